@@ -29,8 +29,8 @@ import tomli_w
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import all_points
 from mapvote.core.types import Drive
+from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose
-from mapvote.doctor.finding import Finding
 from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.maps import examine_points
 from mapvote.doctor.prior import CAMERA_TO_LIDAR

@@ -11,7 +11,7 @@ import pytest
 from bag_recorder import START, Recorder
 from mapvote.core import geometry
 from mapvote.core.types import F64
-from mapvote.doctor.finding import Finding
+from mapvote.doctor import Finding
 from mapvote.doctor.records import check_bag
 from mapvote.formats.drives.options import DriveOptions
 

@@ -11,7 +11,7 @@ import pytest
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, Drive, MapvoteError, Scan
-from mapvote.doctor.scans import LookedAt, cheap_checks, look_at_all
+from mapvote.doctor.scans import Looking, cheap_checks, looked_at
 
 N = 120
 UNSAMPLED = 60
@@ -46,7 +46,7 @@ class Recording:
 
 def test_no_scan_is_read_only_to_be_looked_at_but_a_few_at_first() -> None:
     recording = Recording()
-    watched = LookedAt(recording.drive())
+    watched = looked_at(recording.drive())
     first = recording.reads.sum()
     assert first == 28  # 24, one of them again for its columns, three for their beams
     for _ in watched.drive:
@@ -57,10 +57,10 @@ def test_no_scan_is_read_only_to_be_looked_at_but_a_few_at_first() -> None:
 
 def test_what_is_said_at_the_end_is_what_a_look_at_every_scan_says() -> None:
     spoilt = Recording(cut=range(UNSAMPLED, UNSAMPLED + 3))
-    watched = LookedAt(spoilt.drive())
+    watched = looked_at(spoilt.drive())
     for _ in watched.drive:
         pass
-    found = cheap_checks(spoilt.drive(), look_at_all(spoilt.drive()))
+    found = cheap_checks(spoilt.drive(), Looking(spoilt.drive()).look(range(N)))
     said = [f.what for f in watched.warnings()]
     assert said == [f.what for f in found if f.severity == "warning"]
     assert [line for line in said if "cut off?" in line] == [
@@ -70,11 +70,11 @@ def test_what_is_said_at_the_end_is_what_a_look_at_every_scan_says() -> None:
 
 def test_scans_that_nobody_read_are_looked_at_in_the_end() -> None:
     spoilt = Recording(cut=range(UNSAMPLED, UNSAMPLED + 3))
-    assert any("cut off?" in f.what for f in LookedAt(spoilt.drive()).warnings())
+    assert any("cut off?" in f.what for f in looked_at(spoilt.drive()).warnings())
 
 
 def test_a_file_torn_in_the_middle_stops_whoever_reads_it_and_is_told_at_the_end_too() -> None:
-    watched = LookedAt(Recording(torn=UNSAMPLED).drive())
+    watched = looked_at(Recording(torn=UNSAMPLED).drive())
     with pytest.raises(MapvoteError, match=r"000060\.bin"):
         for _ in watched.drive:
             pass
@@ -84,9 +84,9 @@ def test_a_file_torn_in_the_middle_stops_whoever_reads_it_and_is_told_at_the_end
 
 def test_what_is_wrong_with_many_scans_stops_before_the_work_begins() -> None:
     with pytest.raises(MapvoteError, match=r"000000.bin: 7 bytes"):
-        LookedAt(Recording(torn=0).drive())
+        looked_at(Recording(torn=0).drive())
     with pytest.raises(MapvoteError, match=r"scan 4 holds 1000 points, those around it 3000: cut off\?.*29 such scans"):
-        LookedAt(Recording(cut=range(0, N, 4)).drive())
+        looked_at(Recording(cut=range(0, N, 4)).drive())
 
 
 def test_a_drive_whose_sensor_is_stated_wrongly_is_refused_and_a_measured_one_is_not_asked() -> None:
@@ -99,6 +99,6 @@ def test_a_drive_whose_sensor_is_stated_wrongly_is_refused_and_a_measured_one_is
     drive = Recording().drive()
     seen = replace(drive, read_scan=lambda i: Scan(i, ((away + 0.01 * i)[:, None] * ray).astype("f4")))
     with pytest.raises(MapvoteError, match=r"32 beams from .* as a hdl32e has, but a vlp16 has 16 from"):
-        LookedAt(seen)
+        looked_at(seen)
     for stated in ({"sensor": SENSORS["hdl32e"]}, {"sensor_told": "measured: by its rings"}):
-        LookedAt(replace(seen, **stated))
+        looked_at(replace(seen, **stated))

@@ -17,9 +17,9 @@ from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Drive, Scan
+from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose
-from mapvote.doctor.finding import Finding
-from mapvote.doctor.map_fit import Laid, in_another_unit
+from mapvote.doctor.map_fit import MapEvidence, in_another_unit
 from mapvote.doctor.prior import CAMERA_TO_LIDAR
 from mapvote.formats import DriveWriter
 from mapvote.formats.drives.kitti import write_poses
@@ -193,7 +193,7 @@ def test_of_a_map_that_is_not_in_metres_the_unit_is_named(scans: list[F64], numb
     for index, mine in cut_tiles(numbers * points, Lattice()):
         empty = Tile.empty(Lattice().tile(index))
         tiles[index] = empty.but(points=empty.window.from_map(numbers * points[mine]))
-    found = in_another_unit(Laid(drive, poses(), PointMap("m", Lattice(), tiles)))
+    found = in_another_unit(MapEvidence(drive, poses(), PointMap("m", Lattice(), tiles)))
     assert found is not None
     assert name in found.what
     assert "fits 6 of 6 scans" in found.what

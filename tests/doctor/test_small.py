@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,9 @@ import pytest
 from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.doctor.finding import Finding
-from mapvote.doctor.motion import Road, Run
-from mapvote.doctor.prior_fit import CANNOT_TELL, check_agreement, check_small, held_against
+from mapvote.doctor import Finding
+from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
+from mapvote.doctor.prior_fit import CANNOT_TELL, check_small, compare, fit_to_chain
 
 ROAD = Road("+z", 1.8, 0.4, np.array([0.0, 0.0, 1.0]), 0.02)
 
@@ -55,33 +54,38 @@ def runs_of(T: F64) -> list[Run]:
     return [run_of(T, start, start + 31) for start in range(0, len(T) - 31, 31)]
 
 
-def agreement(prior: F64, T: F64, runs: list[Run] | None = None, sigma_m: float = 1.0) -> list[Finding]:
+def evidence(T: F64, sigma_m: float, runs: list[Run] | None = None, chain: Run | None = None) -> DriveEvidence:
+    """Of a drive whose scans show the motion of poses T (n, 4, 4), a tenth of a second apart."""
+    stamps_ns = np.arange(len(T)) * 100_000_000
+    nothing = Scan(0, np.zeros((0, 3), np.float32))
+    e = DriveEvidence(
+        Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps_ns, lambda i: nothing, prior_sigma_m=sigma_m)
+    )
+    known = {"runs": runs or runs_of(T), "chain": chain or run_of(T, 0, len(T)), "road_below": ROAD}
+    vars(e).update(known, looks={"turns": np.zeros(1)})
+    return e
+
+
+def compared(prior: F64, T: F64, runs: list[Run] | None = None, sigma_m: float = 1.0) -> list[Finding]:
     """What the doctor says of a prior (n, 4, 4), where scans would show the motion of T."""
-    stamps = np.arange(len(T)) * 100_000_000
-    drive = Drive(
-        Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)),
-        prior_sigma_m=sigma_m,
-    )  # fmt: skip
-    chain = partial(run_of, T, 0, len(T))
-    return check_agreement(drive, prior, runs_of(T) if runs is None else runs, ROAD, 0.0, chain)[0]
+    return compare(evidence(T, sigma_m, runs), prior)[0]
 
 
-def found_in(T: F64, prior: F64, sigma_m: float = 0.3) -> list[Finding]:
-    stamps = np.arange(len(T)) * 100_000_000
-    return check_small(prior, run_of(T, 0, len(T)), runs_of(T), None, stamps, sigma_m)
+def found_in(T: F64, prior: F64, sigma_m: float = 0.3, chain: Run | None = None) -> list[Finding]:
+    return list(check_small(evidence(T, sigma_m, chain=chain), prior, None))
 
 
 @pytest.mark.parametrize("curved", [False, True])
 def test_scale_and_heading_are_told_apart_within_their_errors(curved: bool) -> None:
     T = along(150.0, curved)
     turned = smaller(straying(T, 0.02), 0.97) @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(3.0))
-    whole = held_against(turned, run_of(T, 0, len(T)))
+    whole = fit_to_chain(turned, run_of(T, 0, len(T)))
     assert whole is not None
     assert whole.scale.value == pytest.approx(0.97, abs=2 * whole.scale.sigma)
     assert whole.turn.value == pytest.approx(3.0, abs=2 * whole.turn.sigma)
     assert abs(whole.pitch.value) < 2 * whole.pitch.sigma
     mended = whole.turn.poses(whole.scale.poses(turned))
-    again = held_against(mended, run_of(T, 0, len(T)))
+    again = fit_to_chain(mended, run_of(T, 0, len(T)))
     assert again is not None
     assert abs(again.turn.value) < 0.1
     assert again.scale.value == pytest.approx(1.0, abs=0.001)
@@ -111,7 +115,7 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
         T = along(120.0, curved)
         mirrored = T * np.array([1.0, -1, 1, 1])[None, :, None]
         mirrored[:, :3, :3] = T[:, :3, :3]
-        found = agreement(mirrored, T)
+        found = compared(mirrored, T)
         told = [f.what for f in found]
         assert curved or all(f.severity == "note" for f in found)
         if curved:
@@ -128,7 +132,7 @@ def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_
             for C in (geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg)),)
             for run in runs_of(T)
         ]
-        (error,) = agreement(T, T, turned)
+        (error,) = compared(T, T, turned)
         assert error.severity == "error"
         assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
@@ -139,8 +143,7 @@ def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
     T = along(120.0)
     chain = run_of(T, 0, len(T))
     fit = np.where(np.arange(len(chain.fit)) == 20, 0.3, chain.fit)
-    stamps = np.arange(len(T)) * 100_000_000
-    told = check_small(T, Run(chain.indices, chain.T_first_lidar, fit), runs_of(T), None, stamps, 0.3)
+    told = found_in(T, T, chain=Run(chain.indices, chain.T_first_lidar, fit))
     assert any("between scans 57 and 60" in f.what for f in told), told
 
 
@@ -162,7 +165,7 @@ def turned(T: F64, yaw_deg: float) -> F64:
 )
 def test_one_fault_of_a_prior_and_two_at_once_are_named(change: Callable[[F64], F64], names: list[str]) -> None:
     T = along(120.0, curved=True)
-    errors = [f.what for f in agreement(change(straying(T, 0.1)), T) if f.severity == "error"]
+    errors = [f.what for f in compared(change(straying(T, 0.1)), T) if f.severity == "error"]
     for name in names:
         assert any(re.search(name, what) for what in errors), errors
 
@@ -178,6 +181,6 @@ def test_a_prior_that_errs_as_drive_toml_states_is_sound(metres: float, sigma_m:
         jumping[:, :3, 3] += pieces[np.arange(len(T)) // 50]
         tilted = straying(T, sigma_m, seed) @ geometry.from_xyz_rpy(0, 0, 0, roll=0.015, pitch=-0.01)
         for prior in (straying(T, sigma_m, seed), jumping, tilted):
-            found = agreement(prior, T, sigma_m=sigma_m)
+            found = compared(prior, T, sigma_m=sigma_m)
             assert [f.what for f in found if f.severity == "error"] == []
             assert prior is jumping or [f.what for f in found if f.severity == "warning"] == []

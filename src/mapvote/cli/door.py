@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from mapvote.config import Settings
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
-    from mapvote.doctor.finding import Finding
-    from mapvote.doctor.scans import LookedAt
+    from mapvote.doctor import Finding
+    from mapvote.doctor.scans import Looking
     from mapvote.formats.maps.tiling import Look
     from mapvote.server.store.store import Store
 
@@ -225,12 +225,12 @@ def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
     MapvoteError for one that cannot be used so: at once if some of its scans show it, else at the end. Whatever else
     stops the work, what is wrong with a drive is told rather than what came of it.
     """
-    from mapvote.doctor.scans import LookedAt
+    from mapvote.doctor.scans import looked_at
 
     watching = []
     for drive in drives:
         with progress(f"looking at {drive.path}") as tell:
-            watching.append(LookedAt(drive, tell))
+            watching.append(looked_at(drive, tell))
     try:
         yield [one.drive for one in watching]
     except MapvoteError:
@@ -240,7 +240,7 @@ def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
         _warn(path, found)
 
 
-def _warnings_of(watching: list[LookedAt]) -> list[tuple[str, list[Finding]]]:
+def _warnings_of(watching: list[Looking]) -> list[tuple[str, list[Finding]]]:
     found = []
     for one in watching:
         with progress(f"looking at {one.drive.path}") as tell:
@@ -257,7 +257,7 @@ def sound_map(path: Path | str) -> PointMap:
 
 def look_at_points(path: str) -> Look:
     """The check of a map's points before the ground is computed: MapvoteError if they cannot be used."""
-    from mapvote.doctor.finding import usable
+    from mapvote.doctor import usable
     from mapvote.doctor.maps import check_cloud
 
     return lambda pieces: _warn(path, usable(path, check_cloud(pieces)))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mapvote.core.grid import Lattice, TileIndex
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import U8
-    from mapvote.doctor.finding import Finding
+    from mapvote.doctor import Finding
     from mapvote.formats.maps.autoware import Change
     from mapvote.fusion.fuse import Decision
 

@@ -2,3 +2,47 @@
 
 :mod:`mapvote.doctor.diagnosis` lists the checks. docs/decisions/doctor.md gives the reasons.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from mapvote.core.types import MapvoteError
+
+Severity = Literal["error", "warning", "note"]
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, in all)."""
+_ORDER = {"error": 0, "warning": 1, "note": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """``error``: it cannot be used so. ``warning``: results will suffer. ``note``: worth knowing, or undecidable."""
+
+    severity: Severity
+    what: str
+    mend: str = ""
+    map_tells: bool = False
+    """Whether a map can decide what the drive cannot: on one that it lies well on, nothing of this is left."""
+
+
+def any_error(found: Iterable[Finding]) -> bool:
+    """Whether one of them is an error."""
+    return any(f.severity == "error" for f in found)
+
+
+def in_order(found: Iterable[Finding]) -> list[Finding]:
+    """Errors first; duplicates once."""
+    return sorted(dict.fromkeys(found), key=lambda f: _ORDER[f.severity])
+
+
+def usable(path: str, found: list[Finding]) -> list[Finding]:
+    """The warnings among what was found at ``path``; MapvoteError with the first error, if there is one."""
+    errors = [f for f in found if f.severity == "error"]
+    if errors:
+        more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""
+        stop = "" if errors[0].what.endswith("?") else "."
+        raise MapvoteError(f"{path}: {errors[0].what}{stop} {errors[0].mend}{more}")
+    return [f for f in found if f.severity == "warning"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,15 +21,16 @@ from mapvote.core.point_map import PointMap, cut_tiles
 from mapvote.core.sensor_height import LEVEL_M, check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
-from mapvote.doctor.finding import Finding, Progress, Severity
-from mapvote.doctor.motion import find_road
-from mapvote.doctor.similarity import Similarity, fit_similarity
+from mapvote.doctor import Finding, Progress, Severity
+from mapvote.doctor.drive_evidence import find_road
+from mapvote.doctor.prior import Similarity, fit_similarity
 from mapvote.localisation.global_search import GlobalSearch
 from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
+from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, likeliest, refine, thin_for_levels
 from mapvote.localisation.pose_check import MIN_FIT, Judge
 from mapvote.localisation.prepare import deskew, motion_at, solid_sample
 
+Step = TypeVar("Step")
 _PLACES = 6
 _SEARCHED = 4
 _MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
@@ -51,6 +52,14 @@ _SCALES = 1.0 + _FINER * np.arange(-9, 10)
 _LOOKED_AT = 3
 """Scans registered in another scale or unit, to choose one."""
 _FEET_M = 0.3048
+_BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
+_UNITS = (
+    *((f"in {name}", metres, _BY.format(metres)) for name, metres in (
+        ("feet", _FEET_M), ("centimetres", 0.01), ("millimetres", 0.001), ("inches", 0.0254), ("kilometres", 1000.0)
+    )),
+    ("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
+)  # fmt: skip
+"""What the map's numbers may be instead of metres: (name, metres, how to mend it)."""
 _SENSOR_M = 2.0
 """Height of a sensor over the road, about."""
 _AROUND_M = 120.0
@@ -69,28 +78,27 @@ class Place:
     """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map has too few points."""
     known: float
     """Share of the scan's points near which the map has anything, at the guess."""
-    least: float
-    """Fit from which it is the place."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the scan was taken here."""
+        return self.fit >= MIN_FIT
 
 
 def fitting(places: Sequence[Place]) -> list[Place]:
-    return [p for p in places if p.fit >= p.least]
-
-
-def total_fit(places: Sequence[Place]) -> float:
-    """Of those that fit: separates a few good ones from many."""
-    return sum(p.fit for p in fitting(places))
+    """Those where a scan was taken."""
+    return [p for p in places if p.fits]
 
 
 @dataclass(frozen=True)
-class Laid:
+class MapEvidence:
     """Some scans of a drive on a map, as a prior has them."""
 
     drive: Drive
     T: F64
     """(n, 4, 4) the prior, metres."""
     point_map: PointMap
-    tell: Progress | None = None
+    progress: Progress | None = None
 
     @cached_property
     def scans(self) -> dict[int, Scan]:
@@ -102,11 +110,6 @@ class Laid:
         scan = self.drive.read_scan(i)
         points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
         return Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))
-
-    @property
-    def some(self) -> list[int]:
-        """A few of the scans, to choose a scale or a unit by."""
-        return list(self.scans)[:: max(1, len(self.scans) // _LOOKED_AT)][:_LOOKED_AT]
 
     def scaled(self, i: int, scale: float) -> F64:
         """The prior's pose (4, 4) of a scan in a map that is so many times as large about the middle of the drive."""
@@ -124,47 +127,51 @@ class Laid:
     ) -> list[Place]:
         """The scans of ``guesses``, made ``scale`` times as large, each registered to the map around its guesses."""
         judge = Judge(self.drive.sensor.range_sigma_m)
-        scaled = {i: Scan(0, np.asarray(scale * self.scans[i].points, dtype=np.float32)) for i in guesses}
-        return [_place_of(around or self.around, i, scaled[i], guesses[i], judge) for i in guesses]
+        points = {i: np.asarray(scale * self.scans[i].points, dtype=np.float32) for i in guesses}
+        return [_place_of(around or self.around, i, points[i], guesses[i], judge) for i in guesses]
 
-    def told(self, what: str, steps: Iterable[Any]) -> Iterator[Any]:
+    def told(self, what: str, steps: Iterable[Step]) -> Iterator[Step]:
         """The steps, each reported as it begins."""
         every = list(steps)
         for k, step in enumerate(every):
-            if self.tell is not None:
-                self.tell(what, k + 1, len(every))
+            if self.progress is not None:
+                self.progress(what, k + 1, len(every))
             yield step
 
 
-def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> tuple[list[Finding], F64]:
+def check_on_map(
+    drive: Drive, T: F64, point_map: PointMap, progress: Progress | None = None
+) -> tuple[list[Finding], F64]:
     """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
-    laid = Laid(drive, T, point_map, tell)
-    found = _outside(T, point_map)
-    road = find_road([scan.points for scan in laid.scans.values()])
+    e = MapEvidence(drive, T, point_map, progress)
+    found = list(_outside(T, point_map))
+    road = find_road([scan.points for scan in e.scans.values()])
     depth_m = road.depth_m if road.up == "+z" and road.is_there else None
     places: list[Place] = []
-    for i in laid.told("registering to the map", laid.scans):
-        places += laid.places({i: _on_ground(T[i], point_map, depth_m)})
-    scale, scale_sigma = _scale_by_points(laid, places)
+    for i in e.told("registering to the map", e.scans):
+        places += e.places({i: _on_ground(T[i], point_map, depth_m)})
+    scale, scale_sigma = _scale_by_points(e, places)
     if abs(scale - 1.0) > 0.5 * _SCALE:
-        better = laid.places({p.index: [p.T_map_lidar, laid.scaled(p.index, scale)] for p in places}, scale=scale)
-        if total_fit(better) > 1.2 * total_fit(places):
+        better = e.places({p.index: [p.T_map_lidar, e.scaled(p.index, scale)] for p in places}, scale=scale)
+        if sum(p.fit for p in fitting(better)) > 1.2 * sum(p.fit for p in fitting(places)):
             places = better
         else:
             scale_sigma = float("inf")
     if len(fitting(places)) < 0.5 * len(places):
-        unit = in_another_unit(laid)
+        unit = in_another_unit(e)
         if unit is not None:
             return [unit], T
-        better, mirrored = _searched(laid)
+        better, mirrored = _searched(e)
         if mirrored:
             what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, unmirrored none"
             return [*found, Finding("error", what, "negate y of the map's points, or of the scans'")], T
         places = max(places, better, key=lambda one: len(fitting(one)))
     good = fitting(places)
     if len(good) < 2:
-        return [*found, _fits_nowhere(places)], T
-    found += _where_not(places, good)
+        best = max(places, key=lambda p: p.fit)
+        what = f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the "
+        mend = "is it the map of another street, in another scale or tilt, or all changed?"
+        return [*found, Finding("error", f"{what}same street fits above {MIN_FIT}", mend)], T
     # Places far apart show the scale as well, but no better than the prior's positions are known.
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
@@ -174,24 +181,25 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
         scale=(scale, scale_sigma) if np.isfinite(scale_sigma) else (1.0, _UNKNOWN_SCALE),
     )
     mended = fit.applied(T)
-    return found + _differs(fit, len(good), drive) + _heights(point_map, mended, drive), mended
+    differs = _differs(fit, len(good), drive)
+    return [*found, *_where_not(places, good), differs, *_heights(point_map, mended, drive)], mended
 
 
-def _scale_by_points(laid: Laid, places: Sequence[Place]) -> tuple[float, float]:
+def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, float]:
     """(how many times as large as the scans the map is, its standard error), by the points of each scan alone.
 
     Scans made larger and smaller are registered anew; at the right scale many more of their points agree. A sound scan
     shows it to .0005. Where scans contradict each other, (1, inf).
     """
     peaks = []
-    for place in laid.told("trying other scales", places):
-        ndt_map = laid.around(place.T_map_lidar[:3, 3])
+    for place in e.told("trying other scales", places):
+        ndt_map = e.around(place.T_map_lidar[:3, 3])
         fits = []
         for scale in _SCALES:
-            clouds = thin_for_levels(np.asarray(scale * laid.scans[place.index].points, dtype=np.float32))
+            clouds = thin_for_levels(np.asarray(scale * e.scans[place.index].points, dtype=np.float32))
             starts = [place.T_map_lidar]
-            if place.fit < place.least:  # it may be elsewhere: where the prior has it, in a map so much larger
-                starts.append(laid.scaled(place.index, scale))
+            if not place.fits:  # it may be elsewhere: where the prior has it, in a map so much larger
+                starts.append(e.scaled(place.index, scale))
             found = [refine(ndt_map, clouds, start).T_map_lidar for start in starts]
             fits.append(max(fitness(ndt_map, clouds, T, len(clouds) - 1) for T in found))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
@@ -203,44 +211,25 @@ def _scale_by_points(laid: Laid, places: Sequence[Place]) -> tuple[float, float]
     return scale, max(_POINTS_SCALE, 1.4826 * float(np.median(off)) / np.sqrt(len(peaks)))
 
 
-def in_another_unit(laid: Laid) -> Finding | None:
+def in_another_unit(e: MapEvidence) -> Finding | None:
     """What the map is in, if scans fit it once it is made metres about its origin, about its middle or about the road
     below the middle of the drive; None if none does.
 
     The map's points are made metres, not the scans feet: voxels have the size that suits points in metres.
     """
-    centres = np.zeros(3), _middle(laid.point_map), laid.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, _SENSOR_M]
-    for unit in laid.told("trying other units", UNITS):
+    some = list(e.scans)[:: max(1, len(e.scans) // _LOOKED_AT)][:_LOOKED_AT]
+    centres = np.zeros(3), _middle(e.point_map), e.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, _SENSOR_M]
+    for name, in_metres, mend in e.told("trying other units", _UNITS):
         for centre in centres:
-            metres = _in_metres(laid.point_map, unit.metres, centre, laid.T)
+            metres = _in_metres(e.point_map, in_metres, centre, e.T)
             if metres is None:
                 continue
             around = MapWindow(metres)
-            if 2 * len(fitting(laid.places({i: [laid.T[i]] for i in laid.some}, around))) > len(laid.some):
-                fits = len(fitting(laid.places({i: [laid.T[i]] for i in laid.scans}, around)))
-                what = f"the map is {unit.name}: made metres, it fits {fits} of {len(laid.scans)} scans checked"
-                return Finding("error", what, unit.mend)
+            if 2 * len(fitting(e.places({i: [e.T[i]] for i in some}, around))) > len(some):
+                fits = len(fitting(e.places({i: [e.T[i]] for i in e.scans}, around)))
+                what = f"the map is {name}: made metres, it fits {fits} of {len(e.scans)} scans checked"
+                return Finding("error", what, mend)
     return None
-
-
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """What the map's numbers may be instead of metres."""
-
-    name: str
-    metres: float
-    mend: str
-
-
-_BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
-UNITS = [
-    Unit("in feet", _FEET_M, _BY.format(_FEET_M)),
-    Unit("in centimetres", 0.01, _BY.format(0.01)),
-    Unit("in millimetres", 0.001, _BY.format(0.001)),
-    Unit("in inches", 0.0254, _BY.format(0.0254)),
-    Unit("in kilometres", 1000.0, _BY.format(1000.0)),
-    Unit("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
-]
 
 
 def _middle(point_map: PointMap) -> F64:
@@ -267,19 +256,19 @@ def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointM
     return PointMap(point_map.map_id, lattice, tiles)
 
 
-def _searched(laid: Laid) -> tuple[list[Place], int]:
+def _searched(e: MapEvidence) -> tuple[list[Place], int]:
     """(the places under the difference that suits most of them, how many scans fit mirrored where none fits so)."""
-    search = GlobalSearch(laid.point_map, NdtSettings(), laid.drive.sensor.range_sigma_m)
-    chosen = list(laid.scans)[:: max(1, len(laid.scans) // _SEARCHED)][:_SEARCHED]
+    search = GlobalSearch(e.point_map, NdtSettings(), e.drive.sensor.range_sigma_m)
+    chosen = list(e.scans)[:: max(1, len(e.scans) // _SEARCHED)][:_SEARCHED]
     best: list[Place] = []
     mirrored = 0
-    for i in laid.told("searching the map", chosen):
-        scan = laid.scans[i]
+    for i in e.told("searching the map", chosen):
+        scan = e.scans[i]
         found = _find(search, scan)
         if found is not None:
-            D = found @ inverse(laid.T[i])
-            best = max(best, laid.places({j: [D @ laid.T[j]] for j in laid.scans}), key=lambda p: len(fitting(p)))
-            if len(fitting(best)) > 0.6 * len(laid.scans):
+            D = found @ inverse(e.T[i])
+            best = max(best, e.places({j: [D @ e.T[j]] for j in e.scans}), key=lambda p: len(fitting(p)))
+            if len(fitting(best)) > 0.6 * len(e.scans):
                 return best, 0
         elif _find(search, Scan(scan.stamp_ns, scan.points * _MIRROR)) is not None:
             mirrored += 1
@@ -294,37 +283,27 @@ def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
     return None if found is None or found.fit < MIN_FIT else found.T_map_lidar
 
 
-def _place_of(around: MapWindow, i: int, scan: Scan, guesses: Sequence[F64], judge: Judge) -> Place:
+def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], judge: Judge) -> Place:
     """From the guesses themselves, and from the best of a grid of 6 m and 3 deg around them if none of them fits."""
-    clouds = thin_for_levels(scan.points)
-    few = solid_sample(scan.points, LEVELS[-1].points_m)
-    best = Place(i, guesses[0], 0.0, 0.0, MIN_FIT)
+    clouds, few = thin_for_levels(points), solid_sample(points, LEVELS[-1].points_m)
+    best = Place(i, guesses[0], 0.0, 0.0)
     for guess in guesses:
         ndt_map = around(guess[:3, 3])
         known = _known(ndt_map, clouds[0].T.astype(np.float64), guess)
         if known < 0.1:
-            best = max(best, Place(i, guess, 0.0, known, best.least), key=lambda p: p.known)
+            best = max(best, Place(i, guess, 0.0, known), key=lambda p: p.known)
             continue
         starts = [guess]
         for attempt in range(2):
             for start in starts:
                 T = refine(ndt_map, clouds, start).T_map_lidar
-                best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known, best.least), key=lambda p: p.fit)
-            if best.fit >= best.least or attempt:
+                best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known), key=lambda p: p.fit)
+            if best.fits or attempt:
                 break
-            starts = _around(ndt_map, clouds, guess)
+            beside = [from_xyz_rpy(x, y, 0.0) @ guess for x in _OFFSETS_M for y in _OFFSETS_M]
+            grid = [T @ from_xyz_rpy(0, 0, 0, yaw=yaw) for T in beside for yaw in _YAWS]
+            starts = likeliest(ndt_map, clouds[0], grid, _RANKED, 500)
     return best
-
-
-def _around(ndt_map: NdtMap, clouds: list[F32], guess: F64) -> list[F64]:
-    sample = [np.ascontiguousarray(clouds[0][:, :: max(1, clouds[0].shape[1] // 500)])]
-    grid = [
-        from_xyz_rpy(x, y, 0.0) @ guess @ from_xyz_rpy(0, 0, 0, yaw=yaw)
-        for x in _OFFSETS_M
-        for y in _OFFSETS_M
-        for yaw in _YAWS
-    ]
-    return sorted(grid, key=lambda start: -fitness(ndt_map, sample, start))[:_RANKED]
 
 
 def _known(ndt_map: NdtMap, points: F64, T: F64) -> float:
@@ -332,12 +311,9 @@ def _known(ndt_map: NdtMap, points: F64, T: F64) -> float:
     grid = ndt_map.levels[0]
     placed = points @ T[:3, :3].T + T[:3, 3]
     cells = np.floor(placed / grid.level.voxel_m).astype(np.int64)[:, :2] - grid.window.lowest[:2]
-    rows = grid.window.rows
-    columns = np.asarray((rows >= 0).any(axis=2))
+    columns = np.asarray((grid.window.rows >= 0).any(axis=2))
     inside = ((cells >= 0) & (cells < np.array(columns.shape))).all(axis=1)
-    hit = np.zeros(len(cells), dtype=np.bool_)
-    hit[inside] = columns[cells[inside, 0], cells[inside, 1]]
-    return float(hit.mean())
+    return float(columns[cells[inside, 0], cells[inside, 1]].sum() / len(cells))
 
 
 def _peak(before: float, at: float, after: float) -> float:
@@ -346,7 +322,7 @@ def _peak(before: float, at: float, after: float) -> float:
     return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend < 0 else float(np.sign(after - before))
 
 
-def _outside(T: F64, point_map: PointMap) -> list[Finding]:
+def _outside(T: F64, point_map: PointMap) -> Iterator[Finding]:
     """How much of the drive lies outside the map's tiles, and how far."""
     windows = [point_map.lattice.tile(t) for t in point_map.tiles]
     side = TILE_CELLS * CELL_SIZE
@@ -361,11 +337,9 @@ def _outside(T: F64, point_map: PointMap) -> list[Finding]:
             f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
             f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
         )
-        mend = "have prior and map the same frame and origin (for oxts: origin in drive.toml)?"
-        return [Finding("error", what, mend)]
-    if share < 0.95:
-        return [Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote")]
-    return []
+        yield Finding("error", what, "have prior and map the same frame and origin (for oxts: origin in drive.toml)?")
+    elif share < 0.95:
+        yield Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote")
 
 
 def _on_ground(T: F64, point_map: PointMap, depth_m: float | None) -> list[F64]:
@@ -376,69 +350,60 @@ def _on_ground(T: F64, point_map: PointMap, depth_m: float | None) -> list[F64]:
     return [T, from_xyz_rpy(0, 0, depth_m - height) @ T]
 
 
-def _fits_nowhere(places: Sequence[Place]) -> Finding:
-    best = max(places, key=lambda p: p.fit)
-    what = (
-        f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the same "
-        f"street fits above {MIN_FIT}"
-    )
-    return Finding("error", what, "is it the map of another street, in another scale or tilt, or all changed?")
-
-
-def _where_not(places: Sequence[Place], good: Sequence[Place]) -> list[Finding]:
+def _where_not(places: Sequence[Place], good: Sequence[Place]) -> Iterator[Finding]:
     empty = [p for p in places if p.known < 0.3]
     if empty:
         scans = ", ".join(str(p.index) for p in empty)
         grave: Severity = "error" if len(empty) >= 0.4 * len(places) else "warning"
         what = f"the map holds nothing around {len(empty)} of {len(places)} places checked (scans {scans})"
-        return [Finding(grave, what, "part of the map is missing, or the drive leaves it: there it cannot vote")]
-    if len(good) < 0.7 * len(places):
+        yield Finding(grave, what, "part of the map is missing, or the drive leaves it: there it cannot vote")
+    elif len(good) < 0.7 * len(places):
         what = f"scans fit the map at {len(good)} of {len(places)} places only"
-        return [Finding("warning", what, "elsewhere the street has changed, or the map is bent")]
-    return []
+        yield Finding("warning", what, "elsewhere the street has changed, or the map is bent")
 
 
-def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
+def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     """What the difference between prior and map amounts to, with its error."""
     off_m, sigma_m, sigma_deg = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m, drive.prior_sigma_deg
+    yaw_deg = float(np.degrees(np.arctan2(d.rotation[1, 0], d.rotation[0, 0])))
+    tilt_deg = float(np.degrees(np.arccos(np.clip(d.rotation[2, 2], -1.0, 1.0))))
     x, y, z = d.offset_m
     shift = f"shifted by {off_m:.2f} m (x {x:+.2f}, y {y:+.2f}, z {z:+.2f}; +-{d.sigma_m:.2f})"
-    yaw = f"turned about z by {d.yaw_deg:.2f} deg (+-{d.yaw_sigma_deg:.2f})"
-    tilt = f"tilted by {d.tilt_deg:.2f} deg (+-{d.tilt_sigma_deg:.2f})"
+    yaw = f"turned about z by {yaw_deg:.2f} deg (+-{d.yaw_sigma_deg:.2f})"
+    tilt = f"tilted by {tilt_deg:.2f} deg (+-{d.tilt_sigma_deg:.2f})"
     scale = f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})"
     # by how much; what is worth a word; its standard error; what the prior's stated errors explain; what is an error
     rows = [
         (shift, off_m, 0.15, 0.75 * d.sigma_m, _SHIFT_SIGMAS * sigma_m, max(0.3, 4.0 * sigma_m)),
-        (yaw, abs(d.yaw_deg), _TURN_DEG, d.yaw_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
-        (tilt, d.tilt_deg, _TILT_DEG, d.tilt_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
+        (yaw, abs(yaw_deg), _TURN_DEG, d.yaw_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
+        (tilt, tilt_deg, _TILT_DEG, d.tilt_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
         (scale, abs(d.scale - 1.0), _SCALE, d.scale_sigma, 0.0, 0.0),
     ]
     surely = [(words, by, error) for words, by, least, s, within, error in rows if by > max(least, 4.0 * s, within)]
-    parts = [words for words, _, _ in surely]
-    if not parts:
-        what = f"prior and map agree to {off_m:.2f} m and {abs(d.yaw_deg):.2f} deg ({places} places)"
-        small = [words for words, by, least, *_ in rows if by > least]
-        if small:
-            what += f"; the map is {', '.join(small)}: no more than prior_sigma_m and prior_sigma_deg explain"
-        return [Finding("note", what)]
-    grave = any(by > error for _, by, error in surely)
-    what = f"the map is {', '.join(parts)} against the prior, at the middle of the drive ({places} places)"
+    if not surely:
+        what = f"prior and map agree to {off_m:.2f} m and {abs(yaw_deg):.2f} deg ({places} places)"
+        small = ", ".join(words for words, by, least, *_ in rows if by > least)
+        more = f"; the map is {small}: no more than prior_sigma_m and prior_sigma_deg explain" if small else ""
+        return Finding("note", what + more)
+    parts = ", ".join(words for words, _, _ in surely)
+    what = f"the map is {parts} against the prior, at the middle of the drive ({places} places)"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
-    return [Finding("error" if grave else "warning", what, mend)]
+    return Finding("error" if any(by > error for _, by, error in surely) else "warning", what, mend)
 
 
-def _heights(point_map: PointMap, T: F64, drive: Drive) -> list[Finding]:
+def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:
     """Of the sensor over the map's ground, once the difference is taken out."""
     height = check_heights(point_map, T[:, :3, 3])
     if not np.isfinite(height.median_m):
-        return []
+        return
     if not -0.5 < height.median_m < 6.0:
         what = f"the sensor is {height.median_m:.1f} m above the map's ground"
-        return [Finding("error", what, "the map's ground lies wrong under this drive: build it anew")]
-    if abs(height.worst_off_m) > LEVEL_M + 3.0 * drive.prior_sigma_m:
+        yield Finding("error", what, "the map's ground lies wrong under this drive: build it anew")
+    elif abs(height.worst_off_m) > LEVEL_M + 3.0 * drive.prior_sigma_m:
         mend = "if the prior's heights are sound, so much is wrong with the map's ground: build it anew from its drives"
-        return [Finding("warning", f"by the prior, {height.complaint}", mend)]
-    return [Finding("note", f"by the prior: {height}")]
+        yield Finding("warning", f"by the prior, {height.complaint}", mend)
+    else:
+        yield Finding("note", f"by the prior: {height}")
 
 
 def check_cloud_on_map(point_map: PointMap, cloud: PointMap) -> list[Finding]:
@@ -449,6 +414,6 @@ def check_cloud_on_map(point_map: PointMap, cloud: PointMap) -> list[Finding]:
     except MapvoteError as error:
         return [Finding("error", f"against the map: {error}")]
     place, agreement = registered.told()[:2]
-    notes = [Finding("note", f"{place}; {agreement}. A is the map, B is this")]
     mend = "mapvote diff --unbend moves it piece by piece; mapvote vote leaves it out"
-    return [Finding("warning", f"bent: {part.told()}", mend) for part in registered.bent] + notes
+    bent = [Finding("warning", f"bent: {part.told()}", mend) for part in registered.bent]
+    return [*bent, Finding("note", f"{place}; {agreement}. A is the map, B is this")]

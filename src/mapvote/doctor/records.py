@@ -7,17 +7,17 @@ where it was? A store: is every byte what it was, can anybody use it, is its new
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from mapvote.codec.ballot import Ballot, BallotTile, decode, unpack_states
+from mapvote.codec.ballot import decode, unpack_states
 from mapvote.core.types import F64, I64, CellState, MapvoteError
-from mapvote.doctor.finding import Finding, in_order
-from mapvote.doctor.maps import check_whole
+from mapvote.doctor import Finding, Severity, in_order
+from mapvote.doctor.maps import check_cloud, check_map, tile_by_tile
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import CLOUD, GNSS, POSES, Bag, T_from, frame_id, static_frames
 
@@ -34,8 +34,9 @@ _DETERMINED = (CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY, *_CHANGE
 _MOST_CHANGED = 0.2
 _SIGMA_M = 0.15
 _MEND = "mapvote check STORE --mend --from BACKUP"
-_TOLD = 5
+_LISTED = 5
 """Damaged records of one kind that are listed one by one."""
+_SIZES = "tiles", "ballots", "vehicles", "plane_bytes"
 
 
 def check_bag(path: Path, options: DriveOptions) -> list[Finding]:
@@ -43,7 +44,7 @@ def check_bag(path: Path, options: DriveOptions) -> list[Finding]:
     try:
         bag = Bag(path)
         times = {topic: _times(bag, topic) for topic in bag.topics(CLOUD, *POSES, *GNSS)}
-        return _topics(bag, times) + _clocks(bag, times) + _poses(bag, times, options)
+        return [*_topics(bag, times), *_clocks(bag, times), *_poses(bag, times, options)]
     except MapvoteError as error:
         return [Finding("error", str(error))]
 
@@ -53,23 +54,23 @@ def _times(bag: Bag, topic: str) -> I64:
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-def _topics(bag: Bag, times: _Times) -> list[Finding]:
-    others, found = [], []
+def _topics(bag: Bag, times: _Times) -> Iterator[Finding]:
+    others = []
     for name, topic in sorted(bag.reader.topics.items()):
         if topic.msgtype not in (CLOUD, *POSES, *GNSS):
             others.append(f"{name} ({topic.msgcount})")
             continue
         seconds = float(np.ptp(times[name][:, 0])) * 1e-9 if len(times[name]) else 0.0
         rate = f"{(len(times[name]) - 1) / seconds:.1f} Hz" if seconds > 0 else "no rate"
-        found.append(Finding("note", f"{name}: {topic.msgcount} messages of {topic.msgtype}, {rate}"))
+        yield Finding("note", f"{name}: {topic.msgcount} messages of {topic.msgtype}, {rate}")
         if topic.msgtype == CLOUD and topic.msgcount == 0:
-            found.append(Finding("warning", f"{name} holds no message", "did the driver run? Record it again"))
-    return [*found, Finding("note", f"other topics: {', '.join(others)}")] if others else found
+            yield Finding("warning", f"{name} holds no message", "did the driver run? Record it again")
+    if others:
+        yield Finding("note", f"other topics: {', '.join(others)}")
 
 
-def _clocks(bag: Bag, times: _Times) -> list[Finding]:
+def _clocks(bag: Bag, times: _Times) -> Iterator[Finding]:
     """Stamps of the headers against the times of receipt."""
-    found = []
     for topic in bag.topics(CLOUD):
         received, stamps = times[topic].T
         if len(stamps) < 3:
@@ -78,52 +79,42 @@ def _clocks(bag: Bag, times: _Times) -> list[Finding]:
         back = int((np.diff(stamps) <= 0).sum())
         if (stamps == 0).all():
             what = f"{topic}: headers carry no stamps, the times of receipt are used"
-            found.append(Finding("warning", what, "let the driver stamp its messages: receipt comes late and unevenly"))
+            yield Finding("warning", what, "let the driver stamp its messages: receipt comes late and unevenly")
         elif back:
             what = f"{topic}: stamps do not go forward, {back} times"
-            found.append(Finding("error", what, "two recordings joined, or a clock set back: cut the bag there"))
+            yield Finding("error", what, "two recordings joined, or a clock set back: cut the bag there")
         elif abs(late_s) > _LATE_S:
             what = f"{topic}: messages were received {late_s:.2f} s after their stamps (median)"
-            found.append(Finding("note", what, "the sensor keeps another clock: do the poses keep the same one?"))
-    return found
+            yield Finding("note", what, "the sensor keeps another clock: do the poses keep the same one?")
 
 
-def _poses(bag: Bag, times: _Times, options: DriveOptions) -> list[Finding]:
+def _poses(bag: Bag, times: _Times, options: DriveOptions) -> Iterator[Finding]:
     """Which topics may serve as prior, whether they span the scans, and how far the LiDAR sits from what they track."""
     clouds, poses = list(bag.topics(CLOUD)), list(bag.topics(*POSES, *GNSS))
     if not clouds:
-        return []
+        return
     if not poses:
-        return [Finding("note", "no topic of poses or GNSS fixes: a prior must come from a file (--prior)")]
-    found = []
+        yield Finding("note", "no topic of poses or GNSS fixes: a prior must come from a file (--prior)")
+        return
     if options.prior is None:
         what = f"no prior is chosen, but there are poses: {', '.join(poses)}"
-        found.append(Finding("warning", what, f"--prior {poses[0]}"))
-    lidar = frame_id(bag, clouds[0])
-    edges = static_frames(bag)
+        yield Finding("warning", what, f"--prior {poses[0]}")
+    lidar, scans, edges = frame_id(bag, clouds[0]), times[clouds[0]][:, 1], static_frames(bag)
     for topic in poses:
-        found += _spanned(times[clouds[0]][:, 1], times[topic][:, 1], topic)
+        stamps = times[topic][:, 1]
+        outside = float(((scans < stamps.min()) | (scans > stamps.max())).mean()) if len(stamps) and len(scans) else 0.0
+        if outside > 0.05:
+            grave: Severity = "error" if outside > 0.9 else "warning"
+            mend = "do both keep one clock? Use times of one computer, or PTP"
+            what = f"{topic} has no pose at the time of {outside:.0%} of the scans"
+            yield Finding(grave, what, mend if outside > 0.9 else "leave these scans out with --scans")
         tracked = frame_id(bag, topic, child=True)
         if tracked and tracked != lidar:
-            T = T_from(edges, tracked).get(lidar)
-            found.append(_mounted(topic, tracked, lidar, T, options))
-    return found
+            what = f"{topic} tracks {tracked}, the scans are of {lidar}"
+            yield _mounted(what, T_from(edges, tracked).get(lidar), options)
 
 
-def _spanned(scans: I64, poses: I64, topic: str) -> list[Finding]:
-    if not len(poses) or not len(scans):
-        return []
-    outside = float(((scans < poses.min()) | (scans > poses.max())).mean())
-    if outside <= 0.05:
-        return []
-    what = f"{topic} has no pose at the time of {outside:.0%} of the scans"
-    if outside > 0.9:
-        return [Finding("error", what, "do both keep one clock? Use times of one computer, or PTP")]
-    return [Finding("warning", what, "leave these scans out with --scans")]
-
-
-def _mounted(topic: str, tracked: str, lidar: str, T: F64 | None, options: DriveOptions) -> Finding:
-    what = f"{topic} tracks {tracked}, the scans are of {lidar}"
+def _mounted(what: str, T: F64 | None, options: DriveOptions) -> Finding:
     if T is None:
         mend = "give it: --mount X,Y,Z,ROLL,PITCH,YAW (metres, degrees)"
         return Finding("warning", f"{what}; nothing in /tf_static says where that sits on it", mend)
@@ -134,87 +125,66 @@ def _mounted(topic: str, tracked: str, lidar: str, T: F64 | None, options: Drive
     return Finding("warning", f"{what}: /tf_static says where that sits on it, the prior does not know", mend)
 
 
-def check_ballot(data: bytes) -> list[Finding]:
+def check_ballot(data: bytes) -> Iterator[Finding]:
     """Everything that shows in the bytes of a ballot."""
     try:
         ballot = decode(data)
-        changed, determined = _counts(ballot.tiles)
+        counts = np.zeros(256, dtype=np.int64)
+        for tile in ballot.tiles:
+            if tile.states is not None:
+                counts += np.bincount(unpack_states(tile.states).ravel(), minlength=256)
     except MapvoteError as error:
-        return [Finding("error", str(error), "cast it again from the drive, or copy it again")]
-    found = _votes(ballot, changed, determined)
+        yield Finding("error", str(error), "cast it again from the drive, or copy it again")
+        return
+    changed, determined = int(counts[list(_CHANGED)].sum()), int(counts[list(_DETERMINED)].sum())
+    if not ballot.tiles:
+        what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
+        yield Finding("error", what, "see mapvote doctor DRIVE --map MAP")
+    elif determined and changed > _MOST_CHANGED * determined:
+        what = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
+        yield Finding("warning", what, "a lost vehicle, or the wrong map? Streets change by a few per cent")
     if ballot.end_ns <= ballot.start_ns:
-        found.append(Finding("error", "the drive ends before it begins", "mend the times of the drive, and vote again"))
+        yield Finding("error", "the drive ends before it begins", "mend the times of the drive, and vote again")
     if ballot.scans_localised < 0.5 * ballot.scans:
         what = f"only {ballot.scans_localised} of {ballot.scans} scans were localised"
-        found.append(Finding("warning", what, "is it the map of this street? mapvote doctor DRIVE --map MAP"))
+        yield Finding("warning", what, "is it the map of this street? mapvote doctor DRIVE --map MAP")
     if ballot.median_sigma_m > _SIGMA_M:
         what = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
-        found.append(Finding("warning", what, "cells are 0.3 m: such votes blur"))
+        yield Finding("warning", what, "cells are 0.3 m: such votes blur")
     misfit_m, sigma_m = ballot.prior_misfit_m, ballot.prior_sigma_m
     if misfit_m is not None and sigma_m is not None and misfit_m > max(3.0 * sigma_m, 0.5):
         what = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
-        found.append(Finding("warning", what, "measure the offset: mapvote doctor DRIVE --map MAP"))
-    return found
-
-
-def _votes(ballot: Ballot, changed: int, determined: int) -> list[Finding]:
-    if not ballot.tiles:
-        what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
-        return [Finding("error", what, "see mapvote doctor DRIVE --map MAP")]
-    if determined and changed > _MOST_CHANGED * determined:
-        what = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
-        return [Finding("warning", what, "a lost vehicle, or the wrong map? Streets change by a few per cent")]
-    return []
-
-
-def _counts(tiles: list[BallotTile]) -> tuple[int, int]:
-    """(cells called changed, cells judged at all)."""
-    counts = np.zeros(256, dtype=np.int64)
-    for tile in tiles:
-        if tile.states is not None:
-            counts += np.bincount(unpack_states(tile.states).ravel(), minlength=256)
-    return int(counts[list(_CHANGED)].sum()), int(counts[list(_DETERMINED)].sum())
+        yield Finding("warning", what, "measure the offset: mapvote doctor DRIVE --map MAP")
 
 
 def check_store(store: Store) -> list[Finding]:
     """Everything that the doctor finds in an open store, errors first. Every byte is read."""
+    from mapvote.server.store.integrity import check
+    from mapvote.server.store.keys import listed
     from mapvote.server.views.history import overview
 
-    found = _damage(store)
-    at_a_glance = overview(store)
-    told = ", ".join(
-        f"{at_a_glance[key]:,} {key.replace('_', ' ')}" for key in ("tiles", "ballots", "vehicles", "plane_bytes")
-    )
-    found.append(Finding("note", f"version {at_a_glance['version']}: {told}"))
-    if at_a_glance["quarantined"]:
-        what = f"{at_a_glance['quarantined']} damaged things were set aside: their votes and tiles do not count"
+    damaged = check(store)
+    found = []
+    for kind, count in Counter(damage.kind for damage in damaged).items():
+        some = [damage for damage in damaged if damage.kind == kind][:_LISTED]
+        found += [Finding("error", f"damaged: {damage}", _MEND) for damage in some]
+        if count > _LISTED:
+            found.append(Finding("error", f"damaged: {count - _LISTED} more of the kind {kind}", _MEND))
+    glance = overview(store)
+    sizes = ", ".join(f"{glance[key]:,} {key.replace('_', ' ')}" for key in _SIZES)
+    found.append(Finding("note", f"version {glance['version']}: {sizes}"))
+    if glance["quarantined"]:
+        what = f"{glance['quarantined']} damaged things were set aside: their votes and tiles do not count"
         found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
-    found += _keys(store)
+    valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
+    if valid["operator"]:
+        roles = ", ".join(f"{count} {role}" for role, count in sorted(valid.items()))
+        found.append(Finding("note", f"keys: {roles}"))
+    else:
+        what = "no operator has a valid key: the server cannot be operated remotely"
+        found.append(Finding("warning", what, "mapvote keys STORE issue NAME --role operator"))
     try:
-        return in_order(found + check_whole(store.point_map()))
+        newest = store.point_map()
+        return in_order([*found, *check_cloud(tile_by_tile(newest)), *check_map(newest)])
     except MapvoteError as error:
         return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])
-
-
-def _damage(store: Store) -> list[Finding]:
-    from mapvote.server.store.integrity import check
-
-    damaged = check(store)
-    kinds = Counter(damage.kind for damage in damaged)
-    found = []
-    for kind, count in kinds.items():
-        some = [damage for damage in damaged if damage.kind == kind][:_TOLD]
-        found += [Finding("error", f"damaged: {damage}", _MEND) for damage in some]
-        if count > _TOLD:
-            found.append(Finding("error", f"damaged: {count - _TOLD} more of the kind {kind}", _MEND))
-    return found
-
-
-def _keys(store: Store) -> list[Finding]:
-    from mapvote.server.store.keys import listed
-
-    valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
-    if not valid["operator"]:
-        what = "no operator has a valid key: the server cannot be operated remotely"
-        return [Finding("warning", what, "mapvote keys STORE issue NAME --role operator")]
-    return [Finding("note", "keys: " + ", ".join(f"{count} {role}" for role, count in sorted(valid.items())))]

@@ -1,28 +1,29 @@
-"""What one look at every scan of a drive shows, without registering anything.
+"""What one look at every scan of a drive, its times and its prior show, without registering anything.
 
-A scan that is cut off, empty, doubled or half missing; columns or units that are mistaken; points in the map's frame. A
-verb looks on the way, while it reads the scans (:class:`LookedAt`). No scipy here: its import takes longer than a look.
+A scan that is cut off, empty, doubled or half missing; columns or units that are mistaken; points in the map's frame;
+holes in the times; jumps of the prior. A verb looks while it reads the scans (:func:`looked_at`). No scipy here: its
+import takes longer than a look.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
-from mapvote.doctor.finding import Finding, Severity, usable
-from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
+from mapvote.core.types import F32, F64, Bool, Drive, MapvoteError, Scan
+from mapvote.doctor import Finding, Severity, any_error, usable
 from mapvote.formats.drives.sensor_estimate import contradiction
 
-SECTORS = 36
+_SECTORS = 36
 _POINTS = 12_000
 """Points of a scan that are checked."""
 _BINS, _BIN_M = 400, 0.5
-QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02)
+_QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05)
 """Steps to which coordinates may have been rounded."""
 _CUT_SHARE = 0.6
 """A scan with fewer points than this share of its neighbours' is cut off."""
@@ -35,50 +36,62 @@ _FAR_M = 50.0
 """The mean of the points in the sensor's frame is never so far from the origin."""
 _FIRST_LOOK = 24
 """Scans checked before a drive is used: defects of all scans show, for a tenth of a second."""
+_FASTEST_MPS = 70.0
 IN_MAP_FRAME = Finding(
     "error",
     "the points are in the map's frame already: they move along with the prior",
     "give them in the sensor's frame: p_lidar = inverse(T_map_lidar) p_map, one pose a scan",
 )
+NO_PRIOR = Finding(
+    "warning",
+    "no prior: the vehicle must find itself in the map",
+    "write prior.txt (3 x 4 rows T_map_lidar), or be ready to give the first pose",
+)
+_LOOK = np.dtype(
+    [
+        ("index", "i8"),  # which scan
+        ("count", "i8"),  # points
+        ("low", "f8", 3),  # least coordinate along each axis
+        ("high", "f8", 3),
+        ("mean", "f8", 3),
+        ("range_m", "f8", 3),  # ranges from the origin: of a tenth, half and 99 % of the points
+        ("sectors", "f8", _SECTORS),  # share of the points in each ten degrees of azimuth, from -180 deg
+        ("near", "f8"),  # share within 2 m of the origin
+        ("unit", "f8", 3),  # share of each coordinate that lies in [0, 1]
+        ("rounded", "f8", len(_QUANTA_M)),  # share of the points whose x, y and z are multiples of _QUANTA_M
+        ("turns", "f8"),  # how often the points, in their order, go round counter-clockwise
+        ("digest", "f8"),  # a number that two different scans hardly share
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """Of every scan that could be read, one row; the others are in ``refused``."""
+    """What a look at each of some scans showed."""
 
-    index: I64
-    """(m,) which scan."""
-    count: I64
-    """(m,) points."""
-    low: F64
-    """(m, 3) least coordinate along each axis."""
-    high: F64
-    """(m, 3)."""
-    mean: F64
-    """(m, 3)."""
-    range_m: F64
-    """(m, 3) ranges from the origin: of a tenth, half and 99 % of the points."""
-    sectors: F64
-    """(m, 36) share of the points in each ten degrees of azimuth, from -180 deg."""
-    near: F64
-    """(m,) share within 2 m of the origin."""
-    unit: F64
-    """(m, 3) share of each coordinate that lies in [0, 1]."""
-    rounded: F64
-    """(m, 6) share of the points whose x, y and z are multiples of QUANTA_M."""
-    turns: F64
-    """(m,) how often the points, in their order, go round counter-clockwise."""
-    print_: F64
-    """(m,) a number that two different scans hardly share."""
+    rows: NDArray[np.void]
+    """(m,) of ``_LOOK``: of every scan that could be read, in their order."""
     has_times: bool
     has_intensity: bool
     refused: dict[int, str]
     """Why a scan could not be read."""
 
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        """(m, ..) of every scan that could be read."""
+        return self.rows[column]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def median_m(self) -> float:
+        """Range of half of the points."""
+        return float(np.median(self["range_m"][:, 1]))
+
     @property
     def leaps(self) -> F64:
         """(m - 1,) by how much the directions in which a scan sees something differ from those of the one before."""
-        leaps: F64 = np.abs(np.diff(self.sectors, axis=0)).sum(axis=1)
+        leaps: F64 = np.abs(np.diff(self["sectors"], axis=0)).sum(axis=1)
         return leaps
 
 
@@ -89,8 +102,7 @@ class Looking:
         self.drive = replace(drive, read_scan=self._read)
         """The same drive, checked while it is read."""
         self._unseen = drive
-        self._rows: dict[int, F64] = {}
-        self._counts: dict[int, int] = {}
+        self._rows: dict[int, np.void] = {}
         self._refused: dict[int, str] = {}
         self._times = self._intensity = False
 
@@ -101,14 +113,13 @@ class Looking:
             self._refused[i] = str(error)
             raise
         if i not in self._rows:
-            self._rows[i] = _look(scan.points, max(1, len(scan.points) // _POINTS), np.array(QUANTA_M))
-            self._counts[i] = len(scan.points)
+            self._rows[i] = _look(i, scan.points)
             self._times |= scan.time_s is not None
             self._intensity |= scan.intensity is not None
         return scan
 
     def look(self, indices: Iterable[int], progress: Callable[[int, int], None] | None = None) -> Looks:
-        """Read the scans that were not read yet; returns the findings of all that were read so far. ``progress`` gets
+        """Read the scans that were not read yet; returns the looks of all that were read so far. ``progress`` gets
         (done, in all)."""
         left = [i for i in indices if i not in self._rows and i not in self._refused]
         for done, i in enumerate(left):
@@ -116,302 +127,308 @@ class Looking:
                 self._read(i)
             if progress is not None:
                 progress(done + 1, len(left))
-        index = np.array(sorted(self._rows), dtype=np.int64)
-        table: NDArray[np.float64] = np.array([self._rows[i] for i in index.tolist()]).reshape(len(index), _WIDTH)
-        low, high, mean, range_m, sectors, near, unit, rounded, turns, print_ = np.split(
-            table, np.cumsum(_PARTS)[:-1], axis=1
-        )
-        return Looks(
-            index=index,
-            count=np.array([self._counts[i] for i in index.tolist()], dtype=np.int64),
-            low=low,
-            high=high,
-            mean=mean,
-            range_m=range_m,
-            sectors=sectors,
-            near=near[:, 0],
-            unit=unit,
-            rounded=rounded,
-            turns=turns[:, 0],
-            print_=print_[:, 0],
-            has_times=self._times,
-            has_intensity=self._intensity,
-            refused=dict(self._refused),
-        )
+        rows = np.array([self._rows[i] for i in sorted(self._rows)], dtype=_LOOK)
+        return Looks(rows, self._times, self._intensity, dict(self._refused))
+
+    def warnings(self, progress: Callable[[int, int], None] | None = None) -> list[Finding]:
+        """The findings of all scans, read or not; MapvoteError with the first error, if there is one."""
+        found = cheap_checks(self.drive, self.look(range(len(self.drive)), progress))
+        return [f for f in usable(str(self.drive.path), found) if f != NO_PRIOR]
 
 
-def look_at_all(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looks:
-    """Every scan of the drive read once. ``progress`` gets (done, in all)."""
-    return Looking(drive).look(range(len(drive)), progress)
+def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looking:
+    """A drive that must be usable. Some of its scans are looked at before, the others when they are read: so none is
+    read only to be looked at. MapvoteError with the first error that some of the scans show, as of all scans."""
+    looking = Looking(drive)
+    some = np.unique(np.linspace(0, len(drive) - 1, _FIRST_LOOK).astype(np.int64)).tolist() if len(drive) else []
+    if any_error(cheap_checks(drive, looking.look(some, progress))):
+        looking.warnings(progress)
+    return looking
 
 
-_PARTS = (3, 3, 3, 3, SECTORS, 1, 3, len(QUANTA_M), 1, 1)
-_WIDTH = sum(_PARTS)
-
-
-def _look(points: F32, stride: int, quanta: F64) -> F64:
-    """One row of :class:`Looks`, its parts one after the other; every ``stride``-th of the points (n, 3)."""
-    xyz = points[::stride].astype(np.float64)
+def _look(index: int, points: F32) -> np.void:
+    """One row of :class:`Looks`: of every so many of the points (n, 3)."""
+    xyz = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
     n = len(xyz)
+    share = 1.0 / max(n, 1)
     distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(xyz[:, 1], xyz[:, 0])
-    bins = np.minimum(distance / _BIN_M, _BINS - 1.0).astype(np.int64)
-    seen = np.cumsum(np.bincount(bins, minlength=_BINS))
-    ranges = [(np.searchsorted(seen, share * n) + 0.5) * _BIN_M for share in (0.1, 0.5, 0.99)]
-    sectors = np.bincount(((azimuth + np.pi) / (2.0 * np.pi) * SECTORS).astype(np.int64) % SECTORS, minlength=SECTORS)
+    seen = np.cumsum(np.bincount(np.minimum(distance / _BIN_M, _BINS - 1.0).astype(np.int64), minlength=_BINS))
+    sectors = ((azimuth + np.pi) / (2.0 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
     steps = np.diff(azimuth)
     steps -= 2.0 * np.pi * np.round(steps / (2.0 * np.pi))
-    turns = steps[np.abs(steps) < 1.0].sum() / (2.0 * np.pi)
     rounded = []
-    for quantum in quanta:
+    for quantum in _QUANTA_M:
         whole = np.abs(xyz[:, 0] / quantum - np.round(xyz[:, 0] / quantum)) < 1e-3  # of x, which is mostly no multiple
         off = xyz[whole] / quantum
         rounded.append((np.abs(off - np.round(off)) < 1e-3).all(axis=1).sum() / max(n, 1))
-    share = 1.0 / max(n, 1)
-    return np.concatenate(
-        [
-            xyz.min(axis=0, initial=np.inf),
-            xyz.max(axis=0, initial=-np.inf),
-            xyz.sum(axis=0) * share,
-            ranges,
-            sectors * share,
-            [(distance < 2.0).sum() * share],
-            ((xyz >= 0.0) & (xyz <= 1.0)).sum(axis=0) * share,
-            rounded,
-            [turns, ((np.arange(n) % 97 + 1.0) * distance).sum()],
-        ]
-    )
+    row = np.zeros(1, dtype=_LOOK)[0]
+    row["index"], row["count"] = index, len(points)
+    row["low"], row["high"] = xyz.min(axis=0, initial=np.inf), xyz.max(axis=0, initial=-np.inf)
+    row["mean"] = xyz.sum(axis=0) * share
+    row["range_m"] = [(np.searchsorted(seen, part * n) + 0.5) * _BIN_M for part in (0.1, 0.5, 0.99)]
+    row["sectors"] = np.bincount(sectors, minlength=_SECTORS) * share
+    row["near"] = (distance < 2.0).sum() * share
+    row["unit"] = ((xyz >= 0.0) & (xyz <= 1.0)).sum(axis=0) * share
+    row["rounded"] = rounded
+    row["turns"] = steps[np.abs(steps) < 1.0].sum() / (2.0 * np.pi)
+    row["digest"] = ((np.arange(n) % 97 + 1.0) * distance).sum()
+    return row
 
 
-def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
+def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
+    """What ``looks`` at a drive's scans, its times and its prior show."""
+    T = drive.T_map_lidar_prior
+    if T is not None and len(looks) and in_map_frame(T, looks):
+        return [IN_MAP_FRAME]
+    found = [*_check_times(drive), *_check_scans(drive, looks)]
+    if T is None:
+        return [*found, NO_PRIOR] if len(drive) >= 2 else found
+    return [*found, *_check_track(drive, T)] if len(T) >= 2 else found
+
+
+def in_map_frame(T: F64, looks: Looks) -> bool:
+    """Whether the points lie around the prior, or move along with it: then they are in the map's frame already."""
+    position, mean = T[looks["index"], :3, 3], looks["mean"]
+    away_m = float(np.median(np.linalg.norm(position, axis=1)))
+    off_m = float(np.median(np.linalg.norm(mean - position, axis=1)))
+    if away_m > _FAR_M and off_m < 0.5 * away_m:
+        return True
+    p = position[:, :2]
+    if len(p) < 5 or np.linalg.norm(p.max(axis=0) - p.min(axis=0)) < 8.0:
+        return False
+    spread, centre = p - p.mean(axis=0), mean[:, :2] - mean[:, :2].mean(axis=0)
+    slope = float((spread * centre).sum() / (spread**2).sum())
+    off = np.linalg.norm(centre - spread, axis=1)
+    return 0.8 < slope < 1.2 and float(np.median(off)) < 0.4 * float(np.median(np.linalg.norm(spread, axis=1)))
+
+
+def _check_times(drive: Drive) -> Iterator[Finding]:
+    if len(drive) < 3:
+        yield Finding("warning", f"only {len(drive)} scans", "a vote needs many scans of a place")
+        return
+    step_s = np.diff(drive.stamps_ns) * 1e-9
+    median_s = float(np.median(step_s))
+    for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
+        large, small = median_s > 5.0, median_s < 0.01
+        if (large and 0.02 <= median_s / factor <= 2.0) or (small and 0.02 <= median_s * factor <= 2.0):
+            wrong = f"are {unit}, not seconds" if large else f"were divided by {factor:g}"
+            yield Finding("error", f"scans are {median_s:g} s apart: the times {wrong}", "convert times.txt")
+            return
+    sensor = drive.sensor
+    if not 0.8 < median_s * sensor.rate_hz < 1.25:
+        what = f"scans are {median_s:.3f} s apart, but a {sensor.name} turns at {sensor.rate_hz:g} Hz"
+        mend = "if scans were left out, all is well; else times or rate_hz (drive.toml) are wrong"
+        yield Finding("warning", what, mend)
+    holes, longest = int((step_s > 1.8 * median_s).sum()), int(np.argmax(step_s))
+    if holes:
+        what = f"{holes} holes in the times, the longest {step_s[longest]:.2f} s after scan {longest}"
+        grave: Severity = "warning" if step_s[longest] > 5.0 * median_s else "note"
+        yield Finding(grave, what, "chosen with --scans, or lost while recording?")
+    uneven = float(np.median(np.abs(step_s - median_s))) / median_s
+    if uneven > 0.1:
+        what = f"the times are uneven: half of the steps are more than {uneven:.0%} off {median_s:.3f} s"
+        yield Finding("warning", what, "are they times of arrival? Take the sensor's own stamps")
+
+
+def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
+    """Jumps of the prior, rows that stand still, rounding, tilts."""
+    steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    way_m, usual_m = float(steps_m.sum()), float(np.median(steps_m))
+    if way_m < 0.5:
+        what = f"the prior does not move ({way_m:.2f} m in {len(T)} scans)"
+        yield Finding("warning", what, "if the vehicle did, the file is not its trajectory; else all is well")
+    else:
+        speed_mps = float(np.median(steps_m / (np.diff(drive.stamps_ns) * 1e-9)))
+        if speed_mps > _FASTEST_MPS:
+            mend = "check the unit of its positions (metres) and of the times (seconds)"
+            yield Finding("error", f"the prior moves at {speed_mps:.0f} m/s", mend)
+        yield from _jumps_and_stops(steps_m, usual_m)
+        values = np.abs(T[:, :2, 3] - T[0, :2, 3])
+        for quantum in (1.0, 0.5, 0.25, 0.1):
+            whole = np.abs(values / quantum - np.round(values / quantum)) < 1e-3
+            if way_m > 5.0 and whole.mean() > 0.95:
+                what = f"the prior's positions are rounded to {quantum:g} m"
+                yield Finding("warning", what, "float32 of large coordinates? Write double")
+                break
+    tilt_deg = float(np.median(np.rad2deg(np.arccos(np.clip(T[:, 2, 2], -1, 1)))))
+    if tilt_deg > 30:
+        mend = "fine for a sensor mounted so; else its axes are not x forward, z up"
+        yield Finding("warning", f"the prior tilts the sensor by {tilt_deg:.0f} deg", mend)
+
+
+def _jumps_and_stops(steps_m: F64, usual_m: float) -> Iterator[Finding]:
+    jumps = int((steps_m > 5 * usual_m + 1.0).sum())
+    if 0 < jumps < 0.2 * len(steps_m) and usual_m > 0:
+        what = f"the prior jumps {jumps} times, most at scan {int(np.argmax(steps_m)) + 1} ({steps_m.max():.1f} m)"
+        # No error: a map fits all its priors, and a vehicle localises in the map; both reject outliers.
+        yield Finding("warning", what, "GNSS outliers: smooth them, or give prior_sigma_m in drive.toml")
+    stuck = steps_m < 1e-6
+    if 3 <= stuck.sum() < len(steps_m) and usual_m > 0.05:
+        what = f"the prior stands still for {_longest(stuck)} rows, at full speed before or after"
+        yield Finding("warning", what, "was it held while GNSS or the filter was away? Leave those rows out")
+    elif usual_m <= 1e-6 < steps_m.sum() and stuck.sum() > 0.4 * len(stuck):
+        what = f"{stuck.mean():.0%} of the prior's rows repeat the one before"
+        yield Finding("warning", what, "it is slower than the scans, or was held: interpolate it")
+
+
+def _longest(flags: Bool) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max()) + 1
+
+
+def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
     """Everything that shows without registering anything; of every scan."""
-    found = _refused(drive, looks)
-    if len(looks.index) == 0:
-        return found
-    scan = drive.read_scan(int(looks.index[len(looks.index) // 2]))
-    units = _units(looks)
-    columns = _columns(drive, looks, scan)
-    found += columns or units or _beams(drive, looks)
-    found += _counts(drive, looks) + _doubled(looks) + _body(looks)
-    found += [] if columns or units else _sectors(drive, looks) + _reach(looks)
-    found += _rounded(looks)
+    yield from _refused(drive, looks)
+    if not len(looks):
+        return
+    columns = list(_columns(drive, looks, drive.read_scan(int(looks["index"][len(looks) // 2]))))
+    units = list(_units(looks))
+    yield from columns or units or _beams(drive, looks)
+    yield from _counts(drive, looks)
+    yield from _doubled(looks)
+    own = float(np.median(looks["near"]))
+    if own > 0.05 and looks.median_m >= 1.5:
+        what = f"{own:.0%} of the points are within 2 m of the sensor: the vehicle's own body?"
+        yield Finding("warning", what, "mask it: it would be mapped as a wall that follows the car")
+    if not columns and not units:
+        yield from _sectors(drive, looks)
+        far_m = float(np.median(looks["range_m"][:, 2]))
+        if far_m < 15.0:
+            mend = "cut to a small range? Votes need what stands beside the road, 20 m and more"
+            yield Finding("warning", f"99 % of the points lie within {far_m:.0f} m", mend)
+    coarse = [q for q, share in zip(_QUANTA_M, np.median(looks["rounded"], axis=0), strict=True) if share > 0.95]
+    if coarse:
+        what = f"coordinates are rounded to {coarse[0]:g} m"
+        yield Finding("error" if coarse[0] > 0.2 else "warning", what, "write them in millimetres or as float32")
     if not looks.has_times:
         what = "points carry no times: scans are taken as motion-compensated"
-        found.append(Finding("note", what, "if they are not, set motion_compensated = false in drive.toml"))
+        yield Finding("note", what, "if they are not, set motion_compensated = false in drive.toml")
     if not looks.has_intensity:
-        found.append(Finding("note", "no intensity field", "the method does not need it"))
-    return found
+        yield Finding("note", "no intensity field", "the method does not need it")
 
 
 def _severity(spoilt: int, scans: int) -> Severity:
     return "error" if spoilt > _SOME_SCANS * scans else "warning"
 
 
-def _refused(drive: Drive, looks: Looks) -> list[Finding]:
+def _refused(drive: Drive, looks: Looks) -> Iterator[Finding]:
     if not looks.refused:
-        return []
+        return
     i, why = min(looks.refused.items())
     others = f" (and {len(looks.refused) - 1} more of {len(drive)} scans)" if len(looks.refused) > 1 else ""
-    mend = ""
-    if "not finite or beyond" in why and drive.T_map_lidar_prior is not None:
-        place = drive.T_map_lidar_prior[i, :3, 3]
-        if np.linalg.norm(place) > 2000.0:
-            mend = "are the points in the map's frame already? Then take them back: p_lidar = inverse(T_map_lidar) p"
-    return [Finding("error", why + others, mend)]
+    T, mend = drive.T_map_lidar_prior, ""
+    if "not finite or beyond" in why and T is not None and np.linalg.norm(T[i, :3, 3]) > 2000.0:
+        mend = "are the points in the map's frame already? Then take them back: p_lidar = inverse(T_map_lidar) p"
+    yield Finding("error", why + others, mend)
 
 
-def _beams(drive: Drive, looks: Looks) -> list[Finding]:
+def _beams(drive: Drive, looks: Looks) -> Iterator[Finding]:
     """The sensor that somebody stated, against the rings of some scans: rays that never were would demolish walls."""
     if drive.sensor_told.startswith("measured"):
-        return []
-    some = (drive.read_scan(int(looks.index[k])) for k in sorted({0, len(looks.index) // 2, len(looks.index) - 1}))
+        return
+    some = (drive.read_scan(int(looks["index"][k])) for k in sorted({0, len(looks) // 2, len(looks) - 1}))
     what = next(filter(None, (contradiction(drive.sensor, scan.by_lidar()[0][1]) for scan in some)), "")
-    return (
-        [Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")]
-        if what
-        else []
-    )
+    if what:
+        yield Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")
 
 
-def _columns(drive: Drive, looks: Looks, scan: Scan) -> list[Finding]:
+def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
     """A coordinate that is something else: an intensity, a constant."""
-    found = _period(scan)
-    if found:
-        return found
-    unit = np.median(looks.unit, axis=0)
-    spread = np.median(looks.high - looks.low, axis=0)
+    period, width = _period(scan)
+    if period != width:
+        what = f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
+        yield Finding("error", what, "name all columns in their order: --columns x,y,z,intensity,ring")
+        return
+    unit, spread = np.median(looks["unit"], axis=0), np.median(looks["high"] - looks["low"], axis=0)
     for axis, name in enumerate("xyz"):
         if spread[axis] == 0.0:
-            what = f"{name} is {looks.low[0, axis] + 0.0:g} in every point: the scans are flat"
-            found.append(Finding("error", what, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)"))
+            what = f"{name} is {looks['low'][0, axis] + 0.0:g} in every point: the scans are flat"
+            yield Finding("error", what, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)")
         elif unit[axis] > 0.98:
             what = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
-            found.append(Finding("error", what, "name the columns in their order: --columns x,y,z,intensity"))
-        elif np.median(looks.low[:, axis]) >= 0.0 and np.median(looks.rounded[:, 0]) < 0.9:
-            found += _never_negative(drive, looks, name)
-    return found
+            yield Finding("error", what, "name the columns in their order: --columns x,y,z,intensity")
+        elif np.median(looks["low"][:, axis]) >= 0.0 and np.median(looks["rounded"][:, 0]) < 0.9:
+            # A sensor without rings may look ahead only. Points that go round it, but only part of the way, are half of
+            # a revolution: that is reported as the sectors that are missing.
+            goes_round = name != "z" and abs(np.median(looks["turns"])) > 0.3
+            if goes_round or (name == "x" and not drive.sensor.rings):
+                continue
+            what = f"{name} is never negative: no LiDAR sees nothing below itself"
+            if name != "z":
+                what = (
+                    f"{name} is never negative: an absolute value, a range, or half of the azimuth is missing (180 deg)"
+                )
+            yield Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns")
 
 
-def _period(scan: Scan) -> list[Finding]:
-    """After how many numbers a scan repeats itself: neighbouring points are alike, column by column."""
+def _period(scan: Scan) -> tuple[int, int]:
+    """(after how many numbers a scan repeats itself, how many columns were read): neighbouring points are alike, column
+    by column."""
     points = scan.points[:_PERIOD_POINTS].astype(np.float64)
     # Intensities may have been scaled when they were read: their column only keeps its place.
     flat = (points if scan.intensity is None else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)).ravel()
     width = len(flat) // max(len(points), 1)
     if len(flat) < 1000:
-        return []
+        return width, width
     unlike = {
         k: np.nanmean(np.minimum(np.abs(flat[k:] - flat[:-k]), 20.0)) for k in range(2, 16) if k == width or k % width
     }
     period = min(unlike, key=lambda k: unlike[k])
-    if unlike[period] > 0.5 * unlike[width]:
-        return []
-    what = f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
-    return [Finding("error", what, "name all columns in their order: --columns x,y,z,intensity,ring")]
+    return (width if unlike[period] > 0.5 * unlike[width] else period), width
 
 
-def _never_negative(drive: Drive, looks: Looks, name: str) -> list[Finding]:
-    """A sensor without rings may look ahead only. Points that go round it, but only part of the way, are half of a
-    revolution: that is told as the sectors that are missing."""
-    if (name == "x" and not drive.sensor.rings) or (name != "z" and abs(np.median(looks.turns)) > 0.3):
-        return []
-    what = f"{name} is never negative: no LiDAR sees nothing below itself"
-    if name != "z":
-        what = f"{name} is never negative: an absolute value, a range, or half of the azimuth is missing (180 deg)"
-    return [Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns")]
-
-
-def _units(looks: Looks) -> list[Finding]:
-    median_m = float(np.median(looks.range_m[:, 1]))
-    if median_m > 150.0 or np.isinf(median_m):
-        what = f"points are {median_m:.0f} m away in the median: no LiDAR in a street sees so"
+def _units(looks: Looks) -> Iterator[Finding]:
+    if looks.median_m > 150.0 or np.isinf(looks.median_m):
+        what = f"points are {looks.median_m:.0f} m away in the median: no LiDAR in a street sees so"
         mend = "convert the points to metres (they look like centimetres), or are they in the map's frame?"
-        return [Finding("error", what, mend)]
-    if median_m < 1.5:
-        what = f"points are {median_m:.2f} m away in the median"
-        return [Finding("error", what, "convert the points to metres, or mask the vehicle's own body")]
-    return []
+        yield Finding("error", what, mend)
+    elif looks.median_m < 1.5:
+        what = f"points are {looks.median_m:.2f} m away in the median"
+        yield Finding("error", what, "convert the points to metres, or mask the vehicle's own body")
 
 
-def _counts(drive: Drive, looks: Looks) -> list[Finding]:
-    found = []
-    usual = float(np.median(looks.count))
-    around = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(looks.count, 4, mode="edge"), 9), axis=1)
-    cut = np.flatnonzero(looks.count < _CUT_SHARE * around)
+def _counts(drive: Drive, looks: Looks) -> Iterator[Finding]:
+    count, sensor = looks["count"], drive.sensor
+    around = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(count, 4, mode="edge"), 9), axis=1)
+    cut = np.flatnonzero(count < _CUT_SHARE * around)
     if len(cut):
-        k = int(cut[np.argmin(looks.count[cut] / around[cut])])
-        what = f"scan {looks.index[k]} holds {looks.count[k]} points, those around it {around[k]:.0f}: cut off?"
+        k = int(cut[np.argmin(count[cut] / around[cut])])
+        what = f"scan {looks['index'][k]} holds {count[k]} points, those around it {around[k]:.0f}: cut off?"
         more = f" ({len(cut)} such scans)" if len(cut) > 1 else ""
-        mend = "copy it again, or leave it out with --scans"
-        found.append(Finding(_severity(len(cut), len(looks.count)), what + more, mend))
-    if usual < 0.1 * drive.sensor.beams * drive.sensor.azimuths or usual < 1500:
-        what = f"{usual:.0f} points a scan, few for a {drive.sensor.name}"
-        found.append(Finding("warning", what, "is it another sensor (--sensor), or a down-sampled recording?"))
-    return found
+        yield Finding(_severity(len(cut), len(count)), what + more, "copy it again, or leave it out with --scans")
+    usual = float(np.median(count))
+    if usual < 0.1 * sensor.beams * sensor.azimuths or usual < 1500:
+        what = f"{usual:.0f} points a scan, few for a {sensor.name}"
+        yield Finding("warning", what, "is it another sensor (--sensor), or a down-sampled recording?")
 
 
-def _doubled(looks: Looks) -> list[Finding]:
-    same = np.flatnonzero((np.diff(looks.print_) == 0.0) & (np.diff(looks.count) == 0))
-    if not len(same):
-        return []
-    what = f"scan {looks.index[same[0] + 1]} is the same as the one before it"
-    more = f" ({len(same)} such scans of {len(looks.index)})" if len(same) > 1 else ""
-    mend = "the recording stood still or was written twice: leave the copies out"
-    return [Finding(_severity(len(same), len(looks.index)), what + more, mend)]
+def _doubled(looks: Looks) -> Iterator[Finding]:
+    same = np.flatnonzero((np.diff(looks["digest"]) == 0.0) & (np.diff(looks["count"]) == 0))
+    if len(same):
+        what = f"scan {looks['index'][same[0] + 1]} is the same as the one before it"
+        more = f" ({len(same)} such scans of {len(looks)})" if len(same) > 1 else ""
+        mend = "the recording stood still or was written twice: leave the copies out"
+        yield Finding(_severity(len(same), len(looks)), what + more, mend)
 
 
-def _body(looks: Looks) -> list[Finding]:
-    own = float(np.median(looks.near))
-    if own <= 0.05 or np.median(looks.range_m[:, 1]) < 1.5:
-        return []
-    what = f"{own:.0%} of the points are within 2 m of the sensor: the vehicle's own body?"
-    return [Finding("warning", what, "mask it: it would be mapped as a wall that follows the car")]
-
-
-def _sectors(drive: Drive, looks: Looks) -> list[Finding]:
+def _sectors(drive: Drive, looks: Looks) -> Iterator[Finding]:
     """Directions in which hardly any scan sees anything, and scans that lack what the others see."""
-    mean = looks.sectors.mean(axis=0)
-    empty = mean * SECTORS < _EMPTY_SECTOR
-    found = []
-    blind_deg = 360.0 / SECTORS * int(empty.sum())
+    sectors = looks["sectors"]
+    mean = sectors.mean(axis=0)
+    empty = mean * _SECTORS < _EMPTY_SECTOR
+    blind_deg = 360.0 / _SECTORS * int(empty.sum())
     if blind_deg >= 60.0:
-        first = int(np.argmax(empty & ~np.roll(empty, 1)))
-        start = -180.0 + 10.0 * first
-        what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start:.0f} deg counter-clockwise)"
+        start_deg = -180.0 + 10.0 * int(np.argmax(empty & ~np.roll(empty, 1)))
+        what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start_deg:.0f} deg counter-clockwise)"
         mend = "part of every revolution is missing? Sound only for a sensor that sees no more, or is hidden there"
-        middle = np.radians(-175.0 + 10.0 * np.arange(SECTORS))
+        middle = np.radians(-175.0 + 10.0 * np.arange(_SECTORS))
         facing = np.arctan2(mean @ np.sin(middle), mean @ np.cos(middle))
         looks_ahead = not drive.sensor.rings and abs(facing) < np.radians(30.0)
-        found.append(Finding("note" if looks_ahead else "warning", what, mend))
-    seen = mean * SECTORS > 0.3
-    lost = ((looks.sectors < _EMPTY_SECTOR * mean) & seen).sum(axis=1) * 10.0
-    bad = np.flatnonzero(lost >= 60.0)
-    if len(bad) and len(bad) < 0.5 * len(lost):
-        k = int(bad[np.argmax(lost[bad])])
-        what = f"scan {looks.index[k]} lacks {lost[k]:.0f} deg of azimuth that the others see ({len(bad)} such scans)"
+        yield Finding("note" if looks_ahead else "warning", what, mend)
+    lost_deg = ((sectors < _EMPTY_SECTOR * mean) & (mean * _SECTORS > 0.3)).sum(axis=1) * 10.0
+    bad = np.flatnonzero(lost_deg >= 60.0)
+    if 0 < len(bad) < 0.5 * len(lost_deg):
+        k = int(bad[np.argmax(lost_deg[bad])])
+        what = f"scan {looks['index'][k]} lacks {lost_deg[k]:.0f} deg of azimuth that the others see"
         mend = "packets were lost, or the file is cut off: leave these scans out"
-        found.append(Finding(_severity(len(bad), len(lost)), what, mend))
-    return found
-
-
-def _reach(looks: Looks) -> list[Finding]:
-    far_m = float(np.median(looks.range_m[:, 2]))
-    if far_m >= 15.0:
-        return []
-    what = f"99 % of the points lie within {far_m:.0f} m"
-    return [Finding("warning", what, "cut to a small range? Votes need what stands beside the road, 20 m and more")]
-
-
-def _rounded(looks: Looks) -> list[Finding]:
-    for k, quantum in enumerate(QUANTA_M):
-        if np.median(looks.rounded[:, k]) > 0.95 and quantum >= 0.05:
-            what = f"coordinates are rounded to {quantum:g} m"
-            return [Finding("error" if quantum > 0.2 else "warning", what, "write them in millimetres or as float32")]
-    return []
-
-
-def in_map_frame(T: F64, looks: Looks) -> bool:
-    """Whether the points lie around the prior, or move along with it: then they are in the map's frame already."""
-    away_m = float(np.median(np.linalg.norm(T[looks.index, :3, 3], axis=1)))
-    off_m = float(np.median(np.linalg.norm(looks.mean - T[looks.index, :3, 3], axis=1)))
-    if away_m > _FAR_M and off_m < 0.5 * away_m:
-        return True
-    p, centre = T[looks.index, :2, 3], looks.mean[:, :2]
-    spread = p - p.mean(axis=0)
-    if len(p) < 5 or np.linalg.norm(p.max(axis=0) - p.min(axis=0)) < 8.0:
-        return False
-    slope = float((spread * (centre - centre.mean(axis=0))).sum() / (spread**2).sum())
-    off = np.linalg.norm((centre - centre.mean(axis=0)) - spread, axis=1)
-    return 0.8 < slope < 1.2 and float(np.median(off)) < 0.4 * float(np.median(np.linalg.norm(spread, axis=1)))
-
-
-def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
-    """What ``looks`` at a drive's scans, its times and its prior show."""
-    T = drive.T_map_lidar_prior
-    if T is not None and len(looks.index) and in_map_frame(T, looks):
-        return [IN_MAP_FRAME]
-    found = check_times(drive) + check_scans(drive, looks)
-    return found + (check_prior(drive) if len(drive) >= 2 else [])
-
-
-class LookedAt:
-    """A drive that must be usable. Some of its scans are looked at before, the others when they are read: so none is
-    read only to be looked at. If some show an error all are looked at, for the error to be told as of all."""
-
-    def __init__(self, drive: Drive, progress: Callable[[int, int], None] | None = None) -> None:
-        """MapvoteError with the first error that some of the scans show, if there is one."""
-        self._looking = Looking(drive)
-        some = np.unique(np.linspace(0, len(drive) - 1, _FIRST_LOOK).astype(np.int64)).tolist() if len(drive) else []
-        found = cheap_checks(drive, self._looking.look(some, progress))
-        if any(f.severity == "error" for f in found):
-            self.warnings(progress)
-
-    @property
-    def drive(self) -> Drive:
-        """To be used in place of the drive as it came."""
-        return self._looking.drive
-
-    def warnings(self, progress: Callable[[int, int], None] | None = None) -> list[Finding]:
-        """The findings of all scans, read or not; MapvoteError with the first error, if there is one."""
-        drive = self.drive
-        found = cheap_checks(drive, self._looking.look(range(len(drive)), progress))
-        return [f for f in usable(str(drive.path), found) if f != NO_PRIOR]
+        yield Finding(_severity(len(bad), len(lost_deg)), f"{what} ({len(bad)} such scans)", mend)

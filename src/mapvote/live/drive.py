@@ -17,7 +17,7 @@ from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError, Scan
-from mapvote.doctor.finding import Finding
+from mapvote.doctor import Finding
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.first_seconds import FirstSeconds

@@ -8,10 +8,9 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.doctor.finding import Finding, in_order
+from mapvote.doctor import Finding, any_error, in_order
 from mapvote.doctor.map_fit import check_on_map
-from mapvote.doctor.prior import NO_PRIOR
-from mapvote.doctor.scans import Looking, cheap_checks
+from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.vehicle import Vehicle
 
 _SECONDS_NS = 10 * 10**9
@@ -64,7 +63,7 @@ class FirstSeconds:
         found = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
         report = vehicle.report
         decided = len(report.T_map_lidar)
-        if decided and len(report.lost) > _SICK * decided and not any(f.severity == "error" for f in found):
+        if decided and len(report.lost) > _SICK * decided and not any_error(found):
             found += self._on_map(drive, point_map, len(report.lost), decided)
         return in_order(found)
 

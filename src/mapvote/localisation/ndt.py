@@ -273,6 +273,14 @@ def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0
     return float(fitnesses(ndt_map, clouds[level], T_map_lidar[None], level)[0])
 
 
+def likeliest(ndt_map: NdtMap, cloud: F32, guesses: Sequence[F64], most: int, points: int = 1 << 30) -> list[F64]:
+    """The ``most`` of guessed poses (4, 4) at which a cloud (3, n) fits the coarsest level best, best first, by some
+    ``points`` of it."""
+    few = np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // points)])
+    fits = fitnesses(ndt_map, few, np.array(guesses))
+    return [guesses[k] for k in np.argsort(-fits, kind="stable")[:most]]
+
+
 def fitnesses(ndt_map: NdtMap, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:
     """(m,) :func:`fitness` of a cloud (3, n) at many poses (m, 4, 4)."""
     grid = ndt_map.levels[level]

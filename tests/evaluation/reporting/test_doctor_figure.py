@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mapvote.core.point_map import map_from_points
+from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import Diagnosis
-from mapvote.doctor.finding import Finding
 from mapvote.plots import draw_diagnosis
 from streets import drive_along, path
 

@@ -1,0 +1,443 @@
+"""What the scans of a drive show once they are compared: the road below, how ranges scatter, how the sensor moved.
+
+Nothing of the prior is used, not even as a guess: whatever is wrong with it can be measured against this. A run is some
+twenty metres of consecutive scans, each registered to those before it: long enough for a few centimetres of error to be
+a fraction of a per cent. Each thing is measured once, when a check first asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+import scipy
+
+from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
+from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration
+from mapvote.doctor import Finding, Progress, Severity
+from mapvote.doctor.scans import Looking, Looks, in_map_frame
+from mapvote.localisation.ndt import NdtMap, fitness, likeliest, refine, thin_for_levels
+
+_UPS = {sign + axis: s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}
+_TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
+_NEAR_M = 15.0
+_ROAD_SHARE = 0.1
+"""A plane with fewer of a scan's near points than this is no road."""
+_UNSTEADY_M = 0.3
+_THICK_M = 0.12
+_DEPTH_M = (0.2, 12.0)
+_TRIES = 300
+_ROAD_SCANS = 7
+_RAYS = 500
+_BESIDE = 8
+_QUARTER = 0.3186
+"""Of a normal distribution's absolute values a quarter is smaller than this many standard deviations."""
+_NEAREST_M, _FARTHEST_M = 3.0, 40.0
+_HALF_WINDOW_M = 60.0
+"""Of the NDT map of a run: its scans reach 50 m."""
+_RUNS, _SCANS, _ACROSS = 8, 11, 2
+"""Runs spread over a drive, scans of each, and runs across the places where scans differ most."""
+_CHAIN_SCANS = 150
+"""Of a chain: some 300 m."""
+_LOST_SCANS = 4
+"""A chain of no more has lost itself at its first step."""
+_STEP_M, _MOST_STEP = 2.5, 5
+"""Scans are left out of a run while consecutive ones stay this near."""
+_SPEEDS_M = (0.0, 0.8, 1.6, 2.6, 3.6, 4.6)
+_REACH_M = 50.0
+_GOOD_FIT = 0.7
+_STANDS_M = 0.4
+_REFINED = 4
+_ROUGH_M, _SCATTER_M = 0.12, 0.25
+"""Sound sensors show 0.02 to 0.04 m."""
+_HIGHEST_M = 4.5
+"""Of a sensor over the road."""
+_LEAST_FIT = 0.55
+"""Sound scans, a step apart, agree in .75 to .95 of their points; scans of different places in .2 to .5."""
+_BRAKES_MPS2 = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """The plane that most of the low points near the sensor lie in."""
+
+    up: str
+    """Which axis of the points points up: "+z" as it should."""
+    depth_m: float
+    """Of the road below the sensor."""
+    share: float
+    """Of the points within 15 m that lie within 0.12 m of the plane; below 0.1 it may be no road."""
+    normal: F64
+    """(3,) of the road, upwards, in the frame of the points."""
+    scatter_m: float
+    """By how much points near the plane leave it, robust standard deviation."""
+    unsteady_m: float = 0.0
+    """By how much the depth differs from scan to scan, robust standard deviation."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it can be a road: some points lie in it, and as deep in every scan."""
+        return self.share >= _ROAD_SHARE and self.unsteady_m < _UNSTEADY_M
+
+    @property
+    def tilt_deg(self) -> float:
+        """Of the sensor against the road."""
+        return float(np.degrees(np.arccos(np.clip(self.normal @ _UPS[self.up], -1.0, 1.0))))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Scans of a few seconds, and where the sensor was in the frame of the first."""
+
+    indices: I64
+    """(m,) scans of the drive, ascending."""
+    T_first_lidar: F64
+    """(m, 4, 4)."""
+    fit: F64
+    """(m,) share of each scan's points that agree with the scans before it; 1 for the first."""
+
+    @property
+    def length_m(self) -> float:
+        return float(np.linalg.norm(np.diff(self.T_first_lidar[:, :3, 3], axis=0), axis=1).sum())
+
+    @property
+    def usual_fit(self) -> float:
+        return float(np.median(self.fit[1:]))
+
+    def unbroken(self) -> Run:
+        """Up to the first scan that does not fit those before it."""
+        bad = np.flatnonzero(self.fit < _LEAST_FIT)
+        end = int(bad[0]) if len(bad) else len(self.fit)
+        return Run(self.indices[:end], self.T_first_lidar[:end], self.fit[:end])
+
+
+@dataclass(frozen=True, eq=False)
+class DriveEvidence:
+    """The evidence for the checks of a drive: scans, road, registrations. Each is computed once, at first use."""
+
+    drive: Drive
+    progress: Progress | None = None
+
+    @cached_property
+    def looks(self) -> Looks:
+        progress = None if self.progress is None else partial(self.progress, "looking at scans")
+        return Looking(self.drive).look(range(len(self.drive)), progress)
+
+    @property
+    def T(self) -> F64 | None:
+        """(n, 4, 4) the prior as it was read."""
+        return self.drive.T_map_lidar_prior
+
+    @property
+    def in_map_frame(self) -> bool:
+        """Whether the points are in the map's frame: then nothing else can be checked."""
+        return self.T is not None and len(self.looks) > 0 and in_map_frame(self.T, self.looks)
+
+    @property
+    def readable(self) -> I64:
+        """(m,) scans that could be read."""
+        return self.looks["index"]
+
+    @cached_property
+    def some(self) -> I64:
+        """A few of the readable scans, spread evenly."""
+        chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), _ROAD_SCANS)).astype(np.int64)
+        return self.readable[chosen]
+
+    def _points(self, i: int) -> F32:
+        """(p, 3) of scan i, turned over where the sensor is upside down: what else is wrong shows only then."""
+        points = self.drive.read_scan(int(i)).points
+        return points @ _TURNED_OVER if self.road.up == "-z" else points
+
+    @cached_property
+    def road(self) -> Road:
+        """As the points are read."""
+        return find_road([self.drive.read_scan(int(i)).points for i in self.some])
+
+    @cached_property
+    def road_below(self) -> Road:
+        """Of points turned over where the sensor is upside down."""
+        return find_road([self._points(i) for i in self.some]) if self.road.up == "-z" else self.road
+
+    @cached_property
+    def scatter_m(self) -> float:
+        """Of ranges, of the first LiDAR: rays of another one begin elsewhere, and end on other things."""
+        scans = [self.drive.read_scan(int(i)) for i in self.some]
+        return float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in scans]))
+
+    @property
+    def can_be_registered(self) -> bool:
+        """Else whatever seems wrong with the motion may be its consequence."""
+        return len(self.readable) > 2 and 1.5 <= self.looks.median_m <= 150.0 and self.road_below.up == "+z"
+
+    @cached_property
+    def every_run(self) -> list[Run]:
+        """Runs spread over the drive, then those across the places where scans differ most, which show whether the
+        scans are in order. Chosen for being odd, the latter are no measure of the prior."""
+        n = len(self.readable)
+        across = np.argsort(self.looks.leaps, kind="stable")[-_ACROSS:] - _SCANS // 2
+        odd = np.unique(np.clip(across, 0, max(0, n - _SCANS)))
+        starts = dict.fromkeys([*self._starts.tolist(), *odd.tolist()])
+        found = []
+        for k, start in enumerate(starts):
+            found.append(self._follow(start))
+            if self.progress is not None:
+                self.progress("registering scans", k + 1, len(starts))
+        return found
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """Runs spread over the drive."""
+        return self.every_run[: len(self._starts)]
+
+    @cached_property
+    def _starts(self) -> I64:
+        """First scans of runs spread evenly over the drive, half of them where the prior turns most."""
+        n, span = len(self.readable), _SCANS + 2 * _MOST_STEP
+        if n <= span:
+            return np.zeros(1, dtype=np.int64)
+        even = np.linspace(0, n - span, min(_RUNS, max(1, n // _SCANS))).astype(np.int64)
+        if self.T is None or len(even) < _RUNS:
+            return np.unique(even)
+        R = self.T[self.readable, :3, :3]
+        candidates = np.arange(0, n - span, max(1, span // 2))
+        turned = [-np.trace(R[i].T @ R[i + span]) for i in candidates]
+        most = candidates[np.argsort(np.array(turned), kind="stable")[::-1][: _RUNS // 2]]
+        return np.unique(np.concatenate([most, even[::2]]))
+
+    @cached_property
+    def chain(self) -> Run:
+        """A long run, from the first scans that it can begin with: its first step tries every way and speed, and may
+        find a wrong one; the next scan then does not fit, though nothing is wrong with the drive."""
+        run = self._follow(0, _CHAIN_SCANS)
+        for start in (_LOST_SCANS, 2 * _LOST_SCANS):
+            fitting = len(run.unbroken().indices)
+            if fitting > _LOST_SCANS or fitting == len(run.indices):
+                break
+            run = self._follow(start, _CHAIN_SCANS)
+        return run
+
+    @cached_property
+    def leaps(self) -> list[Finding]:
+        """What is wrong with the scans' own motion; while there is anything, a prior cannot be compared with it."""
+        return list(_check_motion(self.every_run, self.drive.stamps_ns)) if self.can_be_registered else []
+
+    def _follow(self, start: int, scans: int = _SCANS) -> Run:
+        """The run of at most ``scans`` scans that begins at readable scan ``start``."""
+        ndt_map = NdtMap(np.zeros(3), half_window_m=_HALF_WINDOW_M)
+        ndt_map.enter(_near(self._points(self.readable[start])))
+        indices, poses, fits = [start], [np.eye(4)], [1.0]
+        i, step = start, 1
+        while len(indices) < scans and i + step < len(self.readable):
+            i += step
+            clouds = thin_for_levels(_near(self._points(self.readable[i])))
+            found = _registered(ndt_map, clouds, _guesses(indices, poses, i, _UPS[self.road_below.up]), self.road_below)
+            indices.append(i)
+            poses.append(found.T_map_lidar)
+            fits.append(found.inlier_share)
+            position = found.T_map_lidar[:3, 3]
+            if not ndt_map.is_central(position):
+                ndt_map.recentre(position)
+            ndt_map.enter(transform(found.T_map_lidar, clouds[-1].T))
+            a_scan_m = float(np.linalg.norm((inverse(poses[-2]) @ poses[-1])[:3, 3])) / (indices[-1] - indices[-2])
+            step = 1 if len(indices) < 3 else int(np.clip(_STEP_M / max(a_scan_m, 0.01), 1, _MOST_STEP))
+        return Run(self.readable[indices], np.array(poses), np.array(fits))
+
+
+def find_road(scans: Sequence[F32]) -> Road:
+    """The road that several scans show. Another axis than z must hold half as much again: a wall is no road."""
+    near = [_low_points(scan) for scan in scans]
+    planes = [_best_planes(points, np.random.default_rng(k)) for k, points in enumerate(near)]
+    share = {name: float(np.mean([one[name][0] for one in planes])) for name in _UPS}
+    best = max(share, key=lambda name: share[name])
+    if share[best] < max(1.5 * share["+z"], _ROAD_SHARE):
+        best = "+z"
+    fitted = [_fitted(points, *one[best][1:]) for points, one in zip(near, planes, strict=True)]
+    normal = np.median([normal for normal, _, _ in fitted], axis=0)
+    depth_m, scatter_m = (float(np.median([one[k] for one in fitted])) for k in (1, 2))
+    unsteady_m = 1.4826 * float(np.median([abs(depth - depth_m) for _, depth, _ in fitted]))
+    return Road(best, depth_m, share[best], normal / np.linalg.norm(normal), scatter_m, unsteady_m)
+
+
+def _low_points(scan: F32) -> F64:
+    distance = np.linalg.norm(scan, axis=1)
+    points = scan[(distance < _NEAR_M) & (distance > 2.0)].astype(np.float64)
+    return points[:: max(1, len(points) // 3000)]
+
+
+def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float, F64, float]]:
+    """For each axis that may point up (share, normal, depth) of the plane below the sensor with most of the points.
+
+    Planes through three points each (Fischler and Bolles, Random Sample Consensus, 1981).
+    """
+    out: dict[str, tuple[float, F64, float]] = {name: (0.0, up, 0.0) for name, up in _UPS.items()}
+    if len(points) < 30:
+        return out
+    a, b, c = (points[rng.integers(0, len(points), _TRIES)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-3] / length[length > 1e-3, None]
+    depth = -np.einsum("ij,ij->i", normals, a[length > 1e-3])
+    normals, depth = normals * np.sign(depth)[:, None], np.abs(depth)  # towards the sensor
+    for normal, d in zip(normals, depth, strict=True):
+        axis = int(np.argmax(np.abs(normal)))
+        if not _DEPTH_M[0] <= d <= _DEPTH_M[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
+            continue
+        share = float((np.abs(points @ normal + d) < _THICK_M).mean())
+        name = ("+" if normal[axis] > 0 else "-") + "xyz"[axis]
+        if share > out[name][0]:
+            out[name] = (share, normal, float(d))
+    return out
+
+
+def _fitted(points: F64, normal: F64, depth_m: float) -> tuple[F64, float, float]:
+    """(normal, depth, robust scatter) of the plane fitted to the points near a first guess of it, twice."""
+    scatter = 0.0
+    for _ in range(2):
+        p = points[np.abs(points @ normal + depth_m) < 3.0 * _THICK_M]
+        if len(p) < 50:
+            return normal, depth_m, 0.0
+        centre = p.mean(axis=0)
+        fitted = np.linalg.svd(p - centre, full_matrices=False)[2][2]
+        normal = fitted if fitted @ normal > 0 else -fitted
+        depth_m = -float(normal @ centre)
+        scatter = 1.4826 * float(np.median(np.abs((p - centre) @ normal)))
+    return normal, depth_m, scatter
+
+
+def range_scatter_m(points: F32) -> float:
+    """Standard deviation of a range from the surface that the rays beside it show, metres; 0 for a scan of few points.
+
+    On a plane the inverse range is linear in the direction: it is fitted to the eight nearest directions. Edges and
+    leaves scatter without being wrong, so the better quarter of the rays is taken for all.
+    """
+    length = np.linalg.norm(points, axis=1).astype(np.float64)
+    inside = (length > _NEAREST_M) & (length < _FARTHEST_M)
+    if inside.sum() < 20 * _BESIDE:
+        return 0.0
+    length, direction = length[inside], points[inside] / length[inside, None]
+    chosen = np.linspace(0, len(length) - 1, _RAYS).astype(np.int64)
+    beside = scipy.spatial.cKDTree(direction).query(direction[chosen], k=_BESIDE + 1)[1][:, 1:]
+    plane = np.linalg.pinv(direction[beside]) @ (1.0 / length[beside])[:, :, None]
+    inverse_range = (direction[chosen][:, None, :] @ plane)[:, 0, 0]
+    off = np.abs(1.0 / np.maximum(inverse_range, 1e-3) - length[chosen])
+    return float(np.quantile(off, 0.25)) / _QUARTER
+
+
+def _near(points: F32) -> F32:
+    squared = np.einsum("ij,ij->i", points, points)
+    middle = np.median(points, axis=0) if np.median(squared) > _REACH_M**2 else np.zeros(3, dtype=np.float32)
+    offset = points - middle
+    near: F32 = points[np.einsum("ij,ij->i", offset, offset) < _REACH_M**2]
+    return near
+
+
+def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Road) -> Registration:
+    """From the first guess, if that fits well; else the best of it and the likeliest of all of them.
+
+    Only objects on the road distinguish guesses: the sensor's rings on it fit best where nothing has moved.
+    """
+    found = refine(ndt_map, clouds, guesses[0])
+    if len(guesses) == 2 and found.inlier_share >= _GOOD_FIT:
+        return found
+    stands = [np.abs(road.normal @ cloud + road.depth_m) > _STANDS_M for cloud in clouds]
+    standing = [np.ascontiguousarray(cloud[:, high]) for cloud, high in zip(clouds, stands, strict=True)]
+    tried = [
+        found,
+        *(refine(ndt_map, clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, _REFINED, 800)),
+    ]
+    return max(tried, key=lambda one: fitness(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
+
+
+def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]:
+    """As the last ones moved; at the start of a run, every way and speed that a vehicle may have."""
+    last = poses[-1]
+    if len(poses) > 1:
+        a_scan = log(inverse(poses[-2]) @ last) / (indices[-1] - indices[-2])
+        return [last @ exp((i - indices[-1]) * a_scan), last]
+    across = np.linalg.svd(up[None, :])[2][1:]
+    angles = np.arange(16) * (np.pi / 8.0)
+    ways = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
+    return [from_xyz_rpy(*(speed * way)) for speed in _SPEEDS_M for way in ways]
+
+
+def check_ranges(e: DriveEvidence) -> Iterator[Finding]:
+    """Do ranges scatter more than a sound sensor's?"""
+    if len(e.readable) > 2 and e.scatter_m > _SCATTER_M:
+        what = f"ranges scatter by {e.scatter_m:.2f} m against those of the rays beside them"
+        mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
+        grave: Severity = "error" if e.scatter_m > 2.0 * _SCATTER_M else "warning"
+        yield Finding(grave, f"{what} (sound sensors: 0.01 to 0.04 m)", mend)
+
+
+def check_road(e: DriveEvidence) -> Iterator[Finding]:
+    """Does the road lie below the sensor, as deep as a vehicle is high, and level by the prior?"""
+    if len(e.readable) <= 2:
+        return
+    road, T = e.road, e.T
+    if road.up == "-z":
+        what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
+        mend = "negate y and z of every point (or only z, if right and left are right already)"
+        yield Finding("error", what, mend)
+        return
+    if road.up != "+z":
+        what = f"the points' axis {road.up} points up (the road lies {road.depth_m:.1f} m along its opposite), not z"
+        mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
+        yield Finding("error", what, mend)
+        return
+    if not road.is_there or (road.scatter_m > _ROUGH_M and e.scatter_m <= _SCATTER_M):
+        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
+        what += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
+        yield Finding("warning", what, "are the lower beams missing, the points cut, or z measured from elsewhere?")
+        return
+    yield Finding("note", f"by the scans themselves the sensor stands {road.depth_m:.1f} m over the road")
+    if road.depth_m < 0.5:
+        what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
+        yield Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's")
+    if road.depth_m > _HIGHEST_M:
+        what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
+        yield Finding("warning", what, f"are the points in feet (then it is {0.3048 * road.depth_m:.1f} m)?")
+    if T is None:
+        return
+    normal = np.mean([T[i, :3, :3] @ road.normal for i in e.some], axis=0)
+    tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
+    if tilt_deg > 4.0:
+        pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
+        own = f"in the scans: pitch {pitch:.1f}, roll {roll:.1f}"
+        mend = "level the points by that, or put the sensor's tilt into the prior's rotations; on a hill all is well"
+        grave: Severity = "error" if tilt_deg > 8.0 else "warning"
+        yield Finding(grave, f"by prior and scans the road is tilted by {tilt_deg:.1f} deg ({own})", mend)
+
+
+def _check_motion(runs: Sequence[Run], stamps_ns: I64) -> Iterator[Finding]:
+    """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
+    broken = [run for run in runs if run.usual_fit < _LEAST_FIT]
+    leaps = np.concatenate([~agree_with_time(run, stamps_ns) for run in runs])
+    speed = [run.length_m / (1e-9 * float(np.diff(stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
+    mend = "are the files in order of time (names, times.txt), of one drive, and whole?"
+    if len(broken) > 0.5 * len(runs):
+        fit = float(np.median([run.usual_fit for run in runs]))
+        what = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"
+    elif len(leaps) and leaps.mean() > 0.25:
+        what = "the scans leap: they are out of order, or their times are wrong (the vehicle would brake or start as "
+        what += f"none can in {leaps.mean():.0%} of the steps)"
+    elif np.median(speed) > 70.0:
+        what = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
+        mend = "check the times (seconds), and that the points are metres"
+    elif broken:
+        first, last = broken[0].indices[[0, -1]]
+        what = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places checked)"
+    else:
+        return
+    yield Finding("error", what, mend)
+
+
+def agree_with_time(run: Run, stamps_ns: I64) -> Bool:
+    """(m - 2,) whether the steps of a run follow each other as a vehicle can: no leap of its speed."""
+    seconds = np.diff(stamps_ns[run.indices]) * 1e-9
+    velocity = np.diff(run.T_first_lidar[:, :3, 3], axis=0) / seconds[:, None]
+    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    out: Bool = change < 1.0 + _BRAKES_MPS2 * 0.5 * (seconds[1:] + seconds[:-1])
+    return out
