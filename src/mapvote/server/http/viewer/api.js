@@ -1,6 +1,5 @@
-// The server's answers. Every request goes to this server only; the key lives in this tab only.
+// The server's answers. Every request goes to this server only; the browser sends the key that it was given for it.
 
-const STORAGE = "mapvote-key";
 const BASE = location.origin + location.pathname;  // without a user and password that the address may hold
 
 export class Refused extends Error {
@@ -10,18 +9,11 @@ export class Refused extends Error {
   }
 }
 
-export const key = {
-  get: () => sessionStorage.getItem(STORAGE),
-  set: (value) => sessionStorage.setItem(STORAGE, value),
-  forget: () => sessionStorage.removeItem(STORAGE),
-};
-
 async function ask(path, parameters = {}, more = {}) {
   const query = new URLSearchParams(parameters).toString();
-  const headers = { ...(key.get() && { Authorization: `Bearer ${key.get()}` }), ...more.headers };
   let answer;
   try {
-    answer = await fetch(`${BASE}v1/${path}${query ? "?" + query : ""}`, { ...more, headers });
+    answer = await fetch(`${BASE}v1/${path}${query ? "?" + query : ""}`, more);
   } catch {
     throw new Refused(0, "The server does not answer. Is it running?");
   }
@@ -52,13 +44,6 @@ export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle 
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
 export const cloudsChanged = async (from, to) => (await ask("clouds/changed", { from, to })).arrayBuffer();
 export const cloudsPending = async () => (await ask("desk/clouds")).arrayBuffer();
-
-// A list as a file: fetched with the key, which a link cannot carry, and handed to the browser.
-export async function download(path, parameters, name) {
-  const made = URL.createObjectURL(await (await ask(path, parameters)).blob());
-  Object.assign(document.createElement("a"), { href: made, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(made), 10_000);
-}
 
 const send = async (path, method, body) =>
   (await ask(path, {}, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();

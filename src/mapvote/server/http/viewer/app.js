@@ -38,9 +38,8 @@ async function start() {
   } catch (error) {
     return refuse(error);
   }
-  $("key-form").hidden = $("notice").hidden = true;
+  $("notice").hidden = true;
   $("content").hidden = false;
-  $("forget").hidden = !api.key.get();
   $("which-map").textContent = `${state.manifest.map_id}, version ${state.manifest.version}`;
   document.title = `mapvote: ${state.manifest.map_id}`;
   showVersions();
@@ -96,13 +95,7 @@ function tight(tiles) {
 function refuse(error) {
   $("busy").hidden = true;
   $("which-map").textContent = location.host;
-  if (error.status === 401 || error.status === 403) {
-    $("key-form").hidden = false;
-    $("content").hidden = true;
-    if (api.key.get()) $("key-reason").textContent = error.message;
-    api.key.forget();
-    $("key").focus();
-  } else notice(error.message);
+  notice(error.message);
 }
 
 // ---- versions and the range between two of them
@@ -255,22 +248,10 @@ function step(by) {
   next.focus();
   next.click();
 }
-for (const list of document.querySelectorAll("[data-list]")) {
-  const { list: path, as: format } = list.dataset, name = path.split("/").at(-1);
-  list.href = `v1/${path}?format=${format}`;
-  list.onclick = (event) => (event.preventDefault(), api.download(path, { format }, `${name}.${format}`).catch((error) => notice(error.message)));
-}
 $("from").onchange = $("to").onchange = showRange;
-$("forget").onclick = () => (api.key.forget(), location.reload());
 for (const radio of document.getElementsByName("shade"))
   radio.onchange = () => ((state.shade = radio.value), address.write({ shade: radio.value === "seen" ? null : radio.value }), showTiles());
 const shade = document.querySelector(`[name=shade][value="${CSS.escape(address.read().shade ?? "")}"]`);
 if (shade) (shade.checked = true), (state.shade = shade.value);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => state.manifest && showTiles());
-$("key-form").onsubmit = (event) => {
-  event.preventDefault();
-  api.key.set($("key").value.trim());
-  $("key").value = "";
-  start();
-};
 start();

@@ -1,6 +1,5 @@
 // The changes between two versions: what is large first, what is small folded away.
 
-import * as api from "./api.js";
 import { drawable, showChange, visit } from "./details.js";
 import { $, address, dot, element, state } from "./page.js";
 
@@ -26,9 +25,7 @@ export function showList(features, nothing, range) {
     $(id).ontoggle = () => unfold(size, $(id).open);
   }
   for (const format of ["geojson", "csv"]) {
-    const asked = format === "csv" ? { ...range, format } : range;
-    $(`as-${format}`).href = `v1/changes?${new URLSearchParams(asked)}`;
-    $(`as-${format}`).onclick = (event) => (event.preventDefault(), api.download("changes", asked, `changes.${format}`));
+    $(`as-${format}`).href = `v1/changes?${new URLSearchParams({ ...range, format })}`;
   }
 }
 
