@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from command_line import type_in
 from mapvote.cli import app
-from mapvote.formats.drives.options import read_drive_file
+from mapvote.formats.drives.options import drive_options
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -129,7 +129,7 @@ def test_the_python_of_a_page_works_word_for_word(where: str, text: str, made: P
 @pytest.mark.parametrize(("where", "text"), TOML, ids=lambda v: v.partition("\n")[0])
 def test_the_drive_files_of_a_page_can_be_read(where: str, text: str, tmp_path: Path) -> None:
     (tmp_path / "drive.toml").write_text(text)
-    about = read_drive_file(tmp_path)
+    about = drive_options(tmp_path)
     assert all(getattr(about, key) == value for key, value in tomllib.loads(text).items())
 
 

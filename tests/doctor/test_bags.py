@@ -13,7 +13,6 @@ from mapvote.core import geometry
 from mapvote.core.types import F64
 from mapvote.doctor import Finding
 from mapvote.doctor.records import check_bag
-from mapvote.formats.drives.options import DriveOptions
 
 T_BASE_LIDAR = geometry.from_xyz_rpy(1.2, 0.0, 1.8, 0.01, 0.02, np.pi / 2)
 
@@ -46,20 +45,20 @@ def told(found: list[Finding]) -> str:
 
 
 def test_topics_rates_and_the_mount_are_told(tmp_path: Path) -> None:
-    said = told(check_bag(bag(tmp_path / "b"), DriveOptions()))
+    said = told(check_bag(bag(tmp_path / "b")))
     assert "/points: 6 messages of sensor_msgs/msg/PointCloud2, 10.0 Hz" in said
     assert "other topics: /tf_static (1)" in said
     assert "warning: no prior is chosen, but there are poses: /odom -> --prior /odom" in said
     assert "-> --mount 1.200,0.000,1.800,0.573,1.146,90.000" in said
-    assert "warning" not in told(check_bag(tmp_path / "b", DriveOptions(prior="/odom", mount="1,0,0,0,0,0")))
+    assert "warning" not in told(check_bag(tmp_path / "b", prior="/odom", mount="1,0,0,0,0,0"))
 
 
 def test_the_mount_that_is_told_is_the_one_that_was_written(tmp_path: Path) -> None:
-    from mapvote.formats.drives.options import mount_of, read_drive_file
+    from mapvote.formats.drives.options import drive_options, mount_of
 
-    said = told(check_bag(bag(tmp_path / "b"), DriveOptions()))
+    said = told(check_bag(bag(tmp_path / "b")))
     mount = said.split("--mount ")[1].split()[0]
-    T = mount_of(read_drive_file(tmp_path / "b"), DriveOptions(mount=mount), None, "here")
+    T = mount_of(drive_options(tmp_path / "b", mount=mount), None, "here")
     assert pytest.approx(T_BASE_LIDAR, abs=1e-3) == T
 
 
@@ -72,9 +71,9 @@ def test_the_mount_that_is_told_is_the_one_that_was_written(tmp_path: Path) -> N
     ],
 )
 def test_what_is_wrong_with_a_bag_is_named(tmp_path: Path, how: dict[str, Any], name: str) -> None:
-    assert name in told(check_bag(bag(tmp_path / "b", **how), DriveOptions()))
+    assert name in told(check_bag(bag(tmp_path / "b", **how)))
 
 
 def test_a_bag_cut_off_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n")
-    assert [f.severity for f in check_bag(tmp_path / "x.mcap", DriveOptions())] == ["error"]
+    assert [f.severity for f in check_bag(tmp_path / "x.mcap")] == ["error"]

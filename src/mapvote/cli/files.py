@@ -123,7 +123,6 @@ def doctor(
 
     from mapvote.doctor.diagnosis import Diagnosis, diagnose
     from mapvote.formats import read_map
-    from mapvote.formats.drives.options import DriveOptions
 
     if is_url(path):
         raise MapvoteError(f"doctor: {path} is a server: mapvote check {path} looks at its store")
@@ -138,7 +137,7 @@ def doctor(
             diagnosis = Diagnosis(check_store(store))
     else:
         with stages_that_vanish() as tell:
-            diagnosis = diagnose(Path(path), DriveOptions(**drive_options), point_map, tell)
+            diagnosis = diagnose(Path(path), drive_options, point_map, tell)
     console = Console(soft_wrap=True, highlight=False)
     for finding in diagnosis.findings:
         for line in _lines(finding):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.records import check_bag, check_ballot
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
 from mapvote.formats import is_cloud, open_drive
-from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.registry import DRIVES
 
@@ -56,12 +56,12 @@ def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[
 
 def diagnose(
     path: Path,
-    options: DriveOptions | None = None,
+    options: Mapping[str, Any] | None = None,
     point_map: PointMap | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Everything the doctor finds at ``path``: in a map, a ballot or a drive; with ``point_map``, also whether a drive
-    or a map lies on it."""
+    or a map lies on it. ``options``: of the drive, as ``open_drive`` takes them."""
     if is_cloud(path):
         found, cloud = examine_map(path)
         if point_map is not None and cloud is not None:
@@ -69,9 +69,9 @@ def diagnose(
         return Diagnosis(found)
     if path.is_file() and not any(layout.recognised(path) for layout in DRIVES.values()):
         return Diagnosis(list(check_ballot(path.read_bytes())))
-    options = options or DriveOptions()
+    options = options or {}
     drive, unopened = _opened(path, options)
-    found = unopened + (check_bag(path, options) if is_rosbag(path) else [])
+    found = unopened + (check_bag(path, **options) if is_rosbag(path) else [])
     T = None
     if drive is not None:
         more, T = examine_drive(drive, progress)
@@ -84,12 +84,12 @@ def diagnose(
     return Diagnosis(in_order(found), drive, read, None if unknown else T)
 
 
-def _opened(path: Path, options: DriveOptions) -> tuple[Drive | None, list[Finding]]:
+def _opened(path: Path, options: Mapping[str, Any]) -> tuple[Drive | None, list[Finding]]:
     """(the drive, what stopped it from opening as it is): a broken prior hides nothing else."""
     found: list[Finding] = []
-    for prior in (options.prior, "none"):
+    for prior in (options.get("prior"), "none"):
         try:
-            return open_drive(path, **asdict(replace(options, prior=prior))), found
+            return open_drive(path, **{**options, "prior": prior}), found
         except MapvoteError as error:
             found = found or [Finding("error", str(error))]
     return None, found

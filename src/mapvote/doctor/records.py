@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import scipy
@@ -18,7 +18,7 @@ from mapvote.codec.ballot import decode, unpack_states
 from mapvote.core.types import F64, I64, CellState, MapvoteError
 from mapvote.doctor import Finding, Severity, in_order
 from mapvote.doctor.maps import check_cloud, check_map, tile_by_tile
-from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_options
 from mapvote.formats.drives.rosbag import CLOUD, GNSS, POSES, Bag, T_from, frame_id, static_frames
 
 if TYPE_CHECKING:
@@ -39,12 +39,12 @@ _LISTED = 5
 _SIZES = "tiles", "ballots", "vehicles", "plane_bytes"
 
 
-def check_bag(path: Path, options: DriveOptions) -> list[Finding]:
+def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
     """Topics, rates, clocks and frames of the bag at ``path``; nothing of what its scans show."""
     try:
         bag = Bag(path)
         times = {topic: _times(bag, topic) for topic in bag.topics(CLOUD, *POSES, *GNSS)}
-        return [*_topics(bag, times), *_clocks(bag, times), *_poses(bag, times, options)]
+        return [*_topics(bag, times), *_clocks(bag, times), *_poses(bag, times, drive_options(path, **said))]
     except MapvoteError as error:
         return [Finding("error", str(error))]
 
@@ -118,7 +118,7 @@ def _mounted(what: str, T: F64 | None, options: DriveOptions) -> Finding:
     if T is None:
         mend = "give it: --mount X,Y,Z,ROLL,PITCH,YAW (metres, degrees)"
         return Finding("warning", f"{what}; nothing in /tf_static says where that sits on it", mend)
-    if options.mount is not None or np.allclose(T, np.eye(4), atol=1e-3):
+    if options.mount or options.T_base_lidar or np.allclose(T, np.eye(4), atol=1e-3):
         return Finding("note", f"{what}: /tf_static says where that sits on it")
     rpy_deg = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
     mend = "--mount " + ",".join(f"{v:.3f}" for v in (*T[:3, 3], *rpy_deg))

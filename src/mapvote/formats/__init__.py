@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
-from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
+from mapvote.formats.drives.options import SaidOfDrive, drive_options
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.exporting import export_map
@@ -49,10 +49,9 @@ def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
     Raises MapvoteError if there is no drive at ``path`` or it cannot be used as it is, saying why.
     """
     path = Path(path)
-    options = DriveOptions(**said)
     for layout in DRIVES.values():
         if layout.recognised(path):
-            return layout.open(path, options)
+            return layout.open(path, drive_options(path, **said))
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a drive is one of: {', '.join(DRIVES)}")
 
 

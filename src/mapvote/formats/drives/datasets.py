@@ -25,12 +25,13 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
+from msgspec import structs
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, Drive, MapvoteError
 from mapvote.formats.clean import log
-from mapvote.formats.drives.options import DriveFile, DriveOptions, map_frame, read_drive_file
+from mapvote.formats.drives.options import DriveOptions, map_frame
 from mapvote.formats.drives.scan_folder import (
     NUSCENES,
     BinLayout,
@@ -91,30 +92,28 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
     """The recording in ``path``. Its oxts are the prior, where calib_imu_to_velo.txt is there or one folder up; of
     KITTI-360 its poses.
     """
-    about = read_drive_file(path)
     files = scan_files(path / "velodyne_points" / "data", ".bin")
     table = path / "velodyne_points" / "timestamps.txt"
     if not table.is_file():
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
     times_ns = read_times_ns(table)
     stamps_ns: I64 = times_ns[lines_of_scans(len(times_ns), files, table)]
-    wanted = options.prior or about.prior
+    wanted = options.prior
     if wanted == "oxts":  # a name of ours, no file
-        options = DriveOptions(**{n: getattr(options, n) for n in DriveOptions.__slots__} | {"prior": None})
-        about = DriveFile(**{n: getattr(about, n) for n in DriveFile.__struct_fields__} | {"prior": None})
+        options = structs.replace(options, prior=None)
 
     def prior() -> Trajectory | F64 | None:
         if wanted is None and has_kitti_360_poses(path):
             return kitti_360_poses(path, files, stamps_ns)
-        return _oxts_prior(path, files, stamps_ns, about, options, wanted=wanted == "oxts")
+        return _oxts_prior(path, files, stamps_ns, options, wanted=wanted == "oxts")
 
-    layout = layout_of(files, options.columns or about.columns, options.dtype or about.dtype)
+    layout = layout_of(files, options.columns, options.dtype)
     folder = ScanFolder(files, stamps_ns, layout.read, prior, zero_is_no_return=False)
-    return open_scan_folder(path, about, options, folder)
+    return open_scan_folder(path, options, folder)
 
 
 def _oxts_prior(
-    path: Path, files: list[Path], stamps_ns: I64, about: DriveFile, options: DriveOptions, *, wanted: bool
+    path: Path, files: list[Path], stamps_ns: I64, options: DriveOptions, *, wanted: bool
 ) -> Trajectory | None:
     folder = path / "oxts" / "data"
     calib = next((f for d in (path, path.parent) if (f := d / "calib_imu_to_velo.txt").is_file()), None)
@@ -131,7 +130,7 @@ def _oxts_prior(
     T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = numbers["R"].reshape(3, 3), numbers["T"]
     check_rigid(T_lidar_imu[None], str(calib))
     rows = np.concatenate([read_numbers(f, 30) for f in scan_files(folder, ".txt")])
-    T_map_imu, frame = poses_from_gnss(rows[:, [1, 0, 2]], rows[:, 3:6], map_frame(about, options))
+    T_map_imu, frame = poses_from_gnss(rows[:, [1, 0, 2]], rows[:, 3:6], map_frame(options))
     T_map_lidar = of_scans(T_map_imu @ geometry.inverse(T_lidar_imu), files, folder)
     return Trajectory(stamps_ns, T_map_lidar, of_vehicle=False, frame=frame)
 
@@ -183,7 +182,6 @@ def is_nuscenes(path: Path) -> bool:
 
 def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
     """One scene of a dataset, or a folder of .pcd.bin scans without tables. MapvoteError lists the scenes to choose."""
-    about = read_drive_file(path)
     tables = next((f for f in sorted(path.glob("v1.0-*")) if (f / "sample_data.json").is_file()), None)
     layout = BinLayout(NUSCENES)
 
@@ -199,8 +197,8 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
             raise MapvoteError(f"{path}: no *.pcd.bin scans in {', '.join(_LIDAR_TOP)}")
         log.warning("%s: no tables v1.0-*, so no poses: only the scans are read", path)
         stamps = np.array([_microseconds_in_name(f) * 1000 for f in files], dtype=np.int64)
-        return open_scan_folder(path, about, options, ScanFolder(files, stamps, read))
-    rows = _scene(path, tables, options.topic or about.topic)
+        return open_scan_folder(path, options, ScanFolder(files, stamps, read))
+    rows = _scene(path, tables, options.topic)
     files = [path / row["filename"] for row in rows]
     stamps = np.array([row["timestamp"] * 1000 for row in rows], dtype=np.int64)
     poses, mounts = _nuscenes_table(tables / "ego_pose.json"), _nuscenes_table(tables / "calibrated_sensor.json")
@@ -212,7 +210,7 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
         return T_map_base @ T_base_lidar
 
     folder = ScanFolder(files, stamps, read, prior, T_base_lidar=T_base_lidar)
-    return open_scan_folder(path, about, options, folder)
+    return open_scan_folder(path, options, folder)
 
 
 def _microseconds_in_name(file: Path) -> int:
@@ -261,13 +259,12 @@ def is_boreas(path: Path) -> bool:
 
 def open_boreas(path: Path, options: DriveOptions) -> Drive:
     """One sequence; its post-processed poses are the prior. The times of points count from the scan's."""
-    about = read_drive_file(path)
     files = scan_files(path / "lidar", ".bin")
     stamps_ns = np.array([int(number_of(f)) * 1000 for f in files], dtype=np.int64)
     table = path / "applanix" / "lidar_poses.csv"
 
     prior = _if_there(table, read_lidar_poses, " (test sequences keep it secret)")
-    return open_scan_folder(path, about, options, ScanFolder(files, stamps_ns, BinLayout(BOREAS_COLUMNS).read, prior))
+    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, BinLayout(BOREAS_COLUMNS).read, prior))
 
 
 def read_lidar_poses(file: Path) -> Trajectory:
@@ -295,14 +292,13 @@ def is_mulran(path: Path) -> bool:
 
 def open_mulran(path: Path, options: DriveOptions) -> Drive:
     """One sequence; its global poses (UTM of zone 52, of the vehicle) are the prior."""
-    about = read_drive_file(path)
     files = scan_files(path / "Ouster", ".bin")
     stamps_ns = np.array([int(f.stem) if f.stem.isdigit() else int(number_of(f)) for f in files], dtype=np.int64)
     table = path / "global_pose.csv"
 
     prior = _if_there(table, _mulran_poses)
     folder = ScanFolder(files, stamps_ns, BinLayout().read, prior, T_base_lidar=MULRAN_MOUNT)
-    return open_scan_folder(path, about, options, folder)
+    return open_scan_folder(path, options, folder)
 
 
 def _mulran_poses(table: Path) -> Trajectory:
@@ -331,7 +327,6 @@ def is_newer_college(path: Path) -> bool:
 
 def open_newer_college(path: Path, options: DriveOptions) -> Drive:
     """One experiment; its registered poses are the prior."""
-    about = read_drive_file(path)
     files = sorted((_newer_college_scans(path) or path).glob("cloud_*_*.pcd"), key=_newer_college_stamp_ns)
     stamps_ns = np.array([_newer_college_stamp_ns(f) for f in files], dtype=np.int64)
     table = path / "ground_truth" / "registered_poses.csv"
@@ -341,7 +336,7 @@ def open_newer_college(path: Path, options: DriveOptions) -> Drive:
 
     prior = _if_there(table, lambda file: replace(read_trajectory(file), of_vehicle=True))
     folder = ScanFolder(files, stamps_ns, read, prior, T_base_lidar=NEWER_COLLEGE_MOUNT)
-    return open_scan_folder(path, about, options, folder)
+    return open_scan_folder(path, options, folder)
 
 
 def _newer_college_stamp_ns(file: Path) -> int:
@@ -357,9 +352,8 @@ def is_oxford(path: Path) -> bool:
 
 def open_oxford(path: Path, options: DriveOptions) -> Drive:
     """One LiDAR of a traversal, the left one unless --topic velodyne_right; the INS is the prior."""
-    about = read_drive_file(path)
     there = [name for name in _OXFORD_LIDARS if (path / name).is_dir()]
-    name = options.topic or about.topic or there[0]
+    name = options.topic or there[0]
     if name not in there:
         raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
     files = scan_files(path / name, ".bin")
@@ -370,7 +364,7 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
         T_base_lidar = (
             _OXFORD_AXES @ geometry.from_xyz_rpy(*(float(v) for v in read_numbers(mount, 6)[0])) @ _OXFORD_AXES
         )
-    elif options.mount is None and about.T_base_lidar is None:
+    elif options.mount is None and options.T_base_lidar is None:
         log.warning("%s: missing, so the LiDAR is taken to sit at the INS; give --mount", mount)
 
     def prior() -> Trajectory | F64 | None:
@@ -379,9 +373,7 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
             return None
         return read_ins(table)
 
-    return open_scan_folder(
-        path, about, options, ScanFolder(files, stamps_ns, _oxford_rows, prior, T_base_lidar=T_base_lidar)
-    )
+    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, _oxford_rows, prior, T_base_lidar=T_base_lidar))
 
 
 def _oxford_rows(file: Path) -> NDArray[np.void]:

@@ -15,7 +15,7 @@ import tomli_w
 
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
-from mapvote.formats.drives.options import DriveOptions, read_drive_file
+from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.scan_folder import ScanFolder, layout_of, open_scan_folder, read_stamps, scan_files
 
 
@@ -25,17 +25,16 @@ def is_kitti_folder(path: Path) -> bool:
 
 def open_kitti(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; its scans are read one by one. MapvoteError says what is missing or does not fit."""
-    about = read_drive_file(path)
     files = scan_files(path / "velodyne", ".bin")
-    layout = layout_of(files, options.columns or about.columns, options.dtype or about.dtype)
+    layout = layout_of(files, options.columns, options.dtype)
     folder = ScanFolder(
         files,
-        read_stamps(path, files, about, options),
+        read_stamps(path, files, options),
         layout.read,
         zero_is_no_return=False,
         spinning=True,
     )
-    return open_scan_folder(path, about, options, folder)
+    return open_scan_folder(path, options, folder)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, Unpack
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from mapvote.config import did_you_mean
 from mapvote.core import geometry
@@ -24,7 +25,7 @@ ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class SaidOfDrive(TypedDict, total=False):
-    """Options of a drive when it is opened, by name: :class:`DriveOptions` before any default."""
+    """Options of a drive when it is opened, by name; None says nothing."""
 
     scans: str | None
     prior: str | None
@@ -38,26 +39,9 @@ class SaidOfDrive(TypedDict, total=False):
     frame: MapFrame | None
 
 
-@dataclass(frozen=True, slots=True)
-class DriveOptions:
-    """What the command line may say about a drive; it wins over drive.toml."""
-
-    scans: str | None = None
-    prior: str | None = None
-    rate_hz: float | None = None
-    sensor: str | None = None
-    vehicle: str | None = None
-    mount: str | None = None
-    topic: str | None = None
-    columns: str | None = None
-    """Names of a .bin or .npy scan's columns, comma-separated."""
-    dtype: str | None = None
-    frame: MapFrame | None = None
-    """The map's frame, into which latitudes and longitudes go."""
-
-
-class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """drive.toml: what the files of a drive cannot say themselves. Every key is optional."""
+class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """What the files of a drive cannot say themselves: drive.toml, in which every key is optional, and over it what the
+    caller says."""
 
     vehicle: str | None = None
     drive: str | None = None
@@ -76,34 +60,41 @@ class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     origin: list[float] | None = None
     """Latitude, longitude (degrees), altitude (metres) of the map's origin, for priors from GNSS."""
     columns: str | None = None
+    """Names of a .bin or .npy scan's columns, comma-separated."""
     dtype: str | None = None
+    scans: str | None = None
+    mount: str | None = None
+    """``T_base_lidar`` as the command line gives it."""
+    frame: MapFrame | None = None
+    """The map's frame, into which latitudes and longitudes go."""
 
 
-def read_drive_file(folder: Path) -> DriveFile:
-    """``folder``/drive.toml, or all defaults if there is none. MapvoteError names an unknown key or a wrong value."""
+_NOT_IN_FILE = ("scans", "mount", "frame")
+
+
+def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
+    """``folder``/drive.toml, if there is one, and over it what is ``said``. MapvoteError names an unknown key or a
+    wrong value."""
     file = folder / "drive.toml"
-    if not file.is_file():
-        return DriveFile()
     try:
-        table = tomllib.loads(read_text(file))
+        table = tomllib.loads(read_text(file)) if file.is_file() else {}
     except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"{file}: not valid TOML ({error})") from error
+    keys = [key for key in DriveOptions.__struct_fields__ if key not in _NOT_IN_FILE]
     for key in table:
-        if key not in DriveFile.__struct_fields__:
-            raise MapvoteError(f"{file}: unknown key {key!r}{did_you_mean(key, DriveFile.__struct_fields__)}")
+        if key not in keys:
+            raise MapvoteError(f"{file}: unknown key {key!r}{did_you_mean(key, keys)}")
     try:
-        about = msgspec.convert(table, DriveFile)
+        options = msgspec.convert(table, DriveOptions)
     except msgspec.ValidationError as error:
         raise MapvoteError(f"{file}: {error}") from error
-    if about.prior_sigma_m <= 0 or about.prior_sigma_deg <= 0:
+    if options.prior_sigma_m <= 0 or options.prior_sigma_deg <= 0:
         raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive")
-    return about
+    return structs.replace(options, **{name: value for name, value in said.items() if value is not None})
 
 
-def read_mount(numbers: list[float] | str | None, where: str) -> F64:
+def read_mount(numbers: list[float] | str, where: str) -> F64:
     """T_base_lidar (4, 4) from 12 numbers (rows of 3 x 4) or 6 (metres; roll, pitch, yaw in degrees)."""
-    if numbers is None:
-        return np.eye(4)
     try:
         values = [float(v) for v in numbers.replace(",", " ").split()] if isinstance(numbers, str) else numbers
     except ValueError as error:
@@ -140,15 +131,15 @@ def read_sensor(sensor: str | dict[str, Any], where: str) -> Sensor:
         raise MapvoteError(f"{where}: [sensor]: {error}") from error
 
 
-def map_frame(about: DriveFile, options: DriveOptions) -> MapFrame | None:
+def map_frame(options: DriveOptions) -> MapFrame | None:
     """The frame that latitudes and longitudes go into: the map's, else a plane at drive.toml's origin, else None."""
     if options.frame is not None and not options.frame.is_local:
         return options.frame
-    if about.origin is None:
+    if options.origin is None:
         return None
-    if len(about.origin) != 3:
+    if len(options.origin) != 3:
         raise MapvoteError("drive.toml: origin must be latitude, longitude, altitude")
-    return enu_frame(*about.origin)
+    return enu_frame(*options.origin)
 
 
 def parse_scans(scans: str | None, n: int, where: str) -> I64:
@@ -191,7 +182,6 @@ def _checked_id(name: str, what: str, where: str) -> str:
 
 def make_drive(
     path: Path,
-    about: DriveFile,
     options: DriveOptions,
     *,
     stamps_ns: I64,
@@ -216,28 +206,27 @@ def make_drive(
             f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or correct times.txt"
         )
     chosen = parse_scans(options.scans, len(stamps_ns), where)
-    rate_hz = options.rate_hz or about.rate_hz
-    sensor, told = _sensor_of(where, options.sensor or about.sensor, stamps_ns, chosen, rate_hz, read_scan)
+    rate_hz = options.rate_hz
+    sensor, told = _sensor_of(where, options.sensor, stamps_ns, chosen, rate_hz, read_scan)
     if rate_hz is not None:
         if not 0.1 <= rate_hz <= 100:
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
         sensor = replace(sensor, rate_hz=rate_hz)
-    drive_id = about.drive or name_from(path)
 
     def read_chosen(i: int) -> Scan:
         return read_scan(int(chosen[i]), sensor)
 
     return Drive(
         path=path,
-        vehicle=_checked_id(options.vehicle or about.vehicle or name_from(path), "vehicle", where),
-        drive_id=_checked_id(drive_id, "drive", where),
+        vehicle=_checked_id(options.vehicle or name_from(path), "vehicle", where),
+        drive_id=_checked_id(options.drive or name_from(path), "drive", where),
         sensor=sensor,
         stamps_ns=stamps_ns[chosen],
         read_scan=read_chosen,
         T_map_lidar_prior=None if T_map_lidar_prior is None else T_map_lidar_prior[chosen],
-        prior_sigma_m=about.prior_sigma_m,
-        prior_sigma_deg=about.prior_sigma_deg,
-        T_base_lidar=mount_of(about, options, T_base_lidar, where),
+        prior_sigma_m=options.prior_sigma_m,
+        prior_sigma_deg=options.prior_sigma_deg,
+        T_base_lidar=mount_of(options, T_base_lidar, where),
         georeference={} if frame.is_local else frame.georeference(),
         sensor_told=told,
     )
@@ -268,7 +257,9 @@ def _sensor_of(
     return found.sensor, found.told
 
 
-def mount_of(about: DriveFile, options: DriveOptions, own: F64 | None, where: str) -> F64:
-    """T_base_lidar (4, 4): the caller's, else drive.toml's, else the format's own."""
-    said = options.mount or about.T_base_lidar
-    return own if said is None and own is not None else read_mount(said, where)
+def mount_of(options: DriveOptions, own: F64 | None, where: str) -> F64:
+    """T_base_lidar (4, 4): what the options say, else the format's own, else the identity."""
+    said = options.mount or options.T_base_lidar
+    if said is not None:
+        return read_mount(said, where)
+    return np.eye(4) if own is None else own

@@ -19,7 +19,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.clean import BadPoints, log
-from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, map_frame, mount_of, read_drive_file
+from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
 from mapvote.formats.drives.point_fields import point_cloud_table, scan_from_fields
 from mapvote.formats.drives.scan_folder import prior_file
 from mapvote.formats.drives.trajectory import (
@@ -110,13 +110,12 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     of the first topic's LiDAR, by /tf_static. MapvoteError lists the topics if there is none
     or a choice to make.
     """
-    about = read_drive_file(path) if path.is_dir() else DriveFile()
     bag = Bag(path)
-    topics = _choose_topics(bag, options.topic or about.topic)
+    topics = _choose_topics(bag, options.topic)
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other) for other in topics[1:])]
     sweeps = _sweeps(bag, topics)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
-    T_prior, frame = _prior(bag, about, options, stamps_ns)
+    T_prior, frame = _prior(bag, options, stamps_ns)
     bad_points = BadPoints(str(path))
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
@@ -133,27 +132,25 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         scans = [read_message(i, message, sensor) for message in sweeps[i]]
         return scans[0] if len(scans) == 1 else Scan.sweep(int(stamps_ns[i]), scans)
 
-    return make_drive(
-        path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan, frame=frame
-    )
+    return make_drive(path, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan, frame=frame)
 
 
-def _prior(bag: Bag, about: DriveFile, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None, MapFrame]:
+def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None, MapFrame]:
     """T_map_lidar of every scan (n, 4, 4) from a topic or a file, and the frame it is in."""
-    wanted = options.prior or about.prior
+    wanted = options.prior
     if wanted in bag.topics(*POSES, *GNSS):
-        found = bag_trajectory(bag, wanted or "", map_frame(about, options))
-        T_base_lidar = mount_of(about, options, None, str(bag.path))
+        found = bag_trajectory(bag, wanted or "", map_frame(options))
+        T_base_lidar = mount_of(options, None, str(bag.path))
         return found.at(stamps_ns, f"{bag.path}: {wanted}") @ T_base_lidar, found.frame
     if wanted is not None and wanted.startswith("/") and not Path(wanted).is_file():
         listed = ", ".join(bag.topics(*POSES, *GNSS)) or "none"
         raise MapvoteError(f"{bag.path}: no pose topic {wanted}; topics with poses: {listed}")
-    file = prior_file(bag.path, about, options)
+    file = prior_file(bag.path, options)
     if file is None:
         return None, MapFrame()
     if has_times(file):
-        found = read_trajectory(file, map_frame(about, options))
-        T_base_lidar = mount_of(about, options, None, str(bag.path)) if found.of_vehicle else np.eye(4)
+        found = read_trajectory(file, map_frame(options))
+        T_base_lidar = mount_of(options, None, str(bag.path)) if found.of_vehicle else np.eye(4)
         return found.at(stamps_ns, str(file)) @ T_base_lidar, found.frame
     T_prior = read_T_map_lidar(file, bag.path)
     if len(T_prior) != len(stamps_ns):

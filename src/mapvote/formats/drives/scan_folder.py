@@ -23,7 +23,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.clean import BadPoints, log, stamps_from_rate
-from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, map_frame, mount_of, read_drive_file
+from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
 from mapvote.formats.drives.point_fields import scan_from_fields
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, has_times, read_T_map_lidar, read_trajectory
 from mapvote.formats.extras import read_text
@@ -90,7 +90,7 @@ def read_times_ns(file: Path) -> I64:
     return np.array(out, dtype=np.int64)
 
 
-def read_stamps(folder: Path, files: list[Path], about: DriveFile, options: DriveOptions) -> I64:
+def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     """(n,) stamps: from times.txt, else evenly at the rate given, else from names like 1317042145.964.pcd.
 
     MapvoteError if there is none of them.
@@ -98,13 +98,12 @@ def read_stamps(folder: Path, files: list[Path], about: DriveFile, options: Driv
     table = folder / "times.txt"
     if table.is_file():
         times_ns = read_times_ns(table)
-        return about.start_ns + times_ns[lines_of_scans(len(times_ns), files, table)]
-    rate_hz = options.rate_hz or about.rate_hz
-    if rate_hz is None and all(number_of(f) > 1e8 for f in files):
+        return options.start_ns + times_ns[lines_of_scans(len(times_ns), files, table)]
+    if options.rate_hz is None and all(number_of(f) > 1e8 for f in files):
         return np.array([_stamp_in_name_ns(f) for f in files], dtype=np.int64)
-    if rate_hz is None:
+    if options.rate_hz is None:
         raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
-    return stamps_from_rate(len(files), rate_hz, about.start_ns)
+    return stamps_from_rate(len(files), options.rate_hz, options.start_ns)
 
 
 def _stamp_in_name_ns(file: Path) -> int:
@@ -114,9 +113,9 @@ def _stamp_in_name_ns(file: Path) -> int:
     return int(number * 10 ** (9 - power))
 
 
-def prior_file(folder: Path, about: DriveFile, options: DriveOptions) -> Path | None:
+def prior_file(folder: Path, options: DriveOptions) -> Path | None:
     """The file that the prior comes from: the caller's, else drive.toml's, else prior.txt if it exists."""
-    wanted = options.prior or about.prior
+    wanted = options.prior
     if wanted is None:
         return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
     if wanted.lower() == "none":
@@ -150,10 +149,10 @@ class ScanFolder:
     """Points without times get them from their azimuth, unless drive.toml says motion_compensated."""
 
 
-def open_scan_folder(path: Path, about: DriveFile, options: DriveOptions, folder: ScanFolder) -> Drive:
+def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
     """The drive of a folder; scans are read one by one. MapvoteError says what is missing or does not fit."""
     bad_points = BadPoints(str(path))
-    T_prior, frame = prior_of(path, about, options, folder)
+    T_prior, frame = prior_of(path, options, folder)
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
         file = folder.files[i]
@@ -165,12 +164,11 @@ def open_scan_folder(path: Path, about: DriveFile, options: DriveOptions, folder
             sensor=sensor,
             bad_points=bad_points,
             zero_is_no_return=folder.zero_is_no_return,
-            spinning=folder.spinning and not about.motion_compensated,
+            spinning=folder.spinning and not options.motion_compensated,
         )
 
     return make_drive(
         path,
-        about,
         options,
         stamps_ns=folder.stamps_ns,
         T_map_lidar_prior=T_prior,
@@ -180,16 +178,16 @@ def open_scan_folder(path: Path, about: DriveFile, options: DriveOptions, folder
     )
 
 
-def prior_of(path: Path, about: DriveFile, options: DriveOptions, folder: ScanFolder) -> tuple[F64 | None, MapFrame]:
+def prior_of(path: Path, options: DriveOptions, folder: ScanFolder) -> tuple[F64 | None, MapFrame]:
     """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the caller's file, else the layout's own."""
-    T_base_lidar = mount_of(about, options, folder.T_base_lidar, str(path))
-    file = prior_file(path, about, options)
-    wanted = options.prior or about.prior
-    own = None if wanted is not None and wanted.lower() == "none" else folder.prior() if file is None else None
+    T_base_lidar = mount_of(options, folder.T_base_lidar, str(path))
+    file = prior_file(path, options)
+    refused = options.prior is not None and options.prior.lower() == "none"
+    own = folder.prior() if file is None and not refused else None
     if file is not None:
         if not has_times(file):
             return of_scans(read_T_map_lidar(file, path), folder.files, file), MapFrame()
-        own = read_trajectory(file, map_frame(about, options))
+        own = read_trajectory(file, map_frame(options))
     if own is None:
         return None, MapFrame()
     if not isinstance(own, Trajectory):
@@ -294,20 +292,19 @@ def is_cloud_scans(path: Path) -> bool:
 
 def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
-    about = read_drive_file(path)
     found = _folder_of(path)
     if found is None:
         raise MapvoteError(f"{path}: no scans ({', '.join(_SUFFIXES)}) in it")
     files = scan_files(*found)
-    columns = options.columns or about.columns
+    columns = options.columns
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
         ".ply": lambda file: _table(read_ply(file)),
         ".las": lambda file: _table(read_las(file)),
         ".laz": lambda file: _table(read_las(file)),
         ".npy": lambda file: _read_npy(file, columns),
     }
-    read = readers.get(found[1]) or layout_of(files, columns, options.dtype or about.dtype).read
-    return open_scan_folder(path, about, options, ScanFolder(files, read_stamps(path, files, about, options), read))
+    read = readers.get(found[1]) or layout_of(files, columns, options.dtype).read
+    return open_scan_folder(path, options, ScanFolder(files, read_stamps(path, files, options), read))
 
 
 def _table(cloud: Cloud) -> NDArray[np.void]:
@@ -350,9 +347,8 @@ def is_pcd_drive(path: Path) -> bool:
 
 def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
-    about = read_drive_file(path)
     files = scan_files(_pcd_folder(path) or path, ".pcd")
-    stamps_ns = read_stamps(path, files, about, options)
+    stamps_ns = read_stamps(path, files, options)
     viewpoints = _viewpoints(files)
     in_map_frame = viewpoints is not None and _points_lie_around(viewpoints, files)
     if in_map_frame:
@@ -370,7 +366,7 @@ def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
             log.warning("%s: the PCD files' VIEWPOINT is taken as prior; --prior none refuses it", path)
         return viewpoints
 
-    return open_scan_folder(path, about, options, ScanFolder(files, stamps_ns, read, prior))
+    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, read, prior))
 
 
 def _viewpoints(files: list[Path]) -> F64 | None:
