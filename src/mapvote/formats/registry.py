@@ -8,16 +8,14 @@ from pathlib import Path
 
 from mapvote.core.types import Drive
 from mapvote.formats.drives.datasets import (
-    is_boreas,
+    BOREAS,
+    MULRAN,
+    NEWER_COLLEGE,
+    Dataset,
     is_kitti_raw,
-    is_mulran,
-    is_newer_college,
     is_nuscenes,
     is_oxford,
-    open_boreas,
     open_kitti_raw,
-    open_mulran,
-    open_newer_college,
     open_nuscenes,
     open_oxford,
 )
@@ -68,13 +66,13 @@ class MapWriter:
     """Whether the format has a place for ASPRS classes."""
 
 
-DRIVES: dict[str, DriveFormat] = {
+DRIVES: dict[str, DriveFormat | Dataset] = {
     "KITTI drive folder": DriveFormat(is_kitti_folder, open_kitti),
     "KITTI raw or KITTI-360 recording": DriveFormat(is_kitti_raw, open_kitti_raw),
     "nuScenes": DriveFormat(is_nuscenes, open_nuscenes),
-    "Boreas sequence": DriveFormat(is_boreas, open_boreas),
-    "MulRan sequence": DriveFormat(is_mulran, open_mulran),
-    "Newer College experiment": DriveFormat(is_newer_college, open_newer_college),
+    "Boreas sequence": BOREAS,
+    "MulRan sequence": MULRAN,
+    "Newer College experiment": NEWER_COLLEGE,
     "Oxford RobotCar traversal": DriveFormat(is_oxford, open_oxford),
     "ROS bag": DriveFormat(is_rosbag, open_rosbag),
     "folder of PCD scans": DriveFormat(is_pcd_drive, open_pcd_drive),

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +44,18 @@ from mapvote.formats.drives.scan_folder import (
     read_bytes,
     read_times_ns,
     scan_files,
+    stamp_in_name_ns,
 )
 from mapvote.formats.drives.trajectory import (
     Trajectory,
-    check_rigid,
+    exact_ns,
+    motions_of_rpy,
+    needed,
     read_calib,
+    read_columns,
     read_numbers,
     read_trajectory,
+    rigid_motions,
     sorted_trajectory,
 )
 from mapvote.formats.extras import read_text
@@ -64,24 +69,11 @@ NuscenesTable = dict[str, dict[str, Any]]
 BOREAS_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "time")
 MULRAN_MOUNT = geometry.from_xyz_rpy(1.7042, -0.021, 1.8047, *np.deg2rad([0.0001, 0.0003, 179.6654]))
 """The dataset's calib_base2ouster.txt."""
-_NEWER_COLLEGE = ("raw_format/ouster_scan", "ouster_scan")
 NEWER_COLLEGE_MOUNT = geometry.from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
 """The camera that carries the poses to the Ouster (Ramezani et al. 2020)."""
 _OXFORD_LIDARS = ("velodyne_left", "velodyne_right")
 _OXFORD_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _NORTH_EAST_DOWN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-
-
-def _if_there(table: Path, read: Callable[[Path], Trajectory], why: str = "") -> Callable[[], Trajectory | None]:
-    """A prior from ``table``; none, with a warning, where that is missing."""
-
-    def prior() -> Trajectory | None:
-        if table.is_file():
-            return read(table)
-        log.warning("%s: missing%s, so there is no prior", table, why)
-        return None
-
-    return prior
 
 
 def is_kitti_raw(path: Path) -> bool:
@@ -126,9 +118,7 @@ def _oxts_prior(
     numbers = read_calib(calib)
     if "R" not in numbers or "T" not in numbers or numbers["R"].size != 9 or numbers["T"].size != 3:
         raise MapvoteError(f"{calib}: no lines R: (9 numbers) and T: (3 numbers)")
-    T_lidar_imu = np.eye(4)
-    T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = numbers["R"].reshape(3, 3), numbers["T"]
-    check_rigid(T_lidar_imu[None], str(calib))
+    T_lidar_imu = rigid_motions(np.column_stack([numbers["R"].reshape(3, 3), numbers["T"]]), str(calib))[0]
     rows = np.concatenate([read_numbers(f, 30) for f in scan_files(folder, ".txt")])
     T_map_imu, frame = poses_from_gnss(rows[:, [1, 0, 2]], rows[:, 3:6], map_frame(options))
     T_map_lidar = of_scans(T_map_imu @ geometry.inverse(T_lidar_imu), files, folder)
@@ -151,9 +141,7 @@ def kitti_360_poses(path: Path, files: list[Path], stamps_ns: I64) -> Trajectory
     """
     file = _pose_file(path)
     rows = read_numbers(file, 13)
-    T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_imu[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
-    check_rigid(T_world_imu, str(file))
+    T_world_imu = rigid_motions(rows[:, 1:], str(file))
     T_imu_lidar = _T_imu_lidar(path.resolve().parents[1] / "calibration")
     numbers = np.array([number_of(f) for f in files])
     first = np.searchsorted(numbers, rows[:, 0])
@@ -168,11 +156,10 @@ def kitti_360_poses(path: Path, files: list[Path], stamps_ns: I64) -> Trajectory
 def _T_imu_lidar(folder: Path) -> F64:
     """(4, 4) through camera 0: calib_cam_to_pose.txt and calib_cam_to_velo.txt."""
     calib = read_calib(folder / "calib_cam_to_pose.txt")
-    velo = np.array([float(word) for word in read_text(folder / "calib_cam_to_velo.txt").split()])
+    velo = read_numbers(folder / "calib_cam_to_velo.txt", 12).ravel()
     if "image_00" not in calib or calib["image_00"].size != 12 or velo.size != 12:
         raise MapvoteError(f"{folder}: calib_cam_to_pose.txt (image_00) and calib_cam_to_velo.txt need 12 numbers each")
-    T_imu_camera, T_lidar_camera = np.eye(4), np.eye(4)
-    T_imu_camera[:3], T_lidar_camera[:3] = calib["image_00"].reshape(3, 4), velo.reshape(3, 4)
+    T_imu_camera, T_lidar_camera = rigid_motions(np.stack([calib["image_00"], velo]), str(folder))
     return T_imu_camera @ geometry.inverse(T_lidar_camera)
 
 
@@ -192,11 +179,11 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
 
     if tables is None:
         folders = [path / folder for folder in _LIDAR_TOP] if not any(path.glob("*.pcd.bin")) else [path]
-        files = sorted((f for folder in folders for f in folder.glob("*.pcd.bin")), key=_microseconds_in_name)
+        files = sorted((f for folder in folders for f in folder.glob("*.pcd.bin")), key=stamp_in_name_ns)
         if not files:
             raise MapvoteError(f"{path}: no *.pcd.bin scans in {', '.join(_LIDAR_TOP)}")
         log.warning("%s: no tables v1.0-*, so no poses: only the scans are read", path)
-        stamps = np.array([_microseconds_in_name(f) * 1000 for f in files], dtype=np.int64)
+        stamps = np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
         return open_scan_folder(path, options, ScanFolder(files, stamps, read))
     rows = _scene(path, tables, options.topic)
     files = [path / row["filename"] for row in rows]
@@ -205,17 +192,8 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
     T_base_lidar = _nuscenes_pose(mounts[rows[0]["calibrated_sensor_token"]])
     T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ _NUSCENES_AXES
     T_map_base = np.stack([_nuscenes_pose(poses[row["ego_pose_token"]]) for row in rows])
-
-    def prior() -> Trajectory | F64 | None:
-        return T_map_base @ T_base_lidar
-
-    folder = ScanFolder(files, stamps, read, prior, T_base_lidar=T_base_lidar)
+    folder = ScanFolder(files, stamps, read, lambda: T_map_base @ T_base_lidar, T_base_lidar=T_base_lidar)
     return open_scan_folder(path, options, folder)
-
-
-def _microseconds_in_name(file: Path) -> int:
-    """Microseconds in a name such as n015-2018-07-24__LIDAR_TOP__1532402927647951.pcd.bin."""
-    return int(number_of(Path(file.name.removesuffix(".pcd.bin").rpartition("__")[2])))
 
 
 def _scene(path: Path, tables: Path, wanted: str | None) -> list[dict[str, Any]]:
@@ -253,90 +231,65 @@ def _nuscenes_pose(row: dict[str, Any]) -> F64:
     return T
 
 
-def is_boreas(path: Path) -> bool:
-    return (path / "lidar").is_dir() and (path / "applanix").is_dir()
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """A dataset whose scans are named by their stamps, with a table of poses."""
+
+    scans: tuple[str, ...]
+    """Patterns of their paths, of which one is used."""
+    read: Callable[[Path], NDArray[np.void]]
+    poses: str
+    """The table. Without it there is no prior, with a warning."""
+    read_poses: Callable[[Path], Trajectory]
+    T_base_lidar: F64 | None = None
+    stamp_ns: Callable[[Path], int] = stamp_in_name_ns
+    beside: str = "."
+    """A folder that distinguishes it from others."""
+
+    def recognised(self, path: Path) -> bool:
+        return (path / self.beside).is_dir() and any(any(path.glob(pattern)) for pattern in self.scans)
+
+    def open(self, path: Path, options: DriveOptions) -> Drive:
+        """The drive in ``path``. MapvoteError says what is missing or does not fit."""
+        files = sorted((file for pattern in self.scans for file in path.glob(pattern)), key=self.stamp_ns)
+        stamps_ns = np.array([self.stamp_ns(file) for file in files], dtype=np.int64)
+        table = path / self.poses
+
+        def prior() -> Trajectory | None:
+            if table.is_file():
+                return self.read_poses(table)
+            log.warning("%s: missing, so there is no prior", table)
+            return None
+
+        folder = ScanFolder(files, stamps_ns, self.read, prior, T_base_lidar=self.T_base_lidar)
+        return open_scan_folder(path, options, folder)
 
 
-def open_boreas(path: Path, options: DriveOptions) -> Drive:
-    """One sequence; its post-processed poses are the prior. The times of points count from the scan's."""
-    files = scan_files(path / "lidar", ".bin")
-    stamps_ns = np.array([int(number_of(f)) * 1000 for f in files], dtype=np.int64)
-    table = path / "applanix" / "lidar_poses.csv"
-
-    prior = _if_there(table, read_lidar_poses, " (test sequences keep it secret)")
-    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, BinLayout(BOREAS_COLUMNS).read, prior))
-
-
-def read_lidar_poses(file: Path) -> Trajectory:
+def _boreas_poses(file: Path) -> Trajectory:
     """GPSTime (microseconds), easting, northing, altitude, velocities, roll, pitch, heading (radians).
 
     Boreas' rotations are those of its development kit: R_enu_lidar is the inverse of the usual roll, pitch, yaw.
     """
-    with file.open() as stream:
-        header, text = stream.readline(), stream.read()
-    if "easting" not in header.lower():
-        raise MapvoteError(f"{file}: no header with GPSTime, easting, northing, altitude ...; copy it again")
-    rows = np.array([[float(v) for v in line.split(",")[:10]] for line in text.splitlines() if line.strip()])
-    if rows.ndim != 2 or rows.shape[1] < 10:
-        raise MapvoteError(f"{file}: rows need ten columns or more; copy it again")
-    stamps = np.array([int(line.split(",")[0]) for line in text.splitlines() if line.strip()], dtype=np.int64) * 1000
-    T = np.stack([geometry.from_xyz_rpy(0.0, 0.0, 0.0, *(float(v) for v in row[7:10])) for row in rows])
+    times_ns, columns = read_columns(file)
+    T = motions_of_rpy(needed(file, columns, "x", "y", "z", "roll", "pitch", "heading"))
     T[:, :3, :3] = T[:, :3, :3].swapaxes(1, 2)
-    T[:, :3, 3] = rows[:, 1:4]
-    return sorted_trajectory(stamps, T, of_vehicle=False, frame=MapFrame())
-
-
-def is_mulran(path: Path) -> bool:
-    return (path / "Ouster").is_dir()
-
-
-def open_mulran(path: Path, options: DriveOptions) -> Drive:
-    """One sequence; its global poses (UTM of zone 52, of the vehicle) are the prior."""
-    files = scan_files(path / "Ouster", ".bin")
-    stamps_ns = np.array([int(f.stem) if f.stem.isdigit() else int(number_of(f)) for f in files], dtype=np.int64)
-    table = path / "global_pose.csv"
-
-    prior = _if_there(table, _mulran_poses)
-    folder = ScanFolder(files, stamps_ns, BinLayout().read, prior, T_base_lidar=MULRAN_MOUNT)
-    return open_scan_folder(path, options, folder)
+    return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
 
 
 def _mulran_poses(table: Path) -> Trajectory:
-    """T_map_base, in UTM of zone 52 where the coordinates are so large."""
-    rows = read_numbers(table, 13)
-    # The first column as text: float64 does not hold nanoseconds since 1970.
-    first = [line.split(",")[0].strip() for line in read_text(table).splitlines() if line.strip()]
-    times = [int(word) if word.isdigit() else int(float(word)) for word in first]
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
-    check_rigid(T, str(table))
-    frame = MapFrame("EPSG:32652") if np.abs(T[0, :2, 3]).max() > 1e5 else MapFrame()
-    return sorted_trajectory(np.array(times, dtype=np.int64), T, of_vehicle=True, frame=frame)
+    """T_map_base of rows of nanoseconds and 3 x 4 matrices, in UTM of zone 52 where the coordinates are so large."""
+    T = rigid_motions(read_numbers(table, 13)[:, 1:], str(table))
+    times_ns = exact_ns(table, [line.split(",")[0] for line in read_text(table).splitlines() if line.strip()])
+    frame = MapFrame("EPSG:32652") if len(T) and np.abs(T[0, :2, 3]).max() > 1e5 else MapFrame()
+    return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
 
 
-def _newer_college_scans(path: Path) -> Path | None:
-    return next(
-        (path / f for f in _NEWER_COLLEGE if (path / f).is_dir() and any((path / f).glob("cloud_*_*.pcd"))),
-        None,
-    )
+def _newer_college_table(file: Path) -> NDArray[np.void]:
+    return read_pcd_table(file)[0]
 
 
-def is_newer_college(path: Path) -> bool:
-    return _newer_college_scans(path) is not None
-
-
-def open_newer_college(path: Path, options: DriveOptions) -> Drive:
-    """One experiment; its registered poses are the prior."""
-    files = sorted((_newer_college_scans(path) or path).glob("cloud_*_*.pcd"), key=_newer_college_stamp_ns)
-    stamps_ns = np.array([_newer_college_stamp_ns(f) for f in files], dtype=np.int64)
-    table = path / "ground_truth" / "registered_poses.csv"
-
-    def read(file: Path) -> NDArray[np.void]:
-        return read_pcd_table(file)[0]
-
-    prior = _if_there(table, lambda file: replace(read_trajectory(file), of_vehicle=True))
-    folder = ScanFolder(files, stamps_ns, read, prior, T_base_lidar=NEWER_COLLEGE_MOUNT)
-    return open_scan_folder(path, options, folder)
+def _newer_college_poses(file: Path) -> Trajectory:
+    return replace(read_trajectory(file), of_vehicle=True)
 
 
 def _newer_college_stamp_ns(file: Path) -> int:
@@ -344,36 +297,6 @@ def _newer_college_stamp_ns(file: Path) -> int:
     if len(words) < 3 or not (words[1].isdigit() and words[2].isdigit()):
         raise MapvoteError(f"{file}: its name is not cloud_SECONDS_NANOSECONDS.pcd")
     return int(words[1]) * 10**9 + int(words[2])
-
-
-def is_oxford(path: Path) -> bool:
-    return any((path / name).is_dir() for name in _OXFORD_LIDARS)
-
-
-def open_oxford(path: Path, options: DriveOptions) -> Drive:
-    """One LiDAR of a traversal, the left one unless --topic velodyne_right; the INS is the prior."""
-    there = [name for name in _OXFORD_LIDARS if (path / name).is_dir()]
-    name = options.topic or there[0]
-    if name not in there:
-        raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
-    files = scan_files(path / name, ".bin")
-    stamps_ns = np.array([int(number_of(f)) * 1000 for f in files], dtype=np.int64)
-    table, mount = path / "gps" / "ins.csv", path / "extrinsics" / f"{name}.txt"
-    T_base_lidar = np.eye(4)
-    if mount.is_file():
-        T_base_lidar = (
-            _OXFORD_AXES @ geometry.from_xyz_rpy(*(float(v) for v in read_numbers(mount, 6)[0])) @ _OXFORD_AXES
-        )
-    elif options.mount is None and options.T_base_lidar is None:
-        log.warning("%s: missing, so the LiDAR is taken to sit at the INS; give --mount", mount)
-
-    def prior() -> Trajectory | F64 | None:
-        if not table.is_file():
-            log.warning("%s: missing, so there is no prior", table)
-            return None
-        return read_ins(table)
-
-    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, _oxford_rows, prior, T_base_lidar=T_base_lidar))
 
 
 def _oxford_rows(file: Path) -> NDArray[np.void]:
@@ -387,19 +310,43 @@ def _oxford_rows(file: Path) -> NDArray[np.void]:
     return table
 
 
-def read_ins(file: Path) -> Trajectory:
+def _oxford_poses(file: Path) -> Trajectory:
     """T_map_base in UTM of ins.csv: microseconds; northing, easting, down (m); roll, pitch, yaw from north (rad)."""
-    lines = [line.split(",") for line in read_text(file).splitlines() if line.strip()]
-    names = [name.strip() for name in lines[0]]
-    wanted = ("northing", "easting", "down", "roll", "pitch", "yaw", "latitude", "longitude")
-    missing = [name for name in ("timestamp", *wanted) if name not in names]
-    if missing or len(lines) < 2:
-        raise MapvoteError(f"{file}: no rows, or no column {', '.join(missing)}")
-    try:
-        rows = np.array([[float(line[names.index(name)]) for name in wanted] for line in lines[1:]])
-        times = np.array([int(line[names.index("timestamp")]) for line in lines[1:]], dtype=np.int64) * 1000
-    except (ValueError, IndexError) as error:
-        raise MapvoteError(f"{file}: a row is not whole ({error}); copy it again") from error
-    T_ned = np.stack([geometry.from_xyz_rpy(*(float(v) for v in row[:6])) for row in rows])
-    frame = MapFrame(utm_of(float(rows[0, 7]), float(rows[0, 6])))
-    return sorted_trajectory(times, _NORTH_EAST_DOWN @ T_ned @ _OXFORD_AXES, of_vehicle=True, frame=frame)
+    times_ns, columns = read_columns(file)
+    T_ned = motions_of_rpy(needed(file, columns, "y", "x", "down", "roll", "pitch", "yaw"))
+    longitude, latitude = needed(file, columns, "longitude", "latitude")[0].tolist()
+    T_map_base = _NORTH_EAST_DOWN @ T_ned @ _OXFORD_AXES
+    return sorted_trajectory(times_ns, T_map_base, of_vehicle=True, frame=MapFrame(utm_of(longitude, latitude)))
+
+
+def is_oxford(path: Path) -> bool:
+    return any((path / name).is_dir() for name in _OXFORD_LIDARS)
+
+
+def open_oxford(path: Path, options: DriveOptions) -> Drive:
+    """One LiDAR of a traversal, the left one unless --topic velodyne_right; the INS is the prior."""
+    there = [name for name in _OXFORD_LIDARS if (path / name).is_dir()]
+    name = options.topic or there[0]
+    if name not in there:
+        raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
+    mount, T_base_lidar = path / "extrinsics" / f"{name}.txt", None
+    if mount.is_file():
+        T_base_lidar = _OXFORD_AXES @ motions_of_rpy(read_numbers(mount, 6))[0] @ _OXFORD_AXES
+    elif options.mount is None and options.T_base_lidar is None:
+        log.warning("%s: missing, so the LiDAR is taken to sit at the INS; give --mount", mount)
+    return Dataset((f"{name}/*.bin",), _oxford_rows, "gps/ins.csv", _oxford_poses, T_base_lidar).open(path, options)
+
+
+BOREAS = Dataset(
+    ("lidar/*.bin",), BinLayout(BOREAS_COLUMNS).read, "applanix/lidar_poses.csv", _boreas_poses, beside="applanix"
+)
+"""Test sequences keep their poses secret. The times of points count from the scan's."""
+MULRAN = Dataset(("Ouster/*.bin",), BinLayout().read, "global_pose.csv", _mulran_poses, MULRAN_MOUNT)
+NEWER_COLLEGE = Dataset(
+    ("raw_format/ouster_scan/cloud_*_*.pcd", "ouster_scan/cloud_*_*.pcd"),
+    _newer_college_table,
+    "ground_truth/registered_poses.csv",
+    _newer_college_poses,
+    NEWER_COLLEGE_MOUNT,
+    _newer_college_stamp_ns,
+)

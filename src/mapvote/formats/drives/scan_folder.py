@@ -100,15 +100,21 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
         times_ns = read_times_ns(table)
         return options.start_ns + times_ns[lines_of_scans(len(times_ns), files, table)]
     if options.rate_hz is None and all(number_of(f) > 1e8 for f in files):
-        return np.array([_stamp_in_name_ns(f) for f in files], dtype=np.int64)
+        return np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
     if options.rate_hz is None:
         raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
     return stamps_from_rate(len(files), options.rate_hz, options.start_ns)
 
 
-def _stamp_in_name_ns(file: Path) -> int:
-    """A file named by its time since 1970: seconds, or a whole number of milli-, micro- or nanoseconds."""
-    number = Decimal(re.findall(r"\d+(?:\.\d+)?", file.stem)[-1])
+def stamp_in_name_ns(file: Path) -> int:
+    """A file named by its time since 1970: seconds, or a whole number of milli-, micro- or nanoseconds.
+
+    MapvoteError if there is no number in its name.
+    """
+    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    if not numbers:
+        raise MapvoteError(f"{file}: its name holds no time; a scan is named by its stamp")
+    number = Decimal(numbers[-1])
     power = next(p for p in (0, 3, 6, 9) if number < Decimal(10) ** (10 + p) or p == 9)
     return int(number * 10 ** (9 - power))
 

@@ -5,7 +5,7 @@ a header, also of latitudes and longitudes. Those with times of their own are br
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +19,7 @@ from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
-_TIMES = {"timestamp": None, "time": None, "stamp": None, "t": None, "gpstime": None, "sec": 1e9, "secs": 1e9}
-_NANOSECONDS = ("nsec", "nanosec", "nsecs", "nanosecs")
+_TIMES = ("timestamp", "time", "stamp", "t", "gpstime", "sec", "secs")
 _COLUMNS = {
     "x": ("x", "tx", "pos_x", "position_x", "easting", "east"),
     "y": ("y", "ty", "pos_y", "position_y", "northing", "north"),
@@ -32,6 +31,8 @@ _COLUMNS = {
     "roll": ("roll",),
     "pitch": ("pitch",),
     "yaw": ("yaw",),
+    "down": ("down",),
+    "nanoseconds": ("nsec", "nanosec", "nsecs", "nanosecs"),
     "heading": ("heading", "azimuth", "course"),
     "latitude": ("latitude", "lat"),
     "longitude": ("longitude", "lon", "lng"),
@@ -60,10 +61,22 @@ def read_poses(file: Path) -> F64:
     """(n, 4, 4) from rows of 12 numbers (3 x 4) or 16 (4 x 4), as they stand in the file. MapvoteError if not rigid."""
     first = next((line for line in read_text(file).splitlines() if line.strip()), "")
     columns = 16 if len(first.replace(",", " ").split()) == 16 else 12
-    rows = read_numbers(file, columns)
+    return rigid_motions(read_numbers(file, columns)[:, :12], str(file))
+
+
+def rigid_motions(rows: F64, where: str) -> F64:
+    """(n, 4, 4) of rows of 12 numbers, 3 x 4 matrices row by row. MapvoteError names the first that is not rigid."""
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-    check_rigid(T, str(file))
+    T[:, :3] = rows.reshape(-1, 3, 4)
+    check_rigid(T, where)
+    return T
+
+
+def motions_of_rpy(rows: F64) -> F64:
+    """(n, 4, 4) of rows x, y, z (metres), roll, pitch, yaw (radians): R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, 3] = rows[:, :3]
+    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
     return T
 
 
@@ -102,10 +115,7 @@ def read_T_camera_lidar(file: Path) -> F64:
     calib = read_calib(file)
     for name in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam"):
         if name in calib and calib[name].size == 12:
-            T = np.eye(4)
-            T[:3] = calib[name].reshape(3, 4)
-            check_rigid(T[None], f"{file} ({name})")
-            return T
+            return rigid_motions(calib[name], f"{file} ({name})")[0]
     raise MapvoteError(f"{file}: no line 'Tr:' with 12 numbers, the motion from LiDAR to camera")
 
 
@@ -181,8 +191,7 @@ def sorted_trajectory(times_ns: I64, T_map: F64, *, of_vehicle: bool, frame: Map
 
 def has_times(file: Path) -> bool:
     """Whether a text file of poses carries times: TUM's eight numbers a row, or a header of names."""
-    line = next((s for s in read_text(file).splitlines() if s.strip() and not s.lstrip().startswith("#")), "")
-    words = line.replace(",", " ").split()
+    words = next((s for s in read_text(file).splitlines() if _holds(s)), "").replace(",", " ").split()
     return len(words) == 8 or (bool(words) and not _is_number(words[0])) or _header(file) is not None
 
 
@@ -192,39 +201,28 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
     ``frame``: the frame of the map, into which latitudes and longitudes go; without one a plane at the first of them.
     MapvoteError names the line or the column that is wrong.
     """
-    header = _header(file)
-    if header is None:
+    if _header(file) is None:
         rows = read_numbers(file, 8)
-        return sorted_trajectory(
-            _ns(file, rows[:, 0]), _of_quaternions(rows[:, 1:]), of_vehicle=False, frame=MapFrame()
-        )
-    names, rows = header, _csv_rows(file, len(header))
-    columns = {key: rows[:, i] for key, aliases in _COLUMNS.items() for i, n in enumerate(names) if n in aliases}
-    times_ns = _times(file, names, rows)
+        T, times_ns = _motions_of_quaternions(file, rows[:, 1:]), _ns(file, rows[:, 0])
+        return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
+    times_ns, columns = read_columns(file)
+    zero = np.zeros(len(times_ns))
+    angles = {name: _radians(columns[name]) for name in ("roll", "pitch", "yaw", "heading") if name in columns}
+    yaw = angles.get("yaw", np.pi / 2 - angles.get("heading", zero))
+    rpy = np.column_stack([angles.get("roll", zero), angles.get("pitch", zero), yaw])
     if {"latitude", "longitude"} <= set(columns):
-        zero = np.zeros(len(rows))
-        angles = [_radians(columns.get(n, zero)) for n in ("roll", "pitch")]
-        yaw = _radians(columns["yaw"]) if "yaw" in columns else np.pi / 2 - _radians(columns.get("heading", zero))
         place = np.column_stack([columns["longitude"], columns["latitude"], columns.get("z", zero)])
-        T, frame = poses_from_gnss(place, np.column_stack([*angles, yaw]), frame)
+        T, frame = poses_from_gnss(place, rpy, frame)
         return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
-    return sorted_trajectory(times_ns, _poses(file, names, columns), of_vehicle=False, frame=MapFrame())
-
-
-def _poses(file: Path, names: Sequence[str], columns: dict[str, F64]) -> F64:
-    missing = [axis for axis in "xyz" if axis not in columns]
-    if missing:
-        raise MapvoteError(f"{file}: no column {', '.join(missing)} among {', '.join(names)}")
-    position = [columns[axis] for axis in "xyz"]
+    position = needed(file, columns, "x", "y", "z")
     if {"qx", "qy", "qz", "qw"} <= set(columns):
-        return _of_quaternions(np.column_stack([*position, *(columns[q] for q in ("qx", "qy", "qz", "qw"))]))
-    if not {"yaw", "heading"} & set(columns):
+        quaternions = needed(file, columns, "qx", "qy", "qz", "qw")
+        T = _motions_of_quaternions(file, np.column_stack([position, quaternions]))
+    elif {"yaw", "heading"} & set(columns):
+        T = motions_of_rpy(np.column_stack([position, rpy]))
+    else:
         raise MapvoteError(f"{file}: no orientation: name columns qx, qy, qz, qw, or roll, pitch, yaw")
-    zero = np.zeros(len(position[0]))
-    yaw = _radians(columns["yaw"]) if "yaw" in columns else np.pi / 2 - _radians(columns["heading"])
-    roll, pitch = (_radians(columns.get(n, zero)) for n in ("roll", "pitch"))
-    rows = zip(*position, roll, pitch, yaw, strict=True)
-    return np.stack([geometry.from_xyz_rpy(*(float(v) for v in row)) for row in rows])
+    return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
 
 
 def _radians(angle: F64) -> F64:
@@ -232,55 +230,82 @@ def _radians(angle: F64) -> F64:
     return np.radians(angle) if len(angle) and float(np.abs(angle).max()) > 2.0 * np.pi + 0.01 else angle
 
 
-def _of_quaternions(rows: F64) -> F64:
+def _motions_of_quaternions(file: Path, rows: F64) -> F64:
     """(n, 4, 4) of rows x, y, z, qx, qy, qz, qw."""
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    norms = np.linalg.norm(rows[:, 3:], axis=1)
-    if len(rows) and not (np.abs(norms - 1.0) < 0.05).all():
-        raise MapvoteError(f"row {int(np.argmax(np.abs(norms - 1.0)))} of the trajectory has no unit quaternion")
-    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else T[:, :3, :3]
+    off = np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0)
+    if not (off < 0.05).all():
+        raise MapvoteError(f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion")
+    if len(rows):
+        T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix()
     T[:, :3, 3] = rows[:, :3]
     return T
 
 
 def _header(file: Path) -> list[str] | None:
     """The names in the first line, lower case without units, comments of TUM files left out; None if it has none."""
-    lines = [line for line in read_text(file).splitlines() if line.strip()]
-    if not lines:
-        return None
-    words = [w.strip().strip('"').lower() for w in lines[0].lstrip("#% ").replace(";", ",").split(",")]
+    line = next((line for line in read_text(file).splitlines() if line.strip()), "")
+    words = [w.strip().strip('"').lower() for w in line.lstrip("#% ").replace(";", ",").split(",")]
     names = [w.split("[")[0].split("(")[0].strip().removeprefix("field.") for w in words]
     known = {alias for aliases in _COLUMNS.values() for alias in aliases} | set(_TIMES)
     return names if len(names) > 3 and len(known & set(names)) >= 3 else None
 
 
-def _csv_rows(file: Path, columns: int) -> F64:
-    out = []
-    lines = [line for line in read_text(file).splitlines() if line.strip()][1:]
-    for number, row in enumerate(csv.reader(line.replace(";", ",") for line in lines), 2):
-        if len(row) < columns:
-            raise MapvoteError(f"{file}:{number}: {len(row)} values, but the header names {columns}")
-        out.append([float(v) if _is_number(v) else np.nan for v in row[:columns]])
-    if not out:
+def read_columns(file: Path) -> tuple[I64, dict[str, F64]]:
+    """(times (n,) in nanoseconds, columns (n,) by the names that ``_COLUMNS`` gives them, NaN where a value is no
+    number) of a CSV file with names in its first line.
+
+    MapvoteError if the names are missing, there is no column of times, or a row is cut off.
+    """
+    names = _header(file)
+    if names is None:
+        raise MapvoteError(f"{file}: its first line names no columns; copy it again")
+    numbered = ((number, line) for number, line in enumerate(read_text(file).splitlines(), 1) if line.strip())
+    rows = []
+    for number, line in list(numbered)[1:]:
+        rows.append(next(csv.reader([line.replace(";", ",")])))
+        if len(rows[-1]) < len(names):
+            raise MapvoteError(f"{file}:{number}: {len(rows[-1])} values, but the header names {len(names)}")
+    if not rows:
         raise MapvoteError(f"{file}: a header, but no poses")
-    return np.array(out)
-
-
-def _times(file: Path, names: Sequence[str], rows: F64) -> I64:
-    """Nanoseconds, exact: columns of times are read again as text, for float64 holds no nanoseconds since 1970."""
-    column = next((i for i, name in enumerate(names) if name in _TIMES), None)
-    if column is None:
+    time = next((i for i, name in enumerate(names) if name in _TIMES), None)
+    if time is None:
         raise MapvoteError(f"{file}: no column of times among {', '.join(names)}; name one timestamp, time or t")
-    lines = [line for line in read_text(file).splitlines() if line.strip()][1:]
-    texts = [line.replace(";", ",").split(",")[column].strip() for line in lines]
-    whole = [int(t) if t.lstrip("-").isdigit() else None for t in texts]
-    fraction = next((i for i, name in enumerate(names) if name in _NANOSECONDS), None)
-    if fraction is not None and None not in whole:
-        return np.array(whole, dtype=np.int64) * 10**9 + rows[:, fraction].astype(np.int64)
-    if None not in whole:
-        unit = _unit(float(np.abs(np.array(whole, dtype=np.float64)).max()))
-        return np.array(whole, dtype=np.int64) * unit
-    return _ns(file, rows[:, column])
+    times_ns = exact_ns(file, [row[time] for row in rows])
+    columns = {
+        key: np.array([_number(row[i]) for row in rows])
+        for key, aliases in _COLUMNS.items()
+        for i, name in enumerate(names)
+        if name in aliases
+    }
+    if "nanoseconds" in columns:
+        times_ns += needed(file, columns, "nanoseconds")[:, 0].astype(np.int64)
+    return times_ns, columns
+
+
+def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
+    """(n, len(names)) columns of :func:`read_columns`; MapvoteError names one that is missing or holds no number."""
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise MapvoteError(f"{file}: no column {', '.join(missing)}; the columns are {', '.join(columns)}")
+    found = np.column_stack([columns[name] for name in names])
+    bad = np.argwhere(~np.isfinite(found))
+    if len(bad):
+        raise MapvoteError(f"{file}: row {bad[0, 0] + 1} has no number in column {names[bad[0, 1]]}; leave it out")
+    return found
+
+
+def exact_ns(file: Path, texts: Sequence[str]) -> I64:
+    """(n,) nanoseconds of times written as seconds, or as whole milli-, micro- or nanoseconds since 1970. Whole numbers
+    are exact: float64 holds no nanoseconds since 1970."""
+    if not all(text.strip().lstrip("-").isdigit() for text in texts):
+        return _ns(file, np.array([_number(text) for text in texts]))
+    whole = [int(text) for text in texts]
+    unit = _unit(float(max(map(abs, whole), default=0)))
+    try:
+        return np.array([value * unit for value in whole], dtype=np.int64)
+    except OverflowError as error:
+        raise MapvoteError(f"{file}: {max(whole, key=abs)} is no time since 1970") from error
 
 
 def _unit(largest: float) -> int:
@@ -290,11 +315,16 @@ def _unit(largest: float) -> int:
 
 def _ns(file: Path, seconds: F64) -> I64:
     if not np.isfinite(seconds).all():
-        raise MapvoteError(f"{file}: row {int(np.argmax(~np.isfinite(seconds)))} has no time")
+        raise MapvoteError(f"{file}: row {int(np.argmax(~np.isfinite(seconds))) + 1} has no time")
     unit = _unit(float(np.abs(seconds).max(initial=0.0)))
     whole = np.floor(seconds)
     ns: I64 = whole.astype(np.int64) * unit + np.round((seconds - whole) * unit).astype(np.int64)
     return ns
+
+
+def _number(text: str) -> float:
+    """NaN if it is none."""
+    return float(text) if _is_number(text) else np.nan
 
 
 def _is_number(text: str) -> bool:
