@@ -19,7 +19,7 @@ from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
-_TIMES = ("timestamp", "time", "stamp", "t", "gpstime", "sec", "secs")
+_TIMES = ("timestamp", "time", "stamp", "t", "gpstime", "rostime", "sec", "secs")
 _COLUMNS = {
     "x": ("x", "tx", "pos_x", "position_x", "easting", "east"),
     "y": ("y", "ty", "pos_y", "position_y", "northing", "north"),
