@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
+from numpy.typing import NDArray
 
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
@@ -25,7 +27,8 @@ from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.doctor.maps import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
-from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
+from mapvote.formats.drives.point_fields import BadPoints, scan_from_fields, spinning_time_s
+from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.slam.build import build_map
@@ -101,8 +104,8 @@ def _go_far(drive: Drive) -> None:
     and come back to; more voxels than a table takes."""
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
-    for points in (np.zeros((2, 3), np.float32), _in_file_rows(np.zeros((2, 3), np.float32))):
-        spinning_time_s(points, drive.sensor.rate_hz)
+    for columns in _COLUMNS:
+        spinning_time_s(xyz_view("warmup", _table(np.zeros((2, 3), np.float32), columns)), drive.sensor.rate_hz)
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
     tiles.leave(Grid(Lattice(), far, far, 1, 1))
@@ -133,10 +136,16 @@ def _street(demolished: bool) -> F64:
     return np.concatenate(pieces)
 
 
-def _in_file_rows(points: F32) -> F32:
-    """The points (n, 3) as readers of files pass them: a read-only view of rows x, y, z, intensity. Numba compiles the
-    kernels of clean_scan once for such a view and once for a contiguous array."""
-    return read_only(np.column_stack([points, np.zeros(len(points), np.float32)]))[:, :3]
+_COLUMNS = ("x", "y", "z"), ("x", "y", "z", "intensity")
+"""Of tables of points. Numba compiles the kernels of a scan once for a contiguous array, and once for a read-only view
+of rows, as readers of files pass them."""
+
+
+def _table(points: F32, columns: tuple[str, ...]) -> NDArray[np.void]:
+    """The points (n, 3) as a structured array (n,), read-only where they are rows of a file."""
+    rows = np.column_stack([points, np.full((len(points), len(columns) - 3), 100.0, np.float32)])
+    table = rows.view([(name, "<f4") for name in columns])[:, 0]
+    return table if len(columns) == 3 else read_only(table)
 
 
 def _drive(street_map: F64, turning: bool) -> Drive:
@@ -149,9 +158,8 @@ def _drive(street_map: F64, turning: bool) -> Drive:
     def read_scan(i: int) -> Scan:
         points = transform(inverse(poses[i]), street_map).astype(np.float32)
         points = points[np.hypot(points[:, 0], points[:, 1]) > 1.5]
-        points = points if i % 2 else _in_file_rows(points)
-        time_s = np.zeros(len(points), dtype=np.float32) if turning else None
-        raw = RawScan(i, int(stamps_ns[i]), points, np.full(len(points), 100.0, dtype=np.float32), time_s)
-        return clean_scan("warmup", raw, sensor, BadPoints("warmup"))
+        table, bad_points = _table(points, _COLUMNS[i % 2]), BadPoints("warmup")
+        scan = scan_from_fields("warmup", i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
+        return replace(scan, time_s=np.zeros(len(scan.points), dtype=np.float32)) if turning else scan
 
     return Drive(Path("warmup"), "warmup", "warmup", sensor, stamps_ns, read_scan, poses, 0.02, 0.1)

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, Drive, MapvoteError
-from mapvote.formats.clean import log
 from mapvote.formats.drives.options import DriveOptions, map_frame
+from mapvote.formats.drives.point_fields import log
 from mapvote.formats.drives.scan_folder import (
     NUSCENES,
     BinLayout,

@@ -18,9 +18,8 @@ import scipy
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, log
 from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
-from mapvote.formats.drives.point_fields import point_cloud_table, scan_from_fields
+from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields
 from mapvote.formats.drives.scan_folder import prior_file
 from mapvote.formats.drives.trajectory import (
     Trajectory,

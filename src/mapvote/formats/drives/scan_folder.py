@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, log, stamps_from_rate
 from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
-from mapvote.formats.drives.point_fields import scan_from_fields
+from mapvote.formats.drives.point_fields import BadPoints, log, scan_from_fields
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, has_times, read_T_map_lidar, read_trajectory
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame
@@ -103,7 +102,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
         return np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
     if options.rate_hz is None:
         raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
-    return stamps_from_rate(len(files), options.rate_hz, options.start_ns)
+    return options.start_ns + np.round(np.arange(len(files)) * (1e9 / options.rate_hz)).astype(np.int64)
 
 
 def stamp_in_name_ns(file: Path) -> int:

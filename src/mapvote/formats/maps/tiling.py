@@ -27,7 +27,7 @@ from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
 from mapvote.core.point_map import PointMap, check_extent, cut_tiles
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError
-from mapvote.formats.clean import MAX_BAD_SHARE
+from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import GROUND, KEPT, Cloud, joined, lattice_of
