@@ -41,13 +41,13 @@ def test_a_car_that_left_and_one_that_came_are_found_and_nothing_else_is() -> No
 
 
 def test_two_surveys_of_one_world_differ_in_nothing() -> None:
-    assert compare(map_from_points(made_court()), map_from_points(made_court(seed=2))) == []
+    assert differences(compare_cells(map_from_points(made_court()), map_from_points(made_court(seed=2)))) == []
 
 
 def test_a_car_where_the_other_survey_has_no_ground_is_not_seen_by_it_rather_than_gone() -> None:
     cloud = made_court(CARS[1:], seed=2)
     hidden = (np.abs(cloud[:, 0] + 17.8) < 4.0) & (np.abs(cloud[:, 1] + 16.1) < 3.0)
-    found = compare(map_from_points(made_court()), map_from_points(cloud[~hidden]))
+    found = differences(compare_cells(map_from_points(made_court()), map_from_points(cloud[~hidden])))
     assert set(at(found, -17.8, -16.1)) == {"not seen"}
 
 
@@ -76,7 +76,7 @@ def test_what_the_maps_own_rays_passed_below_hangs_or_moved_and_is_no_change() -
 
 def test_the_page_holds_the_largest_and_the_footprints_are_closed_rings_in_metres() -> None:
     before, after = map_from_points(made_court()), map_from_points(made_court(CARS[1:], seed=2))
-    found = compare(before, after)
+    found = differences(compare_cells(before, after))
     assert "gone at -18, -16" in difference_page("court", found, before, after)
     feature = difference_geojson(found, before.lattice, {}, [])["features"][0]
     ring = np.array(feature["geometry"]["coordinates"][0][0])

@@ -51,6 +51,7 @@ def test_free_space_of_every_map_comes_along_and_a_point_of_any_map_wins_over_it
         assert not (tile.free & tile.obstacle_words).any()
 
 
+@pytest.mark.slow
 def test_noise_that_one_survey_hit_once_goes_when_the_other_passed_as_near_and_what_is_not_counted_stays() -> None:
     path = np.column_stack([np.arange(-25.0, 30.0, 0.5), np.full(110, -2.0), np.full(110, 2.0)])
     noise = np.array([[0.1, -6.0, 1.6], [5.2, -7.0, 1.9]])

@@ -44,6 +44,7 @@ def drifted() -> tuple[PointMap, F64]:
     return map_from_points(made_court(posts, seed=2)), cloud
 
 
+@pytest.mark.slow
 def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_be_moved_back(tmp_path: Path) -> None:
     straight, cloud = drifted()
     bent = map_from_points(cloud)

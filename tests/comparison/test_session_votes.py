@@ -46,6 +46,7 @@ def test_two_sessions_publish_what_both_saw_and_one_alone_publishes_nothing() ->
     assert alone.n_points == before.n_points
 
 
+@pytest.mark.slow
 def test_a_tree_crown_over_a_car_that_left_stays() -> None:
     rng = np.random.default_rng(4)
     crown = np.array([-17.8, -16.1, 4.0]) + rng.normal(0.0, (1.2, 1.2, 0.5), (800, 3))
