@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
-from mapvote.cli.terminal import print_table, progress, stages
+from mapvote.cli.terminal import progress, stages
 
 if TYPE_CHECKING:
-    from mapvote_lab.evaluation.evaluate import Evaluation
+    from msgspec import Struct
+
+    from mapvote.config import Settings
+    from mapvote_lab.evaluation.reporting.tables import Sheet
 
 
 def register(app: typer.Typer) -> None:
@@ -104,34 +108,32 @@ def evaluate(
     mapvote evaluate court FOLDER
     """
     _need_lab("evaluate")
-    from rich.console import Console
+    from mapvote.config import load_settings
 
-    from mapvote.config import cache_folder, load_with_sources
-    from mapvote_lab.evaluation.evaluate import evaluate as run
-    from mapvote_lab.evaluation.experiments.cases import PUBLISHED, as_paper, choose_cases
-    from mapvote_lab.evaluation.experiments.conditions import Conditions
-    from mapvote_lab.evaluation.experiments.scene import Scene
-    from mapvote_lab.evaluation.reporting.tables import result_json, tables, write_text
-
-    if scenario == "real":
+    if scenario in ("real", "court"):
         if drive is None:
-            raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
+            raise typer.BadParameter(f"name what to evaluate: mapvote evaluate {scenario} FOLDER", param_hint="DRIVE")
         if figures is not None:
-            raise typer.BadParameter("of a recorded drive --out draws the pictures", param_hint="--figures")
-        _evaluate_real(drive, case, scans, seed, json, out, config)
-        return
-    if scenario == "court":
-        if drive is None:
-            raise typer.BadParameter("name the folder: mapvote evaluate court FOLDER", param_hint="DRIVE")
-        _evaluate_court(drive, case, json, config)
+            raise typer.BadParameter("of recorded scans --out draws the pictures", param_hint="--figures")
+        if scenario == "real":
+            _evaluate_real(drive, case, scans, seed, json, out, load_settings(config))
+        else:
+            _evaluate_court(drive, case, json, load_settings(config))
         return
     if drive is not None:
-        raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
+        raise typer.BadParameter(f"{drive}: a folder follows real and court only", param_hint="DRIVE")
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
+    from mapvote.config import cache_folder, load_with_sources
+    from mapvote_lab.evaluation.evaluate import evaluate as run
+    from mapvote_lab.evaluation.experiments.cases import DEFAULT_CASES, PUBLISHED, as_paper, choose_cases
+    from mapvote_lab.evaluation.experiments.conditions import Conditions
+    from mapvote_lab.evaluation.experiments.scene import Scene
+    from mapvote_lab.evaluation.reporting.tables import tables
+
     settings, sources = load_with_sources(config)
     settings = as_paper(settings, scenario, sources, reading)
-    cases, with_yardsticks = choose_cases(settings, case or "1,2,3,4,5,surfaces")
+    cases, with_yardsticks = choose_cases(settings, case or DEFAULT_CASES)
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
         overrides["temporary_cars"] = cars
@@ -139,41 +141,39 @@ def evaluate(
     scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
     with stages() as told:
         evaluation = run(scene, cases, with_yardsticks, told, sentences)
-    result = evaluation.result
-    for sheet in tables(result):
-        Console(width=140).print(sheet.to_rich())
-    if json is not None:
-        write_text(result_json(result), json)
-        print(f"{json}: all numbers")
+    _show(list(tables(evaluation.result)), evaluation.result, json)
     if figures is not None:
-        _draw_figures(evaluation, figures)
+        from mapvote.plots import FORMATS
+        from mapvote_lab.evaluation.reporting.gallery import gallery
+
+        with progress("drawing"):
+            drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
+        print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 
-def _draw_figures(evaluation: Evaluation, out: Path) -> None:
-    from mapvote.plots import FORMATS
-    from mapvote_lab.evaluation.reporting.gallery import gallery
+def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Path | None) -> None:
+    """Tables on the terminal; all numbers into the file ``json``, if one is wanted."""
+    from rich.console import Console
 
-    with progress("drawing"):
-        drawn = gallery(evaluation, evaluation.best, out, FORMATS)
-    print(f"{out}: {len(drawn)} figures, each as PNG, SVG and PDF")
-
-
-def _evaluate_court(folder: Path, case: str | None, json: Path | None, config: Path | None) -> None:
-    """The court's three sessions, as cast scans by ``case`` and as clouds."""
-    from mapvote.config import load_settings
-    from mapvote_lab.evaluation.experiments.cases import choose_cases
-    from mapvote_lab.evaluation.experiments.court import Court, court_rows, evaluate_court
     from mapvote_lab.evaluation.reporting.tables import write_text
     from mapvote_lab.evaluation.results import to_json
 
-    settings = load_settings(config)
-    cases, _ = choose_cases(settings, case or "1,2,3,4,5,surfaces")
+    for sheet in sheets:
+        Console(width=140).print(sheet.to_rich())
+    if json is not None:
+        write_text(to_json(result), json)
+        print(f"{json}: all numbers")
+
+
+def _evaluate_court(folder: Path, case: str | None, json: Path | None, settings: Settings) -> None:
+    """The court's three sessions, as cast scans by ``case`` and as clouds."""
+    from mapvote_lab.evaluation.experiments.cases import DEFAULT_CASES, choose_cases
+    from mapvote_lab.evaluation.experiments.court import Court, court_table, evaluate_court
+
+    cases, _ = choose_cases(settings, case or DEFAULT_CASES)
     with stages() as told:
         scores = evaluate_court(Court.read(folder), settings, cases, told)
-    print_table(*court_rows(scores))
-    if json is not None:
-        write_text(to_json({"scores": scores}), json)
-        print(f"{json}: all numbers")
+    _show([court_table(scores)], {"scores": scores}, json)
 
 
 def _evaluate_real(
@@ -183,20 +183,14 @@ def _evaluate_real(
     seed: int,
     json: Path | None,
     out: Path | None,
-    config: Path | None,
+    settings: Settings,
 ) -> None:
     """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes.
     ``case``: one of them; None: by the settings."""
-    from rich.console import Console
-
-    from mapvote.config import load_settings
     from mapvote_lab.evaluation.experiments.cases import choose_cases
     from mapvote_lab.evaluation.experiments.real_bench import bench
-    from mapvote_lab.evaluation.reporting.real_report import as_markdown, draw_worst, real_tables
-    from mapvote_lab.evaluation.reporting.tables import write_text
-    from mapvote_lab.evaluation.results import to_json
+    from mapvote_lab.evaluation.reporting.real_report import real_tables, write_report
 
-    settings = load_settings(config)
     method = settings.voting.method
     cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))
     if len(cases) > 1:
@@ -204,17 +198,11 @@ def _evaluate_real(
     with stages() as told:
         result = bench(drive, settings, cases, told, scans=scans, seed=seed)
     sheets = real_tables(result, cases[0].name)
-    for sheet in sheets:
-        Console().print(sheet.to_rich())
-    if json is not None:
-        write_text(to_json(result.figures(cases[0].name)), json)
-        print(f"{json}: all numbers")
+    _show(sheets, result.figures(cases[0].name), json)
     if out is not None:
-        pictures = draw_worst(result, cases[0].name, out)
         chosen = "".join(f" --{name} {value}" for name, value in (("case", case), ("scans", scans)) if value)
         command = f"mapvote evaluate real {drive}{chosen} --seed {seed} --out {out}"
-        write_text(as_markdown(sheets, command), out / "tables.md")
-        for file in [out / "tables.md", *pictures]:
+        for file in write_report(result, cases[0].name, sheets, command, out):
             print(f"{file}")
 
 

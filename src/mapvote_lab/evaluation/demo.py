@@ -38,7 +38,8 @@ from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import gallery
 from mapvote_lab.evaluation.reporting.real_report import draw_things
-from mapvote_lab.evaluation.reporting.tables import ReportSection, as_text, page, result_json, write_text
+from mapvote_lab.evaluation.reporting.tables import ReportSection, as_text, page, write_text
+from mapvote_lab.evaluation.results import to_json
 from mapvote_lab.evaluation.scores import same_rows
 from mapvote_lab.simulation.processes import processes
 
@@ -220,7 +221,7 @@ def demo(
         with whole_file(out / f"{name}.pcd") as partial:
             write_pcd(partial, Cloud(all_points(point_map)))
     write_text(as_text(evaluation.result), out / "tables.txt")
-    write_text(result_json(evaluation.result), out / "results.json")
+    write_text(to_json(evaluation.result), out / "results.json")
     write_map(done.updated, out / "map_after")
     areas = changed_areas(work / "server" / "store.db", done.version)
     story = tell(evaluation, done, drives_bytes=size_of(work), kept=keep)

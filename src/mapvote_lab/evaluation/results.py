@@ -105,6 +105,6 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     timings: Timings
 
 
-def to_json(result: msgspec.Struct | Mapping[str, Any], *, sort_keys: bool = False) -> str:
-    """Indented; ValueError if a number is NaN or infinite."""
-    return json.dumps(msgspec.to_builtins(result), indent=1, sort_keys=sort_keys, allow_nan=False) + "\n"
+def to_json(result: msgspec.Struct | Mapping[str, Any]) -> str:
+    """Indented, keys sorted; ValueError if a number is NaN or infinite."""
+    return json.dumps(msgspec.to_builtins(result), indent=1, sort_keys=True, allow_nan=False) + "\n"

@@ -75,6 +75,7 @@ def own_cases(settings: Settings) -> dict[str, Case]:
     return {"surfaces": Case("surfaces", voting, settings.fuse.min_votes)}
 
 
+DEFAULT_CASES = "1,2,3,4,5,surfaces"
 YARDSTICKS = ("nearest", "evidence")
 
 

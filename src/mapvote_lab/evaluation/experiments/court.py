@@ -23,16 +23,18 @@ from scipy.spatial import KDTree
 from mapvote.codec.ballot import Ballot
 from mapvote.comparison.cloud_changes import REACH_CELLS, CloudChange, Kind, planes_of
 from mapvote.comparison.session_votes import vote_of_session
-from mapvote.config import Settings
+from mapvote.config import Settings, choose_case
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F32, F64, I64, U8, Bool, CellState, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.formats import read_map
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.experiments.cases import Case
+from mapvote_lab.evaluation.reporting.tables import Sheet
+from mapvote_lab.evaluation.scores import cells_with, map_obstacles, pieces
 
 SESSIONS = ("robot1", "robot2", "robot3")
 CHANGES: dict[str, tuple[Kind, tuple[float, float, float, float]]] = {
@@ -97,32 +99,29 @@ class Court:
 def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell: Tell) -> list[CourtScore]:
     """Scores of every case on cast scans, of the sessions' clouds as ballots, of one of them alone, and of plain
     distances between clouds."""
-    surfaces = settings.model_copy(update={"voting": settings.voting.model_copy(update={"method": "surfaces"})})
-    as_clouds, shown = [], dict[str, list[CloudChange]]()
+    surfaces = choose_case(settings, "surfaces")
+    as_clouds, shown = [], list[CloudChange]()
     for k, (name, cloud) in enumerate(court.sessions.items()):
         tell("voting with clouds", k, len(SESSIONS))
         said = vote_of_session(name, name, court.reference, cloud, surfaces, end_ns=_ENDED_NS + k)
         as_clouds.append(said.ballot)
-        shown[name] = said.changes
-    every = [change for changes in shown.values() for change in changes if change.kind != "not seen"]
-    scores = []
+        shown += [change for change in said.changes if change.kind != "not seen"]
+    drives, scores = [cast_drive(name, cloud) for name, cloud in court.sessions.items()], []
     for k, case in enumerate(cases):
         tell("voting with cast scans", k, len(cases))
         own = settings.model_copy(update={"voting": case.voting, "paper": case.paper})
-        ballots = [
-            vote_drive(cast_drive(name, cloud), court.reference, own)[0] for name, cloud in court.sessions.items()
-        ]
-        scores.append(_fused(f"cast scans, {case.name}", court, ballots, own, max(case.min_votes, 2), every))
-    scores.append(_fused("clouds, surfaces", court, as_clouds, surfaces, 2, every))
-    scores.append(_fused("one cloud alone", court, as_clouds[:1], surfaces, 2, every))
-    scores.append(_by_distance(court, every))
+        ballots = [vote_drive(drive, court.reference, own)[0] for drive in drives]
+        scores.append(_fused(f"cast scans, {case.name}", court, ballots, own, max(case.min_votes, 2), shown))
+    scores.append(_fused("clouds, surfaces", court, as_clouds, surfaces, 2, shown))
+    scores.append(_fused("one cloud alone", court, as_clouds[:1], surfaces, 2, shown))
+    scores.append(_by_distance(court, shown))
     return scores
 
 
 def cast_drive(name: str, cloud: PointMap, step_m: float = 1.6) -> Drive:
     """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground; one every
     ``step_m``."""
-    points, standing, sensor = all_points(cloud), _standing(cloud), SENSORS["hdl32e"]
+    points, standing, sensor = all_points(cloud), map_obstacles(cloud), SENSORS["hdl32e"]
     window = reduce(Grid.union, (cloud.lattice.tile(tile) for tile in cloud.tiles))
     surveyed = _surveyed(cloud, window)
     corners = np.array(_WAY, dtype=np.float64)
@@ -225,46 +224,35 @@ def _fused(
 ) -> CourtScore:
     after, decisions = update_map(court.reference, ballots, settings.fuse.model_copy(update={"min_votes": min_votes}))
     states, grid = states_over(court.reference.lattice, decisions)
-    return _score(method, _standing(court.reference), _standing(after), states, grid, shown)
-
-
-def _standing(point_map: PointMap) -> F64:
-    """(n, 3) points that are not ground."""
-    return np.concatenate([tile.points_map[tile.columns[1]] for _, tile in sorted(point_map.tiles.items())])
+    return _score(method, map_obstacles(court.reference), map_obstacles(after), states, grid, shown)
 
 
 def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
     """Plain cloud-to-cloud: a point more than 0.6 m from every point of the other cloud is gone or new; published where
     two sessions say so of a cell."""
-    before = _standing(court.reference)
-    lattice = court.reference.lattice
+    before, reference = map_obstacles(court.reference), all_points(court.reference)
     x, y = before[:, 0], before[:, 1]
-    low_r, low_c = (int(v[0]) for v in lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]])))
-    grid = Grid(lattice, low_r, low_c, int((np.ptp(y) + 120) / CELL_SIZE), int((np.ptp(x) + 120) / CELL_SIZE))
-    votes = {"gone": np.zeros(grid.shape, np.int64), "new": np.zeros(grid.shape, np.int64)}
+    rows, cols = court.reference.lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]]))
+    size = int((np.ptp(y) + 120) / CELL_SIZE), int((np.ptp(x) + 120) / CELL_SIZE)
+    grid = Grid(court.reference.lattice, int(rows[0]), int(cols[0]), *size)
+    gone, new = np.zeros((2, *grid.shape), dtype=np.int64)
     offered = []
-    reference = all_points(court.reference)
     for cloud in court.sessions.values():
-        for kind, points, others in (
-            ("gone", before, all_points(cloud)),
-            ("new", _standing(cloud), reference),
-        ):
-            far = points[KDTree(others).query(points)[0] > _FAR_M]
-            rows, cols, inside = grid.indices_of(far)
-            cells = np.zeros(grid.shape, np.int64)
-            cells[rows[inside], cols[inside]] = 1
-            votes[kind] += cells
-            if kind == "new":
-                offered.append(far[inside])
-    states = np.full(grid.shape, 255, dtype=np.uint8)
-    states[votes["gone"] >= 2] = CellState.CHANGED_EMPTY
-    states[votes["new"] >= 2] = CellState.CHANGED_OCCUPIED
-    rows, cols, _ = grid.indices_of(before)
-    kept = before[states[rows, cols] != CellState.CHANGED_EMPTY]
-    new = np.concatenate(offered)
-    rows, cols, _ = grid.indices_of(new)
-    after = np.concatenate([kept, new[states[rows, cols] == CellState.CHANGED_OCCUPIED]])
-    return _score("cloud to cloud", before, after, states, grid, shown)
+        gone += cells_with(_far(before, all_points(cloud)), grid)
+        far = _far(map_obstacles(cloud), reference)
+        new += cells_with(far, grid)
+        offered.append(far[grid.indices_of(far)[2]])
+    states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
+    states[gone >= 2] = CellState.CHANGED_EMPTY
+    states[new >= 2] = CellState.CHANGED_OCCUPIED
+    kept = before[states[grid.indices_of(before)[:2]] != CellState.CHANGED_EMPTY]
+    come = [points[states[grid.indices_of(points)[:2]] == CellState.CHANGED_OCCUPIED] for points in offered]
+    return _score("cloud to cloud", before, np.concatenate([kept, *come]), states, grid, shown)
+
+
+def _far(points: F64, others: F64) -> F64:
+    """Those of ``points`` (n, 3) that lie more than 0.6 m from every one of the ``others`` (m, 3)."""
+    return points[KDTree(others).query(points)[0] > _FAR_M]
 
 
 def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float = 0.0) -> np.ndarray:
@@ -279,17 +267,15 @@ def _score(method: str, before: F64, after: F64, states: U8, grid: Grid, shown: 
     come = KDTree(before).query(after)[0] > 1e-6
     boxed = [np.logical_or.reduce([_in_box(p, box, _MARGIN_M) for _, box in CHANGES.values()]) for p in (before, after)]
     others, false = [], []
+    x, y = grid.centres()
     for kind, state in (("gone", CellState.CHANGED_EMPTY), ("new", CellState.CHANGED_OCCUPIED)):
-        label, count = ndimage.label(states == state, np.ones((3, 3)))
-        for number in range(1, count + 1):
-            rows, cols = np.nonzero(label == number)
-            area_m2 = len(rows) * CELL_SIZE**2
-            xy = np.column_stack([grid.x0 + CELL_SIZE * (cols + 0.5), grid.y0 + CELL_SIZE * (rows + 0.5)])
+        for rows, cols in pieces(states == state):
+            area_m2, xy = round(len(rows) * CELL_SIZE**2, 1), np.column_stack([x[cols], y[rows]])
             if area_m2 <= FALSE_M2 or any(_in_box(xy, box, _MARGIN_M).any() for _, box in CHANGES.values()):
                 continue
-            others.append(round(area_m2, 1))
+            others.append(area_m2)
             if not any(one.kind == kind and _in_box(xy, one.box, _MARGIN_M).any() for one in shown):
-                false.append(round(area_m2, 1))
+                false.append(area_m2)
     added = (counts["structure"][1] - counts["structure"][0], counts["thing"][1] - counts["thing"][0])
     found = int(counts["car"][1] < 0.5 * counts["car"][0]) + sum(more >= 50 for more in added)
     elsewhere = int((gone & ~boxed[0]).sum()), int((come & ~boxed[1]).sum())
@@ -298,22 +284,21 @@ def _score(method: str, before: F64, after: F64, states: U8, grid: Grid, shown: 
     )  # fmt: skip
 
 
-def court_rows(scores: Sequence[CourtScore]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """(headings, rows) of the table."""
+def court_table(scores: Sequence[CourtScore]) -> Sheet:
+    """A line a method."""
     headings = (
         "method", "found", "car's points left", "points of structure, thing added", "deleted, added elsewhere",
         "others > 2 m2", "of these no cloud shows",
     )  # fmt: skip
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (
             one.method,
-            f"{one.found} of 3",
+            f"{one.found} of {len(CHANGES)}",
             f"{one.left} of {one.before}",
             f"{one.added[0]}, {one.added[1]}",
             f"{one.elsewhere[0]}, {one.elsewhere[1]}",
-            f"{len(one.others)} ({sum(one.others):.0f} m2)",
-            f"{len(one.false)} ({sum(one.false):.0f} m2)",
+            *(f"{len(areas)} ({sum(areas):.0f} m2)" for areas in (one.others, one.false)),
         )
         for one in scores
     ]
-    return headings, rows
+    return Sheet("The court at two times", headings, rows)

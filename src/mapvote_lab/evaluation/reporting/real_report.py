@@ -24,7 +24,7 @@ from mapvote_lab.evaluation.experiments.real_bench import (
     unchanged_figures,
 )
 from mapvote_lab.evaluation.experiments.real_street import FalseChange, RealRun, is_changed, largest_false_changes
-from mapvote_lab.evaluation.reporting.tables import Sheet
+from mapvote_lab.evaluation.reporting.tables import Sheet, write_text
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
@@ -34,9 +34,12 @@ def real_tables(bench: Bench, case: str) -> list[Sheet]:
     return [sheet for sheet in sheets if sheet.rows]
 
 
-def as_markdown(sheets: list[Sheet], command: str) -> str:
-    """A page of them, with the command that made it."""
-    return "\n".join([f"```\n{command}\n```\n", *(sheet.to_markdown() for sheet in sheets)])
+def write_report(bench: Bench, case: str, sheets: list[Sheet], command: str, folder: Path) -> list[Path]:
+    """tables.md, a page of the ``sheets`` with the ``command`` that made them, and pictures of the worst cells."""
+    pictures = draw_worst(bench, case, folder)
+    text = "\n".join([f"```\n{command}\n```\n", *(sheet.to_markdown() for sheet in sheets)])
+    write_text(text, folder / "tables.md")
+    return [folder / "tables.md", *pictures]
 
 
 def _ground(bench: Bench) -> Sheet:

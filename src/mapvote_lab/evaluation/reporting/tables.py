@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mapvote.formats.atomic import whole_file
-from mapvote_lab.evaluation.results import CaseResult, EvaluationResult, to_json
+from mapvote_lab.evaluation.results import CaseResult, EvaluationResult
 from mapvote_lab.evaluation.scores import CLASSES, PAPER_F1, PAPER_PRECISION, PAPER_RECALL, ByClass, Scores, ratio
 
 
@@ -41,10 +41,10 @@ class Sheet:
             table.add_row(*map(Text, row))
         return table
 
-    def to_markdown(self, with_title: bool = True) -> str:
+    def to_markdown(self) -> str:
         """Lines that end with a newline."""
         lines = [self.headings, ["---"] * len(self.headings), *self.rows]
-        title = f"**{self.title}**\n\n" if with_title else ""
+        title = f"**{self.title}**\n\n"
         return title + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def to_html(self) -> str:
@@ -271,11 +271,6 @@ def as_text(result: EvaluationResult) -> str:
     for sheet in tables(result):
         console.print(sheet.to_rich())
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
-
-
-def result_json(result: EvaluationResult) -> str:
-    """The result with sorted keys; ValueError if a number is NaN or infinite."""
-    return to_json(result, sort_keys=True)
 
 
 def write_text(text: str, path: Path) -> None:
