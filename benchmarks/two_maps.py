@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from mapvote.comparison.cloud_changes import CloudChange, compare_cells, differences
 from mapvote.comparison.merge import merge_maps
-from mapvote.comparison.two_maps import brought_into
+from mapvote.comparison.register import brought_into
 from mapvote.config import Settings, choose_case
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.formats import open_drive, read_map, write_map

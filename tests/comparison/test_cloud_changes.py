@@ -11,7 +11,7 @@ import pytest
 from made_courts import CARS, court_clouds, made_court
 from mapvote.comparison.cloud_changes import CloudChange, compare_cells, differences
 from mapvote.comparison.difference_report import difference_geojson, difference_page
-from mapvote.comparison.two_maps import brought_into
+from mapvote.comparison.register import brought_into
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.formats import read_map

@@ -42,7 +42,7 @@ def diff(
 
     from mapvote.comparison.cloud_changes import compare_cells, differences
     from mapvote.comparison.difference_report import difference_geojson, difference_page, difference_rows
-    from mapvote.comparison.two_maps import brought_into
+    from mapvote.comparison.register import brought_into
     from mapvote.formats import read_map
     from mapvote.formats.atomic import whole_file
     from mapvote.server.views.geojson import as_csv

@@ -63,7 +63,7 @@ class CloudChange:
     box: tuple[float, float, float, float]
     """x0, y0, x1, y1 in a's frame, metres."""
     confidence: float
-    """How surely the other cloud saw the place: mean over its cells of ``CellComparison.sure_a`` or ``sure_b``."""
+    """How surely the other cloud saw the place: mean over its cells of ``OneSided.sure``."""
     has: Literal["a", "b"]
     cells: tuple[I64, I64]
     """(rows, cols) of its cells in the window of the comparison."""
@@ -76,11 +76,7 @@ class CloudPlanes:
     ground_z: F32
     base: I32
     words: U64
-    """Column words of what stands."""
-    low: Bool
-    """A point lies in BAND."""
-    stands: Bool
-    """A point lies above the ground, at any height."""
+    """Column words of what stands, at any height above the ground."""
     top_z: F32
     counts: F64
     own_ground: Bool
@@ -94,6 +90,28 @@ class CloudPlanes:
     scans: F64
     """Mean of SCANS of the points above the ground in each cell; infinite where one of them is not counted."""
 
+    @property
+    def low(self) -> Bool:
+        """A point lies in BAND."""
+        return np.asarray(self.words & BAND != 0)
+
+    @property
+    def stands(self) -> Bool:
+        return np.asarray(self.words != 0)
+
+
+@dataclass(frozen=True, slots=True)
+class OneSided:
+    """What only one of two clouds has, (rows, cols)."""
+
+    changed: Bool
+    """The other cloud saw the place, and has nothing there."""
+    not_seen: Bool
+    """The other cloud does not show it, and may not have seen it."""
+    sure: F64
+    """How surely the other cloud saw it: the share of its voxels in BAND that are free there; where that knows no free
+    space, 1 if it has ground in the cell itself, else 0."""
+
 
 @dataclass(frozen=True, slots=True)
 class CellComparison:
@@ -102,18 +120,10 @@ class CellComparison:
     window: Grid
     a: CloudPlanes
     b: CloudPlanes
-    gone: Bool
-    new: Bool
-    not_seen_a: Bool
-    """a has something that b does not show, and b may not have seen it."""
-    not_seen_b: Bool
+    only_a: OneSided
+    only_b: OneSided
     left_out: Bool
     """In a bent part, or explained by its motion."""
-    sure_a: F64
-    """How surely a saw b's objects: the share of b's voxels in BAND that are free in a; where a knows no free space, 1
-    if a has ground in the cell itself, else 0."""
-    sure_b: F64
-    """The same, with a and b exchanged."""
 
 
 def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
@@ -121,21 +131,21 @@ def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
     here = reference_window(point_map, window)
     known = np.isfinite(here.ground_z)
     beside = (above_ground_points(point_map, window) != 0) & known
-    own = _ground_points(point_map, window) & known
-    low = here.occupied & BAND != 0
-    free = np.zeros_like(here.occupied) if here.free is None else here.free
-    has_rays = np.zeros(window.shape, dtype=np.bool_)
+    own, has_rays = (np.zeros(window.shape, dtype=np.bool_) for _ in range(2))
     scans = np.full(window.shape, np.inf)
     for index in window.tiles():
         tile = point_map.tiles.get(index)
         if tile is None:
             continue
         common = tile.window.intersection(window)
-        has_rays[common.slices_in(window)] = tile.free is not None and tile.free.any()
-        scans[common.slices_in(window)] = _mean_scans(tile)[common.slices_in(tile.window)]
+        into, cut = common.slices_in(window), common.slices_in(tile.window)
+        has_rays[into] = tile.free is not None and tile.free.any()
+        scans[into] = _mean_scans(tile)[cut]
+        own[into] = (np.bincount(tile.cells[~tile.columns[1]], minlength=CELLS) > 0).reshape(tile.window.shape)[cut]
+    free = np.zeros_like(here.occupied) if here.free is None else here.free
     return CloudPlanes(
-        here.ground_z, here.base, here.occupied, low, here.occupied != 0, here.top_z, here.counts.astype(np.float64),
-        own, beside, free, has_rays, scans,
+        here.ground_z, here.base, here.occupied, here.top_z, here.counts.astype(np.float64), own & known, beside, free,
+        has_rays, scans,
     )  # fmt: skip
 
 
@@ -149,16 +159,6 @@ def _mean_scans(tile: Tile) -> F64:
     number = np.bincount(tile.cells[standing], minlength=CELLS)
     total = np.bincount(tile.cells[standing], weights=weights, minlength=CELLS)
     return np.asarray((total / np.maximum(number, 1)).reshape(tile.window.shape))
-
-
-def _ground_points(point_map: PointMap, window: Grid) -> Bool:
-    out = np.zeros(window.shape, dtype=np.bool_)
-    for index in window.tiles():
-        if index in point_map.tiles:
-            tile = point_map.tiles[index]
-            rows, cols, here = window.indices_of(tile.points_map[~tile.columns[1]])
-            out[rows[here], cols[here]] = True
-    return out
 
 
 def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | None = None) -> CellComparison:
@@ -175,32 +175,22 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
                 "seen cannot be decided by geometry alone"
             )
     apart = (np.abs(a.ground_z - b.ground_z) > GROUND_APART_M) & a.own_ground & b.own_ground  # measured, not filled in
-    only_a = a.low & ~_hangs(a) & ~_around(b.low, REACH_CELLS)
-    only_b = b.low & ~_hangs(b) & ~_around(a.low, REACH_CELLS)
+    alone = [own.low & ~_hangs(own) & ~_around(other.low, REACH_CELLS) for own, other in ((a, b), (b, a))]
     left_out = np.zeros(window.shape, dtype=np.bool_)
     if registered is not None:
-        left_out = _left_out(window, only_a | only_b, registered)
-        _explain(only_a, only_b, left_out, (map_a, map_b), window, registered)
-    free_in_a, free_in_b = _free_share(b, a), _free_share(a, b)
-    seen_by_a = np.where(a.has_rays, free_in_a >= 0.5, a.seen & ~apart)
-    seen_by_b = np.where(b.has_rays, free_in_b >= 0.5, b.seen & ~apart)
-    return CellComparison(
-        window, a, b,
-        only_a & seen_by_b & ~left_out,
-        only_b & seen_by_a & ~left_out,
-        only_a & ~seen_by_b & ~left_out,
-        only_b & ~seen_by_a & ~left_out,
-        left_out,
-        np.where(a.has_rays, free_in_a, a.own_ground),
-        np.where(b.has_rays, free_in_b, b.own_ground),
-    )  # fmt: skip
-
-
-def _free_share(owner: CloudPlanes, other: CloudPlanes) -> F64:
-    """(rows, cols) share of the owner's voxels in BAND that the other map knows to be free; 0 where it has none."""
-    low = owner.words & BAND
-    free = low & rebased(other.free, other.base - owner.base)
-    return np.asarray(np.bitwise_count(free) / np.maximum(np.bitwise_count(low), 1))
+        rows, cols = np.nonzero(alone[0] | alone[1])
+        x, y = window.centres()
+        left_out[rows, cols] = ~registered.compared(np.column_stack([x[cols], y[rows]]))
+        left_out |= _explained(alone, left_out, (map_a, map_b), window, registered)
+    sides = []
+    for only, own, other in zip(alone, (a, b), (b, a), strict=True):
+        low = own.words & BAND
+        free = np.bitwise_count(low & rebased(other.free, other.base - own.base))
+        share = np.asarray(free / np.maximum(np.bitwise_count(low), 1))
+        seen = np.where(other.has_rays, share >= 0.5, other.seen & ~apart)
+        sure = np.where(other.has_rays, share, other.own_ground)
+        sides.append(OneSided(only & seen & ~left_out, only & ~seen & ~left_out, sure))
+    return CellComparison(window, a, b, sides[0], sides[1], left_out)
 
 
 def _hangs(planes: CloudPlanes) -> Bool:
@@ -215,42 +205,32 @@ def _around(cells: Bool, reach: int) -> Bool:
     return np.asarray(ndimage.maximum_filter(cells, 2 * reach + 1, mode="constant"))
 
 
-def _left_out(window: Grid, asked: Bool, registered: Registered) -> Bool:
-    rows, cols = np.nonzero(asked)
-    x, y = window.centres()
+def _explained(
+    alone: list[Bool], left_out: Bool, maps: tuple[PointMap, PointMap], window: Grid, registered: Registered
+) -> Bool:
+    """(rows, cols) cells of which half of the points fit the other cloud under the motion of a bent patch near them.
+    ``alone``: what only a has, and what only b has."""
     out = np.zeros(window.shape, dtype=np.bool_)
-    out[rows, cols] = ~registered.compared(np.column_stack([x[cols], y[rows]]))
-    return out
-
-
-def _explain(
-    only_a: Bool, only_b: Bool, left_out: Bool, maps: tuple[PointMap, PointMap], window: Grid, registered: Registered
-) -> None:
-    """Mark in ``left_out`` the cells whose points fit the other cloud under the motion of a bent patch near them."""
     motions = [] if registered.unbent else registered.other_motions()
     if not motions:
-        return
-    a, b = (all_points(one) for one in maps)
-    mine_a, mine_b = _in_cells(a, only_a & ~left_out, window), _in_cells(b, only_b & ~left_out, window)
-    found = [np.zeros(len(mine_a), dtype=np.bool_), np.zeros(len(mine_b), dtype=np.bool_)]
-    for centre, T in motions:
-        near_a, near_b = (points[_near(points, centre)] for points in (a, b))
-        if not len(near_a) or not len(near_b):
-            continue
-        moved = transform(T, near_b)
-        for points, fits, other, move in (
-            (mine_a, found[0], moved, None),
-            (mine_b, found[1], near_a, T),
-        ):
-            here = np.flatnonzero(_near(points, centre) & ~fits)
-            at = points[here] if move is None else transform(move, points[here])
-            fits[here] = KDTree(other).query(at, distance_upper_bound=_EXPLAINED_M)[0] < _EXPLAINED_M
-    for points, fits in ((mine_a, found[0]), (mine_b, found[1])):
-        rows, cols, _ = window.indices_of(points)
+        return out
+    clouds = [all_points(one) for one in maps]
+    for k, cells in enumerate(alone):
+        mine = _in_cells(clouds[k], cells & ~left_out, window)
+        fits = np.zeros(len(mine), dtype=np.bool_)
+        for centre, T in motions:  # T moves b's points
+            others = clouds[1 - k][_near(clouds[1 - k], centre)]
+            here = np.flatnonzero(_near(mine, centre) & ~fits)
+            if not len(others) or not len(here):
+                continue
+            at, others = (mine[here], transform(T, others)) if k == 0 else (transform(T, mine[here]), others)
+            fits[here] = KDTree(others).query(at, distance_upper_bound=_EXPLAINED_M)[0] < _EXPLAINED_M
+        rows, cols, _ = window.indices_of(mine)
         total, explained = np.zeros(window.shape), np.zeros(window.shape)
         np.add.at(total, (rows, cols), 1.0)
         np.add.at(explained, (rows[fits], cols[fits]), 1.0)
-        left_out |= (total > 0) & (explained >= 0.5 * total)
+        out |= (total > 0) & (explained >= 0.5 * total)
+    return out
 
 
 def _near(points: F64, centre: F64) -> Bool:
@@ -267,28 +247,28 @@ def _in_cells(points: F64, cells: Bool, window: Grid) -> F64:
 def differences(found: CellComparison, min_m2: float = 0.5) -> list[CloudChange]:
     """Objects of at least ``min_m2`` that only one cloud has: gone and new by area, then what was not seen."""
     out = [
-        *_objects(found, found.gone, "gone", "a", min_m2),
-        *_objects(found, found.new, "new", "b", min_m2),
-        *_objects(found, found.not_seen_a, "not seen", "a", min_m2),
-        *_objects(found, found.not_seen_b, "not seen", "b", min_m2),
+        *_objects(found, "gone", "a", min_m2),
+        *_objects(found, "new", "b", min_m2),
+        *_objects(found, "not seen", "a", min_m2),
+        *_objects(found, "not seen", "b", min_m2),
     ]
     return sorted(out, key=lambda one: (one.kind == "not seen", -one.area_m2))
 
 
-def _objects(
-    found: CellComparison, cells: Bool, kind: Kind, has: Literal["a", "b"], min_m2: float
-) -> list[CloudChange]:
+def _objects(found: CellComparison, kind: Kind, has: Literal["a", "b"], min_m2: float) -> list[CloudChange]:
+    owner, other, side = (found.a, found.b, found.only_a) if has == "a" else (found.b, found.a, found.only_b)
+    cells = side.not_seen if kind == "not seen" else side.changed
     rows, cols = (found_at.astype(np.int64) for found_at in np.nonzero(cells))
     if not len(rows):
         return []
     window = found.window
-    owner, other, sure = (found.a, found.b, found.sure_b) if has == "a" else (found.b, found.a, found.sure_a)
     kinds = np.zeros(len(rows), dtype=np.int64)
     hang_together = pieces(rows, cols, kinds)
     things = group(rows, cols, kinds, hang_together.objects)
     outlines = rings(rows + window.row0, cols + window.col0, hang_together.polygons)
     ground = np.where(np.isfinite(owner.ground_z), owner.ground_z, other.ground_z)
     height = (owner.top_z - ground)[rows, cols]
+    x, y = (centres - 0.5 * CELL_SIZE for centres in window.centres())
     out = []
     for mine in np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1]):
         area_m2 = len(mine) * CELL_SIZE**2
@@ -308,15 +288,10 @@ def _objects(
                 area_m2,
                 float(np.nanmax(height[mine], initial=0.0)),
                 points,
-                _box(window, r, c),
-                float(sure[r, c].mean()) if kind != "not seen" else 0.0,
+                (float(x[c.min()]), float(y[r.min()]), float(x[c.max()] + CELL_SIZE), float(y[r.max()] + CELL_SIZE)),
+                float(side.sure[r, c].mean()) if kind != "not seen" else 0.0,
                 has,
                 (r, c),
             )
         )
     return out
-
-
-def _box(window: Grid, rows: I64, cols: I64) -> tuple[float, float, float, float]:
-    x, y = window.x0 + CELL_SIZE * cols, window.y0 + CELL_SIZE * rows
-    return float(x.min()), float(y.min()), float(x.max() + CELL_SIZE), float(y.max() + CELL_SIZE)
