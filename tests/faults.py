@@ -1,0 +1,417 @@
+"""Drives and maps broken on purpose: what is done to a sound one, and which words name it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from mapvote.core.geometry import exp, from_xyz_rpy, inverse, transform
+from mapvote.core.types import F64, I64
+from mapvote.doctor import Finding
+from mapvote.doctor.prior import CAMERA_TO_LIDAR
+from mapvote.formats.drives.kitti import write_poses
+
+VAGUE = "do not belong together|do not fit|leap|the vehicle drives at|off the scans' motion|fits the scans in|nowhere"
+"""Errors that say something is wrong without saying what."""
+MIRROR, UP, TWICE = "left-handed|mirrored", "upside down", "there twice"
+TURN = r"turned by|turned against each other|headings are off|backward|turned about z"
+SCALE, ORDER = r"too large|too small|in scale|scaled by", "in order of time|reverse order|out of order"
+TILT = "tilted|pitched|rolled|lean by"
+
+
+@dataclass
+class Recording:
+    """A drive in memory: scans [(n, 4)], poses (m, 4, 4), times (m,) in seconds, what drive.toml says."""
+
+    scans: list[F64]
+    T: F64
+    times_s: F64
+    toml: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: Path) -> None:
+        (folder / "velodyne").mkdir(parents=True)
+        for i, scan in enumerate(self.scans):
+            np.ascontiguousarray(scan, dtype="<f4").tofile(folder / "velodyne" / f"{i:06d}.bin")
+        write_poses(folder / "prior.txt", self.T)
+        (folder / "times.txt").write_text("".join(f"{t:.9f}\n" for t in self.times_s))
+        (folder / "drive.toml").write_text(tomli_w.dumps(self.toml))
+
+
+Change = Callable[..., Any]
+"""Of one array, float64."""
+Break = Callable[[Recording], Recording]
+
+
+def points(change: Change) -> Break:
+    """Of a scan's x, y, z (n, 3)."""
+    return rows(lambda s: np.column_stack([change(s[:, :3].astype(np.float64)), s[:, 3]]))
+
+
+def rows(change: Change) -> Break:
+    """Of a scan's rows (n, 4)."""
+    return lambda r: replace(r, scans=[change(s) for s in r.scans])
+
+
+def one_scan(change: Change) -> Break:
+    """Of one scan's rows, in the middle."""
+    return lambda r: replace(r, scans=[change(s) if i == len(r.scans) // 2 + 1 else s for i, s in enumerate(r.scans)])
+
+
+def poses(change: Change) -> Break:
+    return lambda r: replace(r, T=change(r.T.copy()))
+
+
+def positions(change: Change) -> Break:
+    return poses(lambda T: with_(T, change(T[:, :3, 3]), slice(3, 4)))
+
+
+def rotations(change: Change) -> Break:
+    return poses(lambda T: with_(T, change(T[:, :3, :3]), slice(0, 3)))
+
+
+def with_(T: F64, part: F64, columns: slice) -> F64:
+    T[:, :3, columns] = part.reshape(len(T), 3, -1)
+    return T
+
+
+def yaws(rule: Change) -> Break:
+    """Poses level, with another yaw."""
+    return poses(lambda T: np.array([
+        from_xyz_rpy(x, y, z, yaw=float(a))
+        for (x, y, z), a in zip(T[:, :3, 3], rule(np.arctan2(T[:, 1, 0], T[:, 0, 0])), strict=True)
+    ]))  # fmt: skip
+
+
+def times(change: Change) -> Break:
+    return lambda r: replace(r, times_s=change(r.times_s.copy()))
+
+
+def order(of: Callable[[int], I64]) -> Break:
+    return lambda r: replace(r, scans=[r.scans[i] for i in of(len(r.scans))])
+
+
+@dataclass(frozen=True)
+class Files:
+    """What is done to the folder of a drive once it is written."""
+
+    edit: Callable[[Path], None]
+
+
+def lines(name: str, change: Callable[[list[str]], list[str]]) -> Files:
+    def edit(folder: Path) -> None:
+        (folder / name).write_text("\n".join(change((folder / name).read_text().splitlines())) + "\n")
+
+    return Files(edit)
+
+
+def cut_in_a_point(folder: Path) -> None:
+    files = sorted((folder / "velodyne").iterdir())
+    files[len(files) // 2].write_bytes(files[len(files) // 2].read_bytes()[:-7])
+
+
+def turn(**deg: float) -> F64:
+    return from_xyz_rpy(0, 0, 0, **{axis: float(np.radians(v)) for axis, v in deg.items()})
+
+
+def turned(**deg: float) -> Change:
+    return lambda p: transform(turn(**deg), p)
+
+
+def half_turned(r: Recording, whole: bool) -> Recording:
+    """Scans in the map's frame, or only in its axes."""
+    each = [T if whole else np.block([[T[:3, :3], np.zeros((3, 1))], [np.zeros((1, 3)), 1.0]]) for T in r.T]
+    return points_of_each(r, each)
+
+
+def points_of_each(r: Recording, T: list[F64]) -> Recording:
+    moved = [np.column_stack([transform(one, s[:, :3]), s[:, 3]]) for one, s in zip(T, r.scans, strict=True)]
+    return replace(r, scans=moved)
+
+
+def late(T: F64, k: int = 12) -> F64:
+    """Every row ``k`` scans early; the last ones go on as the drive ended."""
+    step = inverse(T[-2]) @ T[-1]
+    return np.concatenate([T[k:], [T[-1] @ np.linalg.matrix_power(step, j + 1) for j in range(k)]])
+
+
+def degrees(p: F64) -> F64:
+    east_m = 111_320.0 * np.cos(np.radians(49.0))
+    return np.column_stack([8.4 + p[:, 0] / east_m, 49.0 + p[:, 1] / 111_320.0, p[:, 2]])
+
+
+def changed(T: F64, rows_: slice, axis: int, by: Any) -> F64:
+    T[rows_, axis, 3] += by
+    return T
+
+
+def azimuth(s: F64) -> F64:
+    return np.degrees(np.arctan2(s[:, 1], s[:, 0]))
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def as_floats(s: F64, kind: str) -> F64:
+    return np.ascontiguousarray(s, dtype=kind).view("<f4").reshape(-1, 4)
+
+
+def five_columns(s: F64) -> F64:
+    """What four columns make of a file of five, the fifth a ring."""
+    five = np.column_stack([s, np.arange(len(s)) % 64])
+    return five.ravel()[: five.size // 4 * 4].reshape(-1, 4)
+
+
+def scattered(p: F64) -> F64:
+    out: F64 = p * (1 + rng(7).normal(0, 0.4, (len(p), 1)) / np.linalg.norm(p, axis=1, keepdims=True))
+    return out
+
+
+def frozen(T: F64) -> F64:
+    T[len(T) // 2 :] = T[len(T) // 2]
+    return T
+
+
+C3 = CAMERA_TO_LIDAR[:3, :3]
+# name, what names it rightly, what is done to a Recording (or to the files of its folder)
+DRIVES: list[tuple[str, str, Break | Files]] = [
+    ("points in the vehicle's left-handed axes", MIRROR, points(lambda p: p * [1, -1, 1])),
+    ("points mirrored front to back", MIRROR, points(lambda p: p * [-1, 1, 1])),
+    ("points facing backwards", TURN, points(lambda p: p * [-1, -1, 1])),
+    ("points upside down, turned over", UP, points(lambda p: p * [1, -1, -1])),
+    ("points with z negated", UP, points(lambda p: p * [1, 1, -1])),
+    ("points with x and y swapped", "x and y of the scans are swapped", points(lambda p: p[:, [1, 0, 2]])),
+    ("points in camera axes", "axis -y points up", points(lambda p: p @ C3)),
+    ("points with y up", r"axis \+y points up", points(lambda p: p[:, [0, 2, 1]] * [1, 1, -1])),
+    ("points with x up", r"axis \+x points up", points(lambda p: p[:, [2, 1, 0]])),
+    *((f"points turned by {a} deg", TURN, points(turned(yaw=a))) for a in (90, -90, 30, 8)),
+    *((f"points {how}ed by {a} deg", TILT, points(turned(**{how: a}))) for how, a in (("pitch", 12), ("pitch", 6))),
+    ("points rolled by 10 deg", TILT, points(turned(roll=10))),
+    ("points in millimetres", "millimetres", points(lambda p: 1000 * p)),
+    ("points in centimetres", "centimetres", points(lambda p: 100 * p)),
+    ("points in feet", SCALE, points(lambda p: p / 0.3048)),
+    ("points taken for feet", SCALE, points(lambda p: p * 0.3048)),
+    ("points in kilometres", r"m away in the median|metres", points(lambda p: p / 1000)),
+    ("points 6 % too large", SCALE, points(lambda p: 1.06 * p)),
+    ("points rounded to whole metres", "rounded to 1 m", points(np.round)),
+    ("points rounded to 0.25 m", "rounded to 0.25 m", points(lambda p: np.round(4 * p) / 4)),
+    ("ranges that scatter by 0.4 m", "rough|scatter", points(scattered)),
+    ("points without height", "z is 0", points(lambda p: p * [1, 1, 0])),
+    ("absolute values of y", "y is never negative", points(lambda p: np.where([False, True, False], abs(p), p))),
+    ("points in the map's frame", "map's frame already", lambda r: half_turned(r, True)),
+    ("points turned into the map's axes", "map's axes already|" + TURN, lambda r: half_turned(r, False)),
+    ("intensity in z", "z (lies within|is never)|intensity", rows(lambda s: s[:, [0, 1, 3, 2]])),
+    ("intensity in x", "x (lies within|is never)|intensity", rows(lambda s: s[:, [3, 0, 1, 2]])),
+    ("five columns named like KITTI's", "column|intensity|not finite|5 %|x, y, z", rows(five_columns)),
+    ("half of the azimuth missing", "deg of azimuth", rows(lambda s: s[azimuth(s) > 0])),
+    ("the rear quarter and more missing", "deg of azimuth", rows(lambda s: s[abs(azimuth(s)) < 120])),
+    ("cut to 10 m", "lie within", rows(lambda s: s[np.linalg.norm(s[:, :3], axis=1) < 10])),
+    ("one point in sixty", "few for", rows(lambda s: s[::60])),
+    ("without the lower beams", "no road", rows(lambda s: s[s[:, 2] > -1.0])),
+    ("with the vehicle's own roof", "own body", rows(lambda s: np.concatenate(
+        [s, np.array([1.3, 0.3, -0.4, 0.2]) + 0.1 * rng(1).random((len(s) // 8, 4))]))),
+    *((f"a tenth of the points {v}", "not finite", rows(lambda s, v=v: np.where(np.arange(len(s))[:, None] % 10, s, v)))
+      for v in (np.nan, np.inf)),
+    ("float64 read as float32", "not finite|5 %|not float32", rows(lambda s: as_floats(s, "<f8"))),
+    ("big-endian", "not finite|5 %|no usable", rows(lambda s: as_floats(s, ">f4"))),
+    ("one scan cut off at a point", "cut off", one_scan(lambda s: s[: len(s) // 3])),
+    ("one scan without 100 deg", "lacks|cut off", one_scan(lambda s: s[abs(azimuth(s) - 40) > 50])),
+    ("one scan empty", "no usable|empty|holds no|0 bytes", one_scan(lambda s: s[:0])),
+    ("one scan full of NaN", "not finite", one_scan(lambda s: s * np.nan)),
+    ("one file cut off in a point", "multiple of|cut off", Files(cut_in_a_point)),
+    ("every second scan doubled", "same as the one before", order(lambda n: np.arange(n) // 2 * 2)),
+    ("scans shuffled", ORDER, order(lambda n: rng(3).permutation(n))),
+    ("scans in reverse order", ORDER, order(lambda n: np.arange(n)[::-1])),
+    ("scans sorted as text", ORDER, order(lambda n: np.array(sorted(range(n), key=str)))),
+    ("two halves of the drive swapped", f"{ORDER}|do not fit|does not between|belongs? to|between scans",
+     order(lambda n: np.roll(np.arange(n), n // 2))),
+    ("inverse poses", "inverse poses", poses(lambda T: np.array([inverse(one) for one in T]))),
+    ("rotations transposed", "transposed", rotations(lambda R: np.swapaxes(R, 1, 2))),
+    ("prior in camera axes", "camera axes|camera poses", poses(lambda T: CAMERA_TO_LIDAR.T @ T @ CAMERA_TO_LIDAR)),
+    ("heading as a compass bearing", "compass|" + TURN, yaws(lambda a: np.pi / 2 - a)),
+    ("heading from north, counter-clockwise", TURN, yaws(lambda a: a - np.pi / 2)),
+    ("headings turned about", TURN, yaws(lambda a: a + np.pi)),
+    *((f"headings off by {d} deg", TURN, yaws(lambda a, d=d: a + np.radians(d))) for d in (20, 6)),
+    ("headings in degrees taken for radians", "rotations do not belong|" + TURN, yaws(np.degrees)),
+    ("headings in radians taken for degrees", "rotations do not belong|" + TURN, yaws(np.radians)),
+    ("headings missing", "rotations do not belong|" + TURN, yaws(lambda a: 0 * a)),
+    ("poses pitched by 10 deg", TILT, poses(lambda T: T @ turn(pitch=10))),
+    ("poses rolled by 12 deg", TILT, poses(lambda T: T @ turn(roll=12))),
+    ("positions in millimetres", "millimetres", positions(lambda p: 1000 * p)),
+    ("positions in centimetres", "centimetres", positions(lambda p: 100 * p)),
+    ("positions in kilometres", "kilometres", positions(lambda p: p / 1000)),
+    ("positions in feet", SCALE, positions(lambda p: p / 0.3048)),
+    ("positions in Mercator's metres", SCALE, positions(lambda p: p * [1.53, 1.53, 1])),
+    ("positions 10 % too large", SCALE, positions(lambda p: 1.1 * p)),
+    ("positions 4 % too small", SCALE, positions(lambda p: 0.96 * p)),
+    ("positions as longitude, latitude", "longitude, latitude", positions(degrees)),
+    ("positions as latitude, longitude", "latitude, longitude", positions(lambda p: degrees(p)[:, [1, 0, 2]])),
+    ("x and y of positions swapped", "x and y are swapped|" + TURN, positions(lambda p: p[:, [1, 0, 2]])),
+    ("y of positions negated", "y negated|" + TURN, positions(lambda p: p * [1, -1, 1])),
+    ("x of positions negated", "negated|reverse|" + TURN, positions(lambda p: p * [-1, 1, 1])),
+    ("positions that scatter by 4 m", "scatter|off the scans' motion|do not belong together|jumps",
+     positions(lambda p: p + rng(7).normal(0, 4.0, p.shape))),
+    ("positions rounded to whole metres", "rounded to", positions(np.round)),
+    ("heights that go up and down by 3 m", "off the scans' motion|pitched|do not belong|between scans",
+     poses(lambda T: changed(T, slice(None), 2, 3.0 * np.sin(np.arange(len(T)) / 2.0)))),
+    ("the prior frozen from the middle", "stands still|fits the scans in|repeat", poses(frozen)),
+    *((f"a jump of {m} m", "jumps|between scans|fits the scans in",
+       poses(lambda T, m=m: changed(T, slice(len(T) // 2, None), 0, m))) for m in (30.0, 3.0)),
+    ("spikes of 25 m", "jumps", poses(lambda T: changed(T, slice(5, None, 12), 1, 25.0))),
+    ("the prior does not move", "does not move|stands? still|do not belong|repeat|prior moves 0.0",
+     poses(lambda T: np.tile(T[:1], (len(T), 1, 1)))),
+    ("rows in reverse order", ORDER, poses(lambda T: T[::-1])),
+    ("rows shuffled", "jumps|do not belong|order", poses(lambda T: T[rng(3).permutation(len(T))])),
+    ("another drive's trajectory", "do not belong together|trajectory of this drive",
+     poses(lambda T: np.array([exp(k * np.array([0.31, 0, 0, 0, 0, 0.06])) for k in range(len(T))]))),
+    ("steps instead of poses", "counts from the one before",
+     poses(lambda T: np.array([np.eye(4), *(inverse(a) @ b for a, b in pairwise(T))]))),
+    ("rows 12 scans late", "late|early|s off|does not between|between scans", poses(late)),
+    ("one row missing", "one line a scan|lines for", lines("prior.txt", lambda t: t[:-1])),
+    ("one row not a number", "nan|number|finite", lines("prior.txt", lambda t: [*t[:4], "nan " * 12, *t[5:]])),
+    ("rotations scaled", "orthonormal|rigid",
+     lines("prior.txt", lambda t: [" ".join(str(2 * float(v)) for v in one.split()) for one in t])),
+    ("times in milliseconds", "milliseconds", times(lambda t: 1e3 * t)),
+    ("times in microseconds", "microseconds", times(lambda t: 1e6 * t)),
+    ("times divided by 1000", "divided by 1000", times(lambda t: t / 1000)),
+    ("times that run ten times too fast", "m/s|turns at|times", times(lambda t: t / 10)),
+    ("times in reverse", "not sorted", times(lambda t: t[::-1])),
+    ("times of whole seconds", "not sorted", times(np.floor)),
+    ("two times alike", "not sorted", times(lambda t: np.where(np.arange(len(t)) == 9, t[8], t))),
+    ("times that jitter by 40 ms", "uneven|not sorted", times(lambda t: t + rng(2).uniform(-0.04, 0.04, len(t)))),
+    ("a hole of eight seconds that is none", "holes in the times",
+     times(lambda t: np.where(np.arange(len(t)) > len(t) // 2, t + 8.0, t))),
+    ("one time missing", "lines for|one line a scan", lines("times.txt", lambda t: t[:-1])),
+    ("one time not a number", "not a time", lines("times.txt", lambda t: [*t[:3], "n/a", *t[4:]])),
+]  # fmt: skip
+
+
+def moved(scale: float = 1.0, **pose: float) -> Change:
+    """x, y, z in metres, roll, pitch, yaw in degrees, about the road below the middle of the drive."""
+    shift_m = [pose.pop(axis, 0.0) for axis in "xyz"]
+    T = from_xyz_rpy(*shift_m, **{axis: np.radians(v) for axis, v in pose.items()})
+    T[:3, :3] *= scale
+    return lambda p: p @ T[:3, :3].T + T[:3, 3]
+
+
+def twice(*shift_m: float) -> Change:
+    """Half of the points are there again, elsewhere and with an error of their own."""
+
+    def change(p: F64) -> F64:
+        again = p[rng(4).random(len(p)) < 0.5]
+        return np.concatenate([p, again + shift_m + rng(5).normal(0, 0.03, again.shape)])
+
+    return change
+
+
+def bent(p: F64) -> F64:
+    """As a survey without loops drifts: turned the more, the farther along."""
+    c, s = np.cos(np.radians(0.15) * p[:, 0]), np.sin(np.radians(0.15) * p[:, 0])
+    return np.column_stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]])
+
+
+def above_ground(p: F64) -> F64:
+    """Without the points near the lowest of their square of 2 m."""
+    _, which = np.unique(np.floor(p[:, :2] / 2.0).astype(np.int64), axis=0, return_inverse=True)
+    lowest = np.full(which.max() + 1, np.inf)
+    np.minimum.at(lowest, which, p[:, 2])
+    return p[p[:, 2] - lowest[which] > 0.4]
+
+
+MAPS: list[tuple[str, str, Change]] = [
+    *((f"shifted by {np.linalg.norm(xyz):g} m", "shifted by", moved(x=xyz[0], y=xyz[1], z=xyz[2]))
+      for xyz in ((0.4, 0.3, 0), (-1.2, 1.6, 0), (3, 4, 0), (0, 0, 0.8), (0, 0, 30.0), (32.0, -24.0, 0))),
+    ("shifted by 300 km", "do not overlap", moved(x=3e5)),
+    *((f"turned by {a} deg", TURN, moved(yaw=a)) for a in (2, 10, 90, 180)),
+    *((f"pitched by {a} deg", TILT, moved(pitch=a)) for a in (3, 4)),
+    *((f"scaled by {s}", SCALE, moved(s)) for s in (1.03, 0.97)),
+    ("in feet", SCALE + "|feet", moved(1 / 0.3048)),
+    ("in centimetres", "centimetres", moved(100.0)),
+    ("in millimetres", "millimetres", moved(1000.0)),
+    ("in kilometres", "kilometres", moved(0.001)),
+    ("mirrored, y negated", MIRROR, lambda p: p * [1, -1, 1]),
+    ("mirrored, x negated", MIRROR, lambda p: p * [-1, 1, 1]),
+    ("x and y swapped", MIRROR + "|swapped", lambda p: p[:, [1, 0, 2]]),
+    ("upside down, turned over", UP, lambda p: p * [1, -1, -1]),
+    ("upside down, z negated", UP, lambda p: p * [1, 1, -1]),
+    ("y up", r"axis \+y points up", lambda p: p[:, [0, 2, 1]] * [1, 1, -1]),
+    *((f"twice, {np.linalg.norm(xyz):.1f} m apart", TWICE, twice(*xyz))
+      for xyz in ((2.0, 1.0, 0), (0.4, -1.1, 0), (0, 0.6, 0), (0.35, 0.49, 0), (0, 0, 0.5))),
+    ("half of it missing", "holds nothing around", lambda p: p[p[:, 0] * 0.9 + p[:, 1] * 0.43 > 0]),
+    ("without its ground", "ground", above_ground),
+    ("points that scatter by 0.25 m", "thick|scatter", lambda p: p + rng(2).normal(0, 0.25, p.shape)),
+    ("heights that wave by 1.5 m", "thick|height|bent|only|nowhere|above the map|" + TILT,
+     lambda p: p + np.column_stack([0 * p[:, 0], 0 * p[:, 0], 1.5 * np.sin(p[:, 0] / 12.0)])),
+    ("bent", "bent|only|nowhere", bent),
+    ("rounded to 0.5 m", "rounded to 0.5 m", lambda p: np.round(2 * p) / 2),
+    ("one point in a hundred", "apart", lambda p: p[::100]),
+    ("with strays", "far off all others", lambda p: np.concatenate([p, rng(3).uniform(-9e4, 9e4, (50, 3))])),
+    ("5 % outliers 200 m up", "m above the ground|far off",
+     lambda p: p + (rng(3).random(len(p)) < 0.05)[:, None] * [0, 0, 200.0]),
+    ("flat", "flat", lambda p: p * [1, 1, 0]),
+    ("joined with itself", TWICE, lambda p: np.concatenate([p, p])),
+]  # fmt: skip
+TWO_AT_ONCE = {
+    "drives": [
+        ("points upside down, turned over", "positions 10 % too large"),
+        ("points turned by 30 deg", "positions 10 % too large"),
+        ("points in millimetres", "inverse poses"),
+        ("headings off by 20 deg", "positions in feet"),
+        ("inverse poses", "times in milliseconds"),
+        ("one scan empty", "rotations transposed"),
+    ],
+    "maps": [
+        ("twice, 0.6 m apart", "pitched by 3 deg"),
+        ("twice, 0.6 m apart", "scaled by 1.03"),
+        ("pitched by 3 deg", "scaled by 1.03"),
+        ("shifted by 5 m", "turned by 10 deg"),
+    ],
+}
+
+
+def both(first: Callable[[Any], Any], second: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda sound: second(first(sound))
+
+
+def kinds_of(what: str) -> dict[str, tuple[list[str], Any]]:
+    """By name (patterns that name each fault, what is done): as it is, one fault, two joined by " + "."""
+    table: dict[str, tuple[str, Any]] = {
+        name: (right, change) for name, right, change in (DRIVES if what == "drives" else MAPS)
+    }
+    out: dict[str, tuple[list[str], Any]] = {"as it is": ([], lambda sound: sound)}
+    out |= {name: ([right], change) for name, (right, change) in table.items()}
+    for a, b in TWO_AT_ONCE[what]:
+        out[f"{a} + {b}"] = [table[a][0], table[b][0]], both(table[a][1], table[b][1])
+    return out
+
+
+def broken(sound: Recording, change: Break | Files, folder: Path) -> Path:
+    """The drive folder, written with what is wrong with it."""
+    (sound if isinstance(change, Files) else change(sound)).write(folder)
+    if isinstance(change, Files):
+        change.edit(folder)
+    return folder
+
+
+def verdict(rights: list[str], found: Iterable[Finding]) -> str:
+    """Of faults that the patterns ``rights`` name. "right": an error or a warning names each; "open": a note says that
+    it cannot be decided; "part": one of two is named; "vague": something is wrong but not what; "wrong": an error names
+    something else; "sound"."""
+    found = list(found)
+    serious = [f.what for f in found if f.severity != "note"]
+    named = [any(re.search(right, what) for what in serious) for right in rights]
+    if named and all(named):
+        return "right"
+    if any(named):
+        return "part"
+    if not serious:
+        return "open" if any(re.search(right, f.what) for right in rights for f in found) else "sound"
+    errors = [f.what for f in found if f.severity == "error"]
+    return "wrong" if any(not re.search(VAGUE, what) for what in errors) else "vague"
