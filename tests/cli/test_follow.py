@@ -11,9 +11,7 @@ import pytest
 import yaml
 from pypcd4 import PointCloud
 
-from live_server import serving_here
 from mapvote.cli.files import follow_once
-from mapvote.client import MapClient
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.maps.autoware import lay_version
@@ -147,19 +145,3 @@ def test_the_metadata_never_names_a_tile_that_is_not_whole(tmp_path: Path, monke
     loader.start()
     loader.ask(0.0, 0.0, 100.0)
     assert np.array_equal(loader.points(), by_row(STREET))
-
-
-@pytest.mark.slow
-def test_a_real_server_is_followed_and_only_changed_planes_are_fetched(tmp_path: Path) -> None:
-    from mapvote.server.store.store import Store
-
-    Store.create(f"sqlite:///{tmp_path / 's.db'}", map_from_points(STREET)).close()
-    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url, MapClient(url, home=tmp_path / "home") as client:
-        change = follow_once(client, tmp_path / "map", None, 3)
-        assert change is not None
-        assert (change.version, change.deleted) == (1, 0)
-        assert follow_once(client, tmp_path / "map", None, 3) is None
-        loader = Loader(tmp_path / "map")
-        loader.start()
-        loader.ask(0.0, 0.0, 100.0)
-        assert len(loader.points()) == len(all_points(client.fetch()))

@@ -148,6 +148,12 @@ WRITERS = {
     "tiles": ("export my_map out", "import pypcd4 as m; m.PointCloud.save = wait"),
     "the disk's own time": ("export my_map out.pcd", "import os as m; m.fsync = wait"),
     "a map in the place of another": ("update my_map car_1.ballot --out out", "import os as m; m.fsync = wait"),
+    "between the two renames of a map": (
+        "update my_map car_1.ballot --out out",
+        "import os\nreal, turns = os.replace, []\n"
+        "def replace(a, b):\n    turns.append(a)\n    wait() if len(turns) == 2 else None\n    real(a, b)\n"
+        "os.replace = replace",
+    ),
 }
 
 
@@ -167,21 +173,6 @@ def test_ctrl_c_while_writing_leaves_what_was_there_and_no_litter(what: str, mad
     assert set(here.iterdir()) - before == {here / "ready"}
     if words[0] == "update":
         assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
-
-
-@pytest.mark.slow
-def test_ctrl_c_between_the_two_renames_of_a_map_brings_the_old_one_back(made: Path, desk: Desk) -> None:
-    here = desk("my_map", "car_1.ballot")
-    shutil.copytree(made / "my_map", here / "out")
-    patch = (
-        "import os\nreal, turns = os.replace, []\n"
-        "def replace(a, b):\n    turns.append(a)\n    wait() if len(turns) == 2 else None\n    real(a, b)\n"
-        "os.replace = replace"
-    )
-    done = interrupt(slowed(["update", "my_map", "car_1.ballot", "--out", "out"], patch), here, (here / "ready").exists)
-    assert stopped_by_a_line(done)
-    assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
-    assert {p.name for p in here.iterdir()} == {"my_map", "car_1.ballot", "out", "ready"}
 
 
 @pytest.mark.slow
@@ -224,43 +215,36 @@ def test_a_ctrl_c_that_comes_while_an_object_is_taken_away_is_not_lost(tmp_path:
     assert stopped_by_a_line(done)
 
 
+def end_by_ctrl_c(words: list[str], folder: Path, once: str) -> tuple[int, str]:
+    """(exit code, all that it says) of a verb that runs until it is stopped, after it has said ``once``."""
+    log = folder / "log"
+    with log.open("w") as out:
+        environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK, "PYTHONUNBUFFERED": "1"}
+        process = subprocess.Popen(
+            mapvote(*words), cwd=folder, stdout=out, stderr=subprocess.STDOUT, start_new_session=True, env=environment
+        )
+        try:
+            while once not in log.read_text():
+                assert process.poll() is None, log.read_text()
+                time.sleep(0.05)
+            os.killpg(process.pid, signal.SIGINT)
+            return process.wait(30), log.read_text()
+        finally:
+            process.kill()
+
+
 @pytest.mark.slow
 def test_an_autoware_service_ends_on_ctrl_c_with_how_much_it_answered(tmp_path: Path) -> None:
     """It runs until it is stopped, so that this is no failure; the server may be away."""
     pytest.importorskip("cyclonedds")
-    here, log = tmp_path, tmp_path / "log"
     words = ["autoware", "http://127.0.0.1:9", "map", "--every", "0.1", "--domain", str(own_domain())]
-    with log.open("w") as out:
-        process = subprocess.Popen(
-            mapvote(*words), cwd=here, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
-            env={**os.environ, "CYCLONEDDS_URI": LOOPBACK},
-        )  # fmt: skip
-        try:
-            while "the map stays as it is" not in log.read_text():
-                assert process.poll() is None, log.read_text()
-                time.sleep(0.05)
-            os.killpg(process.pid, signal.SIGINT)
-            assert process.wait(30) == 0, log.read_text()
-        finally:
-            process.kill()
-    assert log.read_text().splitlines()[-1] == "0 requests answered"
+    code, said = end_by_ctrl_c(words, tmp_path, "the map stays as it is")
+    assert (code, said.splitlines()[-1]) == (0, "0 requests answered"), said
 
 
 def test_a_server_started_as_the_help_says_ends_on_ctrl_c(desk: Desk) -> None:
     here = desk("my_map")
-    words = ["serve", "fleet.db", "--map", "my_map", "--port", "0"]
-    with (here / "log").open("w") as log:
-        process = subprocess.Popen(
-            mapvote(*words), cwd=here, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
-        )
-        assert process.stdout is not None
-        try:
-            while not process.stdout.readline().startswith("serving "):
-                assert process.poll() is None, (here / "log").read_text()
-            os.killpg(process.pid, signal.SIGINT)
-            assert process.wait(30) == 130
-        finally:
-            process.kill()
-            process.stdout.close()
-    assert "Traceback" not in (here / "log").read_text()
+    code, said = end_by_ctrl_c(["serve", "fleet.db", "--map", "my_map", "--port", "0"], here, "serving ")
+    assert code == 130
+    assert "Traceback" not in said
     assert (here / "fleet.db").exists()

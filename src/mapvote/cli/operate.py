@@ -186,7 +186,6 @@ def log(
         Path | None,
         typer.Option("--html", metavar="FILE", help="write one page with the largest changes in 3D"),
     ] = None,
-    min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out changes of fewer cells")] = 1,
     metres: Annotated[
         bool, typer.Option("--metres", help="write map metres instead of longitude and latitude")
     ] = False,
@@ -208,7 +207,7 @@ def log(
     from mapvote.formats.atomic import whole_file
 
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
-    asked = f"from={old or 1}&min_cells={min_cells}" + ("" if new is None else f"&to={new}")
+    asked = f"from={old or 1}" + ("" if new is None else f"&to={new}")
     with api_at(store, key_file) as server, waiting("comparing versions"):
         found = server.ask_json("GET", f"/v1/changes?{asked}&lonlat={str(not local).lower()}")
         text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
@@ -280,12 +279,14 @@ def explain(
         print(f"    {before}; {now}")
 
 
+_MOST_STRETCHES = 20
+
+
 def coverage(
     store: StoreOrUrl,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="also write all stretches of road as GeoJSON")
     ] = None,
-    most: Annotated[int, typer.Option(metavar="N", min=1, help="largest number of rows")] = 20,
     key_file: KeyFile = None,
 ) -> None:
     """List the roads where one more pass would decide cells, by tile and direction, most cells first.
@@ -301,7 +302,7 @@ def coverage(
     with api_at(store, key_file) as server:
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
-    for feature in found["features"][:most]:
+    for feature in found["features"][:_MOST_STRETCHES]:
         about, line = feature["properties"], feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
         counts = (str(about[what]) for what in ("cells", "built", "gone"))
@@ -426,7 +427,7 @@ def gc(
     mapvote gc fleet.db
     """
     with api_at(store, key_file) as server, waiting("looking for what can go"):
-        done = server.ask_json("POST" if yes else "GET", "/v1/gc")["cleared"]
+        done = server.ask_json("POST" if yes else "GET", "/v1/gc")
     counts = f"{done['versions']} versions ({done['planes']} planes, {done['decisions']} decisions)"
     size = f"{done['ballots']} ballots on tiles, {done['size']:,} bytes"
     print(f"{counts} and {size}" + ("" if yes else ": --yes clears them"))

@@ -94,7 +94,7 @@ def test_a_street_that_lost_a_house_and_a_map_that_followed_passes() -> None:
     after = np.concatenate([ROAD, *HOUSES[:7], *HOUSES[8:]])
     result = run(STREET, after, world=after)
     assert result.verdict == "pass", result.reasons
-    assert (result.scans, result.scans_near, result.scans_compared) == (20, 20, 20)
+    assert result.scans_compared == 20
 
 
 def test_a_house_that_was_built_raises_the_inlier_share() -> None:

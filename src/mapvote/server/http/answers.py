@@ -14,10 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.server.store.integrity import Damage
-from mapvote.server.store.retention import Cleared
 from mapvote.server.views.change_objects import Kind, Size
 from mapvote.server.views.consensus import VehicleStanding
-from mapvote.server.views.explain import CellDecision, CellVote
 
 
 class Answer(BaseModel):
@@ -247,17 +245,6 @@ class Places(Answer):
     features: list[PlacedFeature]
 
 
-class CellAnswer(Answer):
-    """One cell: who says what, what was decided, what stands there."""
-
-    row: int
-    col: int
-    thing: str
-    votes: list[CellVote]
-    decisions: list[CellDecision]
-    probability: float | None
-
-
 class CoveredTile(Answer):
     """Row and column of a tile, how many vehicles saw it, and when the last did."""
 
@@ -338,12 +325,6 @@ class Restored(Answer):
     """A plane is as it was written; ``restored``: by this request."""
 
     restored: bool
-
-
-class ClearedAnswer(Answer):
-    """What was deleted, or would be."""
-
-    cleared: Cleared
 
 
 class KeyEntry(Answer):

@@ -19,10 +19,8 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.answers import (
     Cancelled,
-    CellAnswer,
     Changes,
     Checked,
-    ClearedAnswer,
     Coverage,
     Health,
     Info,
@@ -72,7 +70,7 @@ from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
 from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
-from mapvote.server.views.explain import explain_cell, seen
+from mapvote.server.views.explain import CellStory, explain_cell, seen
 from mapvote.server.views.geojson import feature_rows, tile_squares
 from mapvote.server.views.history import changes_between, log_of, overview, page_between
 
@@ -187,7 +185,7 @@ def changes_page(
     return Response(page, media_type="text/html", headers=kept)
 
 
-@router.get("/v1/cells", response_model=CellAnswer, responses=problems(), summary="The votes behind one cell")
+@router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
 def cell(request: Request, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     return as_json(explain_cell(services(request).store, x, y, known=sees_names(request)))
@@ -333,21 +331,21 @@ def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
         return _as_answer(replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor))
 
 
-@router.get("/v1/gc", response_model=ClearedAnswer, responses=problems(403), summary="What the policy does not keep")
+@router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
 async def clearable(request: Request) -> Response:
     """Old versions and ballots that POST would delete."""
     operator(request)
     return await _cleared(services(request), partial(clear, dry_run=True))
 
 
-@router.post("/v1/gc", response_model=ClearedAnswer, responses=problems(403), summary="Delete what it does not keep")
+@router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
 async def clear_now(request: Request) -> Response:
     """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
     return await _cleared(services(request), partial(clear, dry_run=False, by=operator(request)))
 
 
 async def _cleared(parts: Services, work: Callable[[Store], Cleared]) -> Response:
-    return as_json({"cleared": await to_thread.run_sync(work, parts.store, limiter=parts.threads.deciding)})
+    return as_json(await to_thread.run_sync(work, parts.store, limiter=parts.threads.deciding))
 
 
 @router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")

@@ -95,12 +95,8 @@ class GateResult:
     verdict: Verdict
     """pass: at least as good. hold: worse. abstain: undecided by this drive."""
     reasons: tuple[str, ...]
-    scans: int
-    """Scans in the drive."""
-    scans_near: int
-    """Scans taken near a change."""
-    scans_compared: int
-    measures: tuple[Measure, ...]
+    scans_compared: int = 0
+    measures: tuple[Measure, ...] = ()
 
 
 def gate_by(ndt: NdtSettings) -> Gate:
@@ -133,11 +129,10 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "
             f"{REACH_M:g} m of what changed; the gate needs {MIN_SCANS}"
         )
-        return GateResult("abstain", (reason,), len(drive), len(near), 0, ())
+        return GateResult("abstain", (reason,))
     pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], ndt)
     measures = compare(pairs, settings)
-    verdict, reasons = pass_or_hold(measures)
-    return GateResult(verdict, reasons, len(drive), len(near), len(chosen), measures)
+    return GateResult(*pass_or_hold(measures), len(chosen), measures)
 
 
 def scans_near(old: PointMap, new: PointMap, T_map_lidar_prior: F64, reach_m: float) -> np.ndarray:
