@@ -1,6 +1,5 @@
 """The ground of maps made from simulated surveys, against the terrain that the simulator knows.
 
-    python benchmarks/ground.py corner:1 junction:1 street:2
     python benchmarks/ground.py --priors 101 [--kitti ../shared/data/kitti]     # 20 surveys under priors of all kinds
 
 The LiDAR has the scenario's flaws: reflections below the road, mixed pixels, surfaces that return nothing. A cell is
@@ -12,30 +11,25 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import from_xyz_rpy, inverses
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.doctor.diagnosis import examine_drive
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.slam.build import BuildReport, build_map
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.drives import _stage
-from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.scenario import Scenario, load_scenario
 from mapvote_lab.simulation.truth import T_map_street
 
 NEAR_M = 10.0
-ONE_VEHICLE = {"vehicles": 1}
 COLUMNS = (
     "survey", "sensor's height off, m", "path off, m", "occupied under the path", "ground: median off, m", "99 %, m",
     "lowest, m", "highest, m", "cells off by > .15 m", "bent, m", "doctor",
@@ -74,44 +68,34 @@ SURVEYS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("streets", nargs="*", metavar="SCENARIO:SEED")
-    parser.add_argument("--priors", type=int, metavar="SEED", help="20 surveys; seeds from here on")
+    parser.add_argument("--priors", type=int, metavar="SEED", default=101, help="20 surveys; seeds from here on")
     parser.add_argument("--kitti", type=Path, help="real drives too: only path and ground against each other")
     arguments = parser.parse_args()
-    table = Table(*COLUMNS, title=f"Ground against terrain; within {NEAR_M:.0f} m of the path")
-    console = Console(width=190)
+    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
     with tempfile.TemporaryDirectory() as folder:
-        for street in arguments.streets:
-            scenario, seed = street.split(":")
-            table.add_row(street, *simulated(scenario, int(seed), Path(folder) / street))
-        for k, survey in enumerate(SURVEYS if arguments.priors is not None else ()):
-            row = simulated(survey.scenario, arguments.priors + k, Path(folder) / str(k), survey)
-            table.add_row(str(survey), *row)
-            print(survey, *row, sep=" | ", flush=True)
-        for path in sorted(arguments.kitti.glob("*")) if arguments.kitti else ():
-            table.add_row(path.name, *real(path))
-    console.print(table)
+        for k, survey in enumerate(SURVEYS):
+            row = simulated(survey, arguments.priors + k, Path(folder) / str(k))
+            print("| " + " | ".join([str(survey), *row]) + " |", flush=True)
+    for path in sorted(arguments.kitti.glob("*")) if arguments.kitti else ():
+        print("| " + " | ".join([path.name, *real(path)]) + " |", flush=True)
 
 
-def simulated(scenario: str, seed: int, folder: Path, survey: Survey | None = None) -> list[str]:
-    """The columns of one street, with the priors of its RTK or those of a ``survey``."""
-    overrides: dict[str, object] = {**ONE_VEHICLE}
-    if survey is not None:
-        overrides |= {"length_m": survey.length_m, "changes": [], "clutter": {"gantry_m": []}}
-        overrides |= {"surveys": ["east inner", "west inner"][: survey.drives]}
-    simulate(scenario, folder, seed, overrides=overrides)
+def simulated(survey: Survey, seed: int, folder: Path) -> list[str]:
+    """The columns of one survey."""
+    overrides: dict[str, object] = {"vehicles": 1, "length_m": survey.length_m, "changes": []}
+    overrides |= {"clutter": {"gantry_m": []}, "surveys": ["east inner", "west inner"][: survey.drives]}
+    simulate(survey.scenario, folder, seed, overrides=overrides)
     drives = [open_drive(path) for path in sorted(folder.glob("survey_*"))]
     true = [read_T_map_lidar(folder / "truth" / d.path.name / "poses.txt", d.path) for d in drives]
-    if survey is not None:
-        drives = [off(d, T, survey, 10 * seed + k) for k, (d, T) in enumerate(zip(drives, true, strict=True))]
+    drives = [off(d, T, survey, 10 * seed + k) for k, (d, T) in enumerate(zip(drives, true, strict=True))]
     said = ", ".join(doctors_word(drive) for drive in drives)
     try:
         point_map, report = build_map(drives)
     except MapvoteError as error:
         return [f"refused: {error}", *[""] * 8, said]
-    spec = load_scenario(scenario, overrides)
+    spec = load_scenario(survey.scenario, overrides)
     height = max(abs(track.heights.median_m - spec.mount_height_m) for track in report.tracks)
-    near, under = beyond_terrain(point_map, report, true, scenario, seed, overrides)
+    near, under = beyond_terrain(point_map, report, true, spec, seed)
     return [
         f"{height:.3f}", worst_of(report), f"{under.mean():.2%}", f"{np.median(np.abs(near)):.3f}",
         f"{np.percentile(np.abs(near), 99):.3f}", f"{near.min():+.2f}", f"{near.max():+.2f}",
@@ -157,36 +141,27 @@ def off(drive: Drive, true: F64, survey: Survey, seed: int) -> Drive:
     return replace(drive, T_map_lidar_prior=prior, prior_sigma_m=survey.sigma_m, prior_sigma_deg=1.0)
 
 
-def cells_near(point_map: PointMap) -> Iterator[tuple[F64, Bool]]:
-    """Tile by tile ((n, 3) ground of the cells within NEAR_M of the path, (n,) occupied right under it)."""
-    tree = cKDTree(np.concatenate(point_map.driven)[:, :2])
-    for index in point_map.tiles:
-        reference = reference_window(point_map, point_map.lattice.tile(index))
-        x, y = np.meshgrid(*point_map.lattice.tile(index).centres())
-        away = tree.query(np.column_stack([x.ravel(), y.ravel()]))[0].reshape(x.shape)
-        here = (away < NEAR_M) & np.isfinite(reference.ground_z)
-        ground = np.column_stack([x[here], y[here], reference.ground_z[here].astype(np.float64)])
-        yield ground, (reference.occupied != 0)[away < CELL_SIZE / 2]
-
-
 def beyond_terrain(
-    point_map: PointMap, report: BuildReport, true: list[F64], scenario: str, seed: int, overrides: dict[str, object]
+    point_map: PointMap, report: BuildReport, true: list[F64], spec: Scenario, seed: int
 ) -> tuple[F64, Bool]:
     """((n,) how far the ground near the path lies above (+) or below (-) its cell's terrain, occupied under it)."""
-    pieces = list(cells_near(point_map))
-    ground = np.concatenate([piece for piece, _ in pieces])
+    tree, grounds, under = cKDTree(np.concatenate(point_map.driven)[:, :2]), [], []
+    for tile in point_map.tiles.values():
+        x, y = np.meshgrid(*tile.window.centres())
+        away = tree.query(np.column_stack([x.ravel(), y.ravel()]))[0].reshape(x.shape)
+        here = (away < NEAR_M) & np.isfinite(tile.ground_z)
+        grounds.append(np.column_stack([x[here], y[here], tile.ground_z[here].astype(np.float64)]))
+        under.append((tile.obstacle_words != 0)[away < CELL_SIZE / 2])
+    ground = np.concatenate(grounds)
     found = np.concatenate([track.T_map_lidar for track in report.tracks])
     moved = np.concatenate(true) @ inverses(found)
-    T = moved[cKDTree(found[:, :2, 3]).query(ground[:, :2])[1]]
-    spec = load_scenario(scenario, overrides)
-    street = np.linalg.inv(T_map_street(spec)) @ T
+    street = np.linalg.inv(T_map_street(spec)) @ moved[cKDTree(found[:, :2, 3]).query(ground[:, :2])[1]]
     x, y, z = (street[:, :3, :3] @ ground[:, :, None])[:, :, 0].T + street[:, :3, 3].T
     terrain, half = _stage(spec, seed).world.terrain, CELL_SIZE / 2
     heights = np.stack([terrain.height(x + a, y + b) for a in (-half, 0, half) for b in (-half, 0, half)])
     low, high = heights.min(axis=0), heights.max(axis=0)
-    inside = (x > 0.0) & (x < spec.length_m)
-    error = np.where(z > high, z - high, np.minimum(z - low, 0.0))[inside]
-    return error, np.concatenate([under for _, under in pieces])
+    error = np.where(z > high, z - high, np.minimum(z - low, 0.0))
+    return error[(x > 0.0) & (x < spec.length_m)], np.concatenate(under)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,13 @@
 """A street with ten parking spaces: does what is published ever contradict the world, and how late is it?
 
-python benchmarks/parked_cars.py
+    python benchmarks/parked_cars.py
 
 Cars stay for a while and go, some days later the next one comes. Every day three vehicles of the fleet pass at random
-minutes, each with the newest map, and say what is there; after every pass (``--nightly``: after the last of a day) the
-server publishes. "against the truth" counts published changes that make a space other than it is at that moment;
-"hours" is from a change of the world to its publication, median and worst. Changes that were never published were
-overtaken by the next, or are of what comes and goes and is kept out of the map. With noise every vehicle is wrong about
-every space with that probability. Truth is the simulation's.
-
-``--house``: a house that stood for a year falls. How many passes until it is gone?
+minutes, each with the newest map, and say what is there; after every pass the server publishes. "against the truth"
+counts published changes that make a space other than it is at that moment; "hours" is from a change of the world to its
+publication, median and worst. Changes that were never published were overtaken by the next, or are of what comes and
+goes and is kept out of the map. With noise every vehicle is wrong about every space with that probability. Truth is the
+simulation's. At the end a house that stood for a year falls: after how many passes is it gone?
 """
 
 from __future__ import annotations
@@ -18,15 +16,14 @@ import argparse
 import random
 import sys
 import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from hand_made import Cell, Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -46,151 +43,109 @@ EMPTY_DAYS = 3.0
 
 
 @dataclass(slots=True)
-class Street:
-    """The world, and when each space last changed."""
+class Space:
+    """A parking space of the world."""
 
-    stay_days: float
-    rng: random.Random
-    parked: list[bool] = field(default_factory=lambda: [False] * len(SPACES))
-    until_h: list[float] = field(default_factory=list)
-    changed_h: list[float | None] = field(default_factory=lambda: [None] * len(SPACES))
-    changes: int = 0
+    until_h: float
+    parked: bool = False
+    changed_h: float = np.nan
 
-    def __post_init__(self) -> None:
-        self.until_h = [self.rng.uniform(0, 24 * min(self.stay_days, EMPTY_DAYS)) for _ in SPACES]
-
-    def move_on(self, hour: float) -> None:
-        for i, until in enumerate(self.until_h):
-            if hour >= until:
-                self.parked[i] = not self.parked[i]
-                self.changed_h[i], self.changes = until, self.changes + 1
-                days = self.stay_days if self.parked[i] else self.rng.uniform(0.5, EMPTY_DAYS)
-                self.until_h[i] = until + 24 * days
+    def move_on(self, hour: float, stay_days: float, rng: random.Random) -> bool:
+        """Whether it changed."""
+        if hour < self.until_h:
+            return False
+        self.parked, self.changed_h = not self.parked, self.until_h
+        self.until_h += 24 * (stay_days if self.parked else rng.uniform(0.5, EMPTY_DAYS))
+        return True
 
 
-@dataclass(slots=True)
-class Result:
-    """One row of the table."""
+class Server:
+    """A store with a clock, and vehicles that say what stands on things of one tile."""
 
-    published: int = 0
-    against: int = 0
-    hours: list[float] = field(default_factory=list)
-    changes: int = 0
+    def __init__(self, folder: str, first: PointMap, prior_days: float = 30.0) -> None:
+        self.now_ns = START_NS
+        policy = Policy(fuse=FuseSettings(prior_stay_days=prior_days, max_deleted_share=1.0))
+        self.store = Store.create(f"sqlite:///{folder}/store.db", first, policy, clock=lambda: self.now_ns)
+        self.point_map = self.store.point_map()
+
+    def holds(self, things: list[list[Cell]]) -> list[bool]:
+        """Which of the things the map holds."""
+        tile = self.point_map.tiles[0, 0]
+        standing = {divmod(int(cell), 256) for cell, z in zip(tile.cells, tile.points[:, 2], strict=True) if z > 0.3}
+        return [not standing.isdisjoint(cells) for cells in things]
+
+    def told(self, things: list[list[Cell]], seen: list[bool], vehicle: str, drive: str) -> bool:
+        """A vehicle saw these of the things; whether the server then published."""
+        states, new = {}, [wall([], [])]
+        for cells, there, mapped in zip(things, seen, self.holds(things), strict=True):
+            state = {
+                (True, True): CellState.UNCHANGED_OCCUPIED,
+                (True, False): CellState.CHANGED_OCCUPIED,
+                (False, True): CellState.CHANGED_EMPTY,
+                (False, False): CellState.UNCHANGED_EMPTY,
+            }[there, mapped]
+            states |= dict.fromkeys(cells, int(state))
+            new += [wall(cells, HEIGHTS)] if state == CellState.CHANGED_OCCUPIED else []
+        say = Say(states_plane(states), new_points=np.concatenate(new) if len(new) > 1 else None)
+        data = encode(make_ballot(self.point_map, {(0, 0): say}, vehicle, drive, self.now_ns - 10**9))
+        (receipt,) = accept(self.store, [examine(data)])
+        assert isinstance(receipt, Receipt), receipt
+        published = publish(self.store).published
+        self.point_map = self.store.point_map() if published else self.point_map
+        return bool(published)
 
 
-def holds(point_map: PointMap) -> list[bool]:
-    """Which spaces hold a car in the map."""
-    tile = point_map.tiles[0, 0]
-    standing = {int(cell) for cell, z in zip(tile.cells, tile.points[:, 2], strict=True) if z > 0.3}
-    return [any(r * 256 + c in standing for r, c in cells) for cells in SPACES]
-
-
-def ballot(point_map: PointMap, parked: list[bool], vehicle: str, drive: str, now_ns: int) -> bytes:
-    """What a vehicle says that takes ``parked`` for the world."""
-    states, new = {}, []
-    for cells, there, mapped in zip(SPACES, parked, holds(point_map), strict=True):
-        state = {
-            (True, True): CellState.UNCHANGED_OCCUPIED,
-            (True, False): CellState.CHANGED_OCCUPIED,
-            (False, True): CellState.CHANGED_EMPTY,
-            (False, False): CellState.UNCHANGED_EMPTY,
-        }[there, mapped]
-        states |= dict.fromkeys(cells, int(state))
-        new += [wall(cells, HEIGHTS)] if state == CellState.CHANGED_OCCUPIED else []
-    say = Say(states_plane(states), new_points=np.concatenate(new) if new else None)
-    return encode(make_ballot(point_map, {(0, 0): say}, vehicle, drive, now_ns))
-
-
-def live(stay_days: float, fleet: int, noise: float, days: int, prior_days: float, nightly: bool) -> Result:
-    """So many days of one street."""
-    rng, now, result = random.Random(1), [START_NS], Result()
-    street = Street(stay_days, rng)
+def live(stay_days: float, fleet: int, noise: float, days: int, prior_days: float) -> tuple[object, ...]:
+    """So many days of one street: (changes, published, against the truth, hours)."""
+    rng = random.Random(1)
+    street = [Space(rng.uniform(0, 24 * min(stay_days, EMPTY_DAYS))) for _ in SPACES]
     ground = make_map({(0, 0): make_tile(wall([(r, c) for r in range(0, 80, 8) for c in range(0, 220, 8)], [0.05]))})
-    settings = FuseSettings(prior_stay_days=prior_days, max_deleted_share=1.0)
+    changes, published, against, hours = 0, 0, 0, list[float]()
     with tempfile.TemporaryDirectory() as folder:
-        url = f"sqlite:///{folder}/store.db"
-        store = Store.create(url, ground, Policy(fuse=settings), clock=lambda: now[0])
-        point_map = store.point_map()
+        server = Server(folder, ground, prior_days)
         for day in range(days):
             minutes = sorted(rng.sample(range(24 * 60), 3))
-            for k, (vehicle, minute) in enumerate(zip(rng.sample(range(fleet), 3), minutes, strict=True)):
+            for vehicle, minute in zip(rng.sample(range(fleet), 3), minutes, strict=True):
                 hour = 24 * day + minute / 60
-                street.move_on(hour)
-                now[0] = START_NS + round(hour * HOUR_NS)
-                seen = [there != (rng.random() < noise) for there in street.parked]
-                data = ballot(point_map, seen, f"v{vehicle}", f"d{day}", now[0] - 10**9)
-                (receipt,) = accept(store, [examine(data)])
-                assert isinstance(receipt, Receipt), receipt
-                if nightly and k < 2:
-                    continue
-                before = holds(point_map)
-                if publish(store).published:
-                    point_map = store.point_map()
-                    _judge(result, street, before, holds(point_map), hour)
-        store.close()
-    result.changes = street.changes
-    return result
+                changes += sum([space.move_on(hour, stay_days, rng) for space in street])
+                server.now_ns = START_NS + round(hour * HOUR_NS)
+                before = server.holds(SPACES)
+                seen = [space.parked != (rng.random() < noise) for space in street]
+                if server.told(SPACES, seen, f"v{vehicle}", f"d{day}"):
+                    for space, old, new in zip(street, before, server.holds(SPACES), strict=True):
+                        published += old != new
+                        against += old != new != space.parked
+                        hours += [hour - space.changed_h] if old != new == space.parked else []
+        server.store.close()
+    return changes, published, against, f"{np.median(hours):.0f} / {max(hours):.0f}" if hours else "-"
 
 
-def _judge(result: Result, street: Street, before: list[bool], after: list[bool], hour: float) -> None:
-    for i, (old, new) in enumerate(zip(before, after, strict=True)):
-        if old != new:
-            result.published += 1
-            result.against += new != street.parked[i]
-            since = street.changed_h[i]
-            if new == street.parked[i] and since is not None:
-                result.hours.append(hour - since)
-
-
-def house_falls(fleet: int, passes_a_day: int = 3) -> int:
-    """After a year in which every pass said "unchanged": how many passes until the house is gone."""
-    now = [START_NS]
-    first = make_map({(0, 0): make_tile(wall(HOUSE, [0.05, *HEIGHTS]))})
-    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0))
+def house_falls(fleet: int) -> int:
+    """After a year in which each of three passes a day said "unchanged": how many passes until the house is gone."""
     with tempfile.TemporaryDirectory() as folder:
-        store = Store.create(f"sqlite:///{folder}/store.db", first, policy, clock=lambda: now[0])
-        point_map = store.point_map()
-
-        def passes(number: int, state: CellState) -> None:
-            now[0] += 24 // passes_a_day * HOUR_NS
-            say = Say(states_plane(dict.fromkeys(HOUSE, int(state))))
-            one = make_ballot(point_map, {(0, 0): say}, f"v{number % fleet}", f"d{number}", now[0] - 10**9)
-            (receipt,) = accept(store, [examine(encode(one))])
-            assert isinstance(receipt, Receipt), receipt
-
-        year = 365 * passes_a_day
-        for number in range(year):
-            passes(number, CellState.UNCHANGED_OCCUPIED)
-        needed = 0
-        while not publish(store).published:
-            passes(year + needed, CellState.CHANGED_EMPTY)
-            needed += 1
-        store.close()
-    return needed
-
-
-def rows(asked: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    for prior_days, noise in ((30.0, 0.0), (30.0, 0.02), (25.0, 0.0)):
-        for stay_days in (1, 3, 7, 20) if asked.stay is None else (asked.stay,):
-            for fleet in (3, 30, 90):
-                found = live(stay_days, fleet, noise, asked.days, prior_days, asked.nightly)
-                late = f"{np.median(found.hours):.0f} / {max(found.hours):.0f}" if found.hours else "-"
-                counts = found.changes, found.published, found.against
-                yield (f"{prior_days:g}", f"{noise:.0%}", stay_days, fleet, *counts, late)
+        server = Server(folder, make_map({(0, 0): make_tile(wall(HOUSE, [0.05, *HEIGHTS]))}))
+        number, gone = 0, False
+        while not gone:
+            server.now_ns += 8 * HOUR_NS
+            gone = server.told([HOUSE], [number < 365 * 3], f"v{number % fleet}", f"d{number}")
+            number += 1
+        server.store.close()
+    return number - 365 * 3
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--days", type=int, default=90)
-    parser.add_argument("--stay", type=float, help="only this stay, days")
-    parser.add_argument("--nightly", action="store_true", help="publish once a day")
-    parser.add_argument("--house", action="store_true", help="only the house")
+    parser.add_argument("--stay", type=float, nargs="+", default=[1, 3, 7, 20], help="how long cars stay, days")
     asked = parser.parse_args()
-    if not asked.house:
-        print("| prior_stay_days | noise | stay, days | fleet | changes | published | against the truth | hours |")
-        print("|---|---|---|---|---|---|---|---|")
-        for row in rows(asked):
-            print("| " + " | ".join(map(str, row)) + " |", flush=True)
+    print("| prior_stay_days | noise | stay, days | fleet | changes | published | against the truth | hours |")
+    print("|---|---|---|---|---|---|---|---|")
+    for prior_days, noise in ((30.0, 0.0), (30.0, 0.02), (25.0, 0.0)):
+        for stay_days in asked.stay:
+            for fleet in (3, 30, 90):
+                found = live(stay_days, fleet, noise, asked.days, prior_days)
+                row = f"{prior_days:g}", f"{noise:.0%}", stay_days, fleet, *found
+                print("| " + " | ".join(map(str, row)) + " |", flush=True)
     for fleet in (3, 30, 90):
         print(f"| a house falls after a year, fleet of {fleet} | gone after {house_falls(fleet)} passes |", flush=True)
 
