@@ -4,7 +4,6 @@
 
 Each module gives the same number of mutants, drawn by the seed: an operator, a small constant or a negation is changed,
 min becomes max, any becomes all. A mutant is killed if a test of its module fails, crashes or takes four times as long.
-Each mutant gets a copy of the cache, in which the kernels that the change concerns are compiled again.
 Ends with 1 below 90 % killed, or below 80 % in one module, equal mutants (benchmarks/equal_mutants.csv) apart.
 """
 
@@ -12,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import csv
 import os
 import random
@@ -24,12 +24,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-DECIDING = (
-    "core/voting core/ground_growing fusion/fuse fusion/tile_vote fusion/edit fusion/persistence fusion/distrust "
-    "fusion/loss_budget fusion/neighbour_noise fusion/change_time detection/paper detection/evidence "
-    "detection/packed_tiles detection/confidence perception/fans perception/raycast slam/clean_map server/store/votes "
-    "server/store/round localisation/odometry localisation/pose_check"
-).split()
+DECIDING = [
+    "core/voting", "core/ground_growing", "fusion/fuse", "fusion/tile_vote", "fusion/edit", "fusion/persistence",
+    "fusion/distrust", "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper",
+    "detection/evidence", "detection/packed_tiles", "detection/confidence", "perception/fans", "perception/raycast",
+    "slam/clean_map", "server/store/votes", "server/store/round", "localisation/odometry", "localisation/pose_check",
+]  # fmt: skip
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
     "core/ground_growing": "core/test_ground.py",
@@ -101,19 +101,17 @@ def run(house: Path, tests: str, cache: Path, limit_s: float) -> str:
     words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
     words += [f"tests/{test}" for test in tests.split()]
     paths = {"PYTHONPATH": str(house / "src"), "NUMBA_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
-    try:
+    with contextlib.suppress(subprocess.TimeoutExpired):
         done = subprocess.run(words, cwd=house, env={**os.environ, **paths}, capture_output=True, timeout=limit_s)
-    except subprocess.TimeoutExpired:
-        return "killed"
-    return "survived" if done.returncode == 0 else "killed"
+        return "survived" if done.returncode == 0 else "killed"
+    return "killed"
 
 
 def try_module(house: Path, module: str, tests: str, share: int, seed: int, equal: set[tuple[str, str]]) -> float:
     """The share of a module's mutants that is killed; equal mutants do not count."""
     file, common, cache = house / f"src/mapvote/{module}.py", house / "cache", house / "cache-of-mutant"
     source, began = file.read_text(), time.monotonic()
-    if run(house, tests, common, 900.0) != "survived":
-        raise SystemExit(f"{module}: its tests fail without any change")
+    assert run(house, tests, common, 900.0) == "survived", f"{module}: its tests fail without any change"
     limit_s = 60.0 + 4.0 * (time.monotonic() - began)
     places = list(range(len(list(changes(ast.parse(source))))))
     outcomes = []
@@ -123,13 +121,11 @@ def try_module(house: Path, module: str, tests: str, share: int, seed: int, equa
         shutil.copytree(common, cache)
         file.write_text(text)
         outcome = run(house, tests, cache, limit_s)
+        outcome = "equal" if outcome == "survived" and (f"{module}.py", change) in equal else outcome
         file.write_text(source)
-        if outcome == "survived" and (f"{module}.py", change) in equal:
-            outcome = "equal"
         print(module, change, outcome, sep="  ", flush=True)
         outcomes.append(outcome)
-    counted = [outcome for outcome in outcomes if outcome != "equal"]
-    return counted.count("killed") / max(len(counted), 1)
+    return outcomes.count("killed") / max(len(outcomes) - outcomes.count("equal"), 1)
 
 
 def main() -> None:
@@ -138,8 +134,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=DECIDING, default=DECIDING, metavar="MODULE")
     asked = parser.parse_args()
-    with (ROOT / "benchmarks/equal_mutants.csv").open(newline="") as rows:
-        equal = {(row["module"], row["change"]) for row in csv.DictReader(rows)}
+    rows = csv.DictReader((ROOT / "benchmarks/equal_mutants.csv").read_text().splitlines())
+    equal = {(row["module"], row["change"]) for row in rows}
     with tempfile.TemporaryDirectory() as folder:
         house = Path(folder)
         for part in ("src", "tests", "pyproject.toml"):
