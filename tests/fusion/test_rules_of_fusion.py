@@ -1,0 +1,94 @@
+"""Fusion does what its rules say in plain words (``plain_rules.py``): random passes over a street of a few cells."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hand_made import make_tile, states_plane, wall, words_plane
+from mapvote.config import FuseSettings
+from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
+from mapvote.fusion.fuse import fuse_tile, unspent
+from mapvote.fusion.persistence import history_days
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
+from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Spoken, Version, fuse
+
+WALL: list[Cell] = [(r, c) for r in (10, 11, 12) for c in (10, 11)]
+LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
+HEIGHTS = (0.05, 0.45, 0.75, 1.05, 1.65)
+START_S = 1_700_000_000
+
+
+def say(rng: random.Random, there: bool, seen_with: CellMap, masks: bool, has_free: bool) -> Spoken:
+    """Mostly the truth."""
+    truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[seen_with.stands(), there]
+    state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
+    gone = rng.choice([0b101110, 0b001110, 0b000110, 0b100010, 0]) if state in (CE, UO) and rng.random() < 0.7 else 0
+    heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,), (1.35,)]) if state == CO else ()
+    return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
+
+
+def as_vote(cast: Cast, masks: bool) -> TileVote:
+    points = [wall([cell], list(spoken.heights)) for cell, spoken in cast.says.items()]
+    gone, free = (words_plane({c: getattr(s, name) or 0 for c, s in cast.says.items()}) for name in ("gone", "free"))
+    return TileVote(
+        cast.vehicle,
+        cast.end_s * 10**9,
+        cast.drive,
+        states=states_plane({cell: spoken.state for cell, spoken in cast.says.items()}),
+        gone=Words.of(gone) if masks else None,
+        new_points=np.concatenate(points),
+        free=Words.of(free) if cast.has_free else None,
+        version=cast.version,
+    )
+
+
+def held_by(tile: Tile, cell: Cell) -> CellMap:
+    heights = tile.points[tile.cells == cell[0] * 256 + cell[1], 2]
+    changed, came_s, stays, stayed_s = (int(n) for n in (tile.memory or Memory.none()).planes[:, cell[0], cell[1]])
+    free = 0 if tile.free is None else int(tile.free[cell])
+    return CellMap(tuple(round(float(z), 3) for z in heights), free, changed, came_s, stays, stayed_s)
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_every_cell_of_every_version_is_as_the_rules_have_it(seed: int) -> None:
+    rng = random.Random(seed)
+    more = {
+        "latest_vehicles": rng.choice([3, 10]),
+        "max_age_days": rng.choice([5, 28]),
+        "stay_days": rng.choice([3, 30]),
+    }
+    settings = FuseSettings.model_validate({"min_votes": rng.choice([1, 2, 2, 3]), **more})
+    tile = make_tile(wall(WALL, list(HEIGHTS)))
+    first = {cell: CellMap(HEIGHTS) for cell in WALL} | {cell: CellMap() for cell in LAWN}
+    versions = {1: Version("import", first, False, 0, 0.0, settings)}
+    there, casts, votes, now_s = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False), [], [], START_S
+    for _ in range(9):
+        for cell in rng.sample(WALL + LAWN, 2):
+            there[cell] = not there[cell]
+        newest = max(versions)
+        for vehicle in rng.sample("abcde", rng.randint(1, 4)):
+            now_s += rng.choice([60, 3_600, DAY_S])
+            version, masks, has_free = rng.randint(max(1, newest - 2), newest), rng.random() < 0.7, rng.random() < 0.7
+            seen = [cell for cell in WALL + LAWN if rng.random() < 0.8]
+            says = {c: say(rng, there[c], versions[version].cells[c], masks, has_free) for c in seen}
+            cast = Cast(vehicle, f"d{len(casts):03}", now_s, version, says, has_free, now_s, len(casts))
+            casts.append(cast)
+            votes.append(as_vote(cast, masks))
+        oldest = votes[-1].end_ns - history_days(settings) * DAY_NS
+        lately = [unspent(vote, tile) for vote in votes if vote.end_ns >= oldest]
+        drives = [unspent(vote, tile) for vote in newest_votes(votes, settings)]
+        rng.shuffle(drives)
+        tile = fuse_tile(tile, drives, "columns", settings, newest + 1, lambda lately=lately: lately)[1]
+        before = versions[newest]
+        cells, knows = fuse(before, casts, settings, now_s, newest + 1, lambda *_: True, lambda *_: True)
+        assert {cell: held_by(tile, cell) for cell in cells} == cells
+        assert (tile.free is not None) == knows
+        if knows != before.knows_free or any(not cells[c].same_as(before.cells[c]) for c in cells):
+            versions[newest + 1] = replace(before, cells=cells, knows_free=knows)
+    assert len(versions) > 2, "the street changed"
