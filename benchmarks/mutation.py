@@ -33,9 +33,10 @@ DECIDING = [
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
     "core/ground_growing": "core/test_ground.py",
-    "fusion/fuse": "fusion",
-    "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py",
-    "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py",
+    "fusion/fuse": "fusion/test_fuse.py fusion/test_spent.py fusion/test_distrust.py fusion/test_rules_of_fusion.py",
+    "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
+    "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
+    "fusion/persistence": "fusion/test_persistence.py fusion/test_rules_of_fusion.py",
     "detection/evidence": "detection",
     "detection/packed_tiles": "detection",
     "detection/confidence": "detection",
@@ -56,8 +57,8 @@ def left_out(tree: ast.Module) -> set[int]:
     """Nodes that stay: annotations, decorators, texts, what is raised or asserted, and constants of the module."""
     parts: list[ast.AST | None] = [s for s in tree.body if isinstance(s, ast.Assign | ast.AnnAssign)]
     for node in ast.walk(tree):
-        parts += [getattr(node, "annotation", None), getattr(node, "returns", None)]
-        parts += getattr(node, "decorator_list", [])
+        named = getattr(node, "annotation", None), getattr(node, "returns", None)
+        parts += [*named, *getattr(node, "decorator_list", [])]
         if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr) or getattr(node, "arg", "") == "strict":
             parts.append(node)
     return {id(inner) for part in parts if part is not None for inner in ast.walk(part)}

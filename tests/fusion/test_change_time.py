@@ -12,17 +12,15 @@ from mapvote.fusion.change_time import _turn
 from mapvote.fusion.fuse import Rule, fuse_tile
 from mapvote.fusion.tile_vote import TileVote
 
-UO, UE, CO, CE, UN = (int(state) for state in list(CellState)[:5])
+UO, UE, CO, CE, UN = (int(state) for state in CellState)
 CELL = (10, 10)
+SIX, TWICE = [UO] * 6, ["a", "b", "c", "d", "e", "f", "a", "b"]
 
 
 def decided(
-    *said: int,
-    min_votes: int = 2,
-    ends_s: list[int] | None = None,
-    whose: list[str] | None = None,
+    said: list[int], min_votes: int = 2, ends_s: list[int] | None = None, whose: list[str] | None = None,
     rule: Rule = "columns",
-) -> int:
+) -> int:  # fmt: skip
     """What is decided of a cell if the vehicles pass one after the other and say this."""
     votes = [
         TileVote(
@@ -33,47 +31,35 @@ def decided(
         )
         for i, state in enumerate(said)
     ]
-    rng = np.random.default_rng(len(said))
-    tile = two_walls().tiles[0, 0]
-    shuffled = [votes[i] for i in rng.permutation(len(votes))]
+    shuffled = [votes[i] for i in np.random.default_rng(len(said)).permutation(len(votes))]
     settings = FuseSettings(min_votes=min_votes, latest_vehicles=99)
-    return int(fuse_tile(tile, shuffled, rule, settings)[0].states[CELL])
+    return int(fuse_tile(two_walls().tiles[0, 0], shuffled, rule, settings)[0].states[CELL])
 
 
-def test_a_house_that_many_saw_standing_is_gone_once_three_in_turn_say_so() -> None:
-    assert decided(*[UO] * 6, CE, CE) == UO, "a quorum alone does not outvote six"
-    assert decided(*[UO] * 6, CE, CE, CE) == CE
-    assert decided(*[UO] * 50, CE, CE, CE) == CE
-    assert decided(*[UE] * 6, CO, CO, CO) == CO
-
-
-def test_by_the_papers_rule_the_majority_decides_whoever_came_last() -> None:
-    assert decided(*[UO] * 6, CE, CE, CE, rule="paper") == UO
-
-
-def test_one_more_than_the_quorum_must_say_so() -> None:
-    assert decided(*[UO] * 6, CE, CE, CE, min_votes=3) == UO
-    assert decided(*[UO] * 6, CE, CE, CE, CE, min_votes=3) == CE
-
-
-@pytest.mark.parametrize("said", [[UO, UO, CE, UO, UO, UO, CE, CE, CE], [*[UO] * 6, CE, UO, CE, CE],
-                                  [*[UO] * 6, CE, CE, CE, UO], [*[UO] * 6, CO, CE, CE, CE]])  # fmt: skip
-def test_where_they_contradict_each_other_the_majority_decides(said: list[int]) -> None:
-    assert decided(*said) != CE
-
-
-def test_who_is_not_sure_breaks_nothing() -> None:
-    assert decided(*[UO] * 6, CE, UN, CE, UN, CE) == CE
-
-
-def test_at_the_same_moment_there_is_no_before() -> None:
-    assert decided(*[UO] * 4, CE, CE, CE, ends_s=[1, 1, 1, 5, 5, 5, 5]) == UO
-
-
-def test_of_a_vehicle_the_last_word_counts_once() -> None:
-    whose = ["a", "b", "c", "d", "e", "f", "a", "b", "b"]
-    assert decided(*[UO] * 6, CE, CE, CE, whose=whose) == UO, "two vehicles, three drives"
-    assert decided(*[UO] * 6, CE, CE, CE, whose=[*whose[:8], "c"]) == CE
+@pytest.mark.parametrize(
+    ("why", "said", "how", "state"),
+    [
+        ("a quorum alone does not outvote six", [*SIX, CE, CE], {}, UO),
+        ("three in turn say that the house is gone", [*SIX, CE, CE, CE], {}, CE),
+        ("however many saw it stand", [*[UO] * 50, CE, CE, CE], {}, CE),
+        ("likewise of what is new", [*[UE] * 6, CO, CO, CO], {}, CO),
+        ("one more than the quorum must say so", [*SIX, CE, CE, CE], {"min_votes": 3}, UO),
+        ("one more than the quorum says so", [*SIX, CE, CE, CE, CE], {"min_votes": 3}, CE),
+        ("by the paper's rule the majority decides, whoever came last", [*SIX, CE, CE, CE], {"rule": "paper"}, UO),
+        ("who is not sure breaks nothing", [*SIX, CE, UN, CE, UN, CE], {}, CE),
+        ("at the same moment there is no before", [*[UO] * 4, CE, CE, CE], {"ends_s": [1, 1, 1, 5, 5, 5, 5]}, UO),
+        ("two vehicles, three drives", [*SIX, CE, CE, CE], {"whose": [*TWICE, "b"]}, UO),
+        ("of a vehicle the last word counts", [*SIX, CE, CE, CE], {"whose": [*TWICE, "c"]}, CE),
+        ("one contradicts before", [UO, UO, CE, UO, UO, UO, CE, CE, CE], {}, UO),
+        ("one contradicts between", [*SIX, CE, UO, CE, CE], {}, UO),
+        ("the last contradicts", [*SIX, CE, CE, CE, UO], {}, UO),
+        ("one saw something else", [*SIX, CO, CE, CE, CE], {}, UO),
+    ],
+)
+def test_a_change_is_decided_once_more_than_a_quorum_say_so_one_after_the_other_and_nobody_contradicts(
+    why: str, said: list[int], how: dict[str, int], state: int
+) -> None:
+    assert decided(said, **how) == state, why  # type: ignore[arg-type]
 
 
 def test_a_vehicle_that_never_spoke_of_a_cell_does_not_stand_for_another() -> None:

@@ -68,10 +68,6 @@ def test_vehicles_that_disagree_with_each_other_silence_nobody() -> None:
     assert silenced(named([rng.integers(0, 5, SHAPE, dtype=np.uint8) for _ in range(5)])) == set()
 
 
-def test_two_vehicles_alone_are_both_heard() -> None:
-    assert silenced(named([honest(1), OPPOSITE[honest(2)]])) == set()
-
-
 def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
     def only(states: U8) -> U8:
         few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
@@ -276,13 +272,6 @@ def test_of_copies_the_one_is_heard_that_opposes_others_least_not_the_one_that_s
     fewer[99:101, 60:200], more[99, 60:200], more[100, 60:200] = UN, UN, CO
     votes = by_name({"copy": more, "honest": fewer, "other": drive_along(2), "third": drive_along(3)})
     assert copied(votes) == {"copy": "honest"}
-
-
-def test_all_copies_of_one_drive_count_as_one_vehicle() -> None:
-    votes = by_name({f"copy{i}": drive_along(1) for i in range(3)} | {"other": drive_along(2)})
-    kept, copies = originals(votes, POLICY)
-    assert len(kept) == 2
-    assert len({copy.heard_vehicle for copy in copies}) == 1
 
 
 def test_a_vehicle_may_drive_the_same_way_twice() -> None:

@@ -141,14 +141,6 @@ def test_what_touches_what_stays_goes_if_more_than_two_thirds_mark_it(marking: i
     assert of_standing([0b100] * marking + [0] * (of - marking), [0.45, 0.75]) == (0b100 if goes else 0)
 
 
-def test_nobody_alone_takes_what_touches_what_stays() -> None:
-    for heights, goes in (([0.45, 0.75], 0), ([0.45, 1.05], 0b1000)):
-        tile, votes = make_tile(wall([CELL], heights)), says([0b1100], [UO])
-        words = words_gone(votes, states_plane({CELL: UO}), 1, tile)
-        assert words is not None
-        assert int(words[CELL] & tile.obstacle_words[CELL]) == goes
-
-
 def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
     twig, votes = wall([CELL], APART), says([0b1010] * 2 + [0], [UO] * 3)
     for beside, other, stays in (
@@ -165,10 +157,6 @@ def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
         assert words[CELL] == (0 if stays else 0b1010)
 
 
-def test_of_two_voxels_that_go_together_neither_holds_the_other() -> None:
-    assert of_standing([0b110] * 2 + [0], [0.45, 0.75, 1.65]) == 0b110
-
-
 @pytest.mark.parametrize("cell", [(0, 10), (TILE_CELLS - 1, 10), (10, 0), (10, TILE_CELLS - 1)])
 def test_at_the_tile_s_edge_all_may_touch_what_stays_beyond_it(cell: Cell) -> None:
     assert of_standing([0b1010] * 2 + [0], cell=cell) == 0
@@ -182,15 +170,6 @@ def test_who_has_the_whole_cell_empty_counts_among_two_thirds_but_not_among_half
         assert gone(tile, says([mask, 0b111110, 0], [UO, CE, UO])) == 0, "two of three, of whom one saw nothing stand"
         whole = TileVote("w", 0, "w", states=states_plane({CELL: CE}))
         assert gone(tile, [*says([mask, mask], [UO, UO]), whole]) == mask, "no mask is all of an emptied cell"
-
-
-def test_marks_count_of_nobody_who_says_anything_else_and_only_if_the_cell_stands() -> None:
-    tile = make_tile(wall([CELL], [0.45]))
-    for other in (UN, UE, NO_VOTE):
-        assert gone(tile, says([0b10, 0, 0, 0b10], [UO, UO, UO, other])) == 0
-    assert gone(tile, says([0b10] * 3, [UN] * 3), UN) == 0
-    whole = [TileVote(v, 0, v, states=states_plane({CELL: UO})) for v in "abc"]
-    assert gone(tile, whole) == 0, "no mask marks nothing in a cell that stands"
 
 
 def test_in_one_stage_a_mask_of_a_cell_that_may_be_empty_says_nothing_of_one_that_stands() -> None:
@@ -219,15 +198,6 @@ def test_the_order_of_votes_is_nothing_and_one_mark_more_never_takes_less(
     before = gone(tile, votes)
     assert gone(tile, votes[::-1]) == before
     assert gone(tile, says([masks[0] | more, *masks[1:]], states[: len(masks)])) & before == before
-
-
-def test_a_mapped_neighbour_that_nobody_decides_stays_and_keeps_what_touches_it() -> None:
-    """Its votes are spent: it stands as before. Else a publish without new votes would delete more."""
-    beside = (CELL[0], CELL[1] + 1)
-    tile = make_tile(wall([CELL, beside], [0.45]))
-    votes = says([0b10, 0b10, 0], [UO, UO, UO])
-    assert gone(tile, votes) == 0
-    assert gone(make_tile(wall([CELL], [0.45])), votes) == 0b10, "alone it is a remnant"
 
 
 @settings(max_examples=60)

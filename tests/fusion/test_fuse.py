@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -48,21 +47,6 @@ def test_server_row_of_table_1() -> None:
     assert count(votes, "paper", 1)[0][CELL] == OCCUPIED
 
 
-@pytest.mark.parametrize(
-    ("says", "paper", "columns"),
-    [
-        ([OCCUPIED, EMPTY], CellState.UNDETERMINED, CellState.UNDETERMINED),
-        ([EMPTY, CellState.UNDETERMINED], CellState.UNDETERMINED, EMPTY),
-        ([EMPTY, EMPTY, CellState.UNDETERMINED, CellState.UNDETERMINED, CellState.UNDETERMINED], 4, EMPTY),
-        ([EMPTY, EMPTY, CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY], EMPTY, CellState.UNDETERMINED),
-    ],
-)
-def test_undetermined_competes_in_the_paper_and_abstains_in_columns(says: list[int], paper: int, columns: int) -> None:
-    votes = [vote(f"v{i}", states_plane({CELL: s})) for i, s in enumerate(says)]
-    assert count(votes, "paper", 1)[0][CELL] == paper
-    assert count(votes, "columns", 1)[0][CELL] == columns
-
-
 def test_tie_keeps_the_points_of_the_map() -> None:
     tile = make_tile(wall([CELL], [0.45, 0.75]))
     votes = [vote("a", states_plane({CELL: EMPTY})), vote("b", states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))]
@@ -78,41 +62,13 @@ def test_ground_is_never_deleted_and_everything_else_is_bit_identical() -> None:
     assert edited.ground_z is tile.ground_z
 
 
-def test_delete_mask_takes_the_awning_and_leaves_the_wall() -> None:
-    tile = make_tile(wall([CELL], [0.45, 1.05, 3.15]))
-    awning = marks(1 << 10)
-    _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=awning)])
-    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
-
-
-def test_only_voxels_marked_by_enough_vehicles_are_deleted() -> None:
-    tile = make_tile(wall([CELL], [0.45, 0.75, 1.05]))
-    masks = [1 << 1 | 1 << 2, 1 << 2 | 1 << 3, 1 << 2]
-    votes = [
-        vote(f"v{i}", states_plane({CELL: EMPTY}), gone=Words.of(words_plane({CELL: m}))) for i, m in enumerate(masks)
-    ]
-    _, edited = fuse(tile, votes, SURE)
-    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
-
-
 KEPT = CellState.UNCHANGED_OCCUPIED
-
-
-def standing(masks: list[int], state: int = KEPT) -> list[TileVote]:
-    return [vote(f"v{i}", states_plane({CELL: state}), gone=marks(mask)) for i, mask in enumerate(masks)]
 
 
 def test_heights_are_relative_to_the_ground_of_the_cell() -> None:
     tile = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
     _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
     assert edited.points[:, 2].tolist() == pytest.approx([100.1])
-
-
-def test_min_votes_holds_back_a_change_that_too_few_saw() -> None:
-    tile = make_tile(wall([CELL], [0.45]))
-    states, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}))], SURE)
-    assert states[CELL] == CellState.UNDETERMINED
-    assert edited is tile
 
 
 def test_right_state_with_false_points_injects_nothing() -> None:
@@ -122,30 +78,6 @@ def test_right_state_with_false_points_injects_nothing() -> None:
     votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate([honest, honest, lies])]
     _, edited = fuse(NOTHING, votes, SURE)
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
-
-
-def test_new_points_need_support_within_one_voxel_of_the_column() -> None:
-    says = [wall([CELL], [0.45, 3.15]), wall([CELL], [0.75, 4.05])]
-    votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate(says)]
-    _, edited = fuse(NOTHING, votes, SURE)
-    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
-
-
-def test_a_vehicle_that_voted_otherwise_adds_no_points() -> None:
-    votes = [
-        vote("a", states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.45])),
-        vote("b", states_plane({CELL: CellState.UNDETERMINED}), new_points=wall([CELL], [0.45, 6.0])),
-    ]
-    _, edited = fuse(NOTHING, votes)
-    assert len(edited.points) == 1
-
-
-def test_a_voxel_of_the_map_stays_as_it_is() -> None:
-    tile = make_tile(wall([CELL], [0.05]))
-    offered = wall([CELL], [0.1, 0.45]) + np.float32(0.01)
-    _, edited = fuse(tile, [vote("a", states_plane({CELL: OCCUPIED}), new_points=offered)])
-    assert len(edited.points) == 2
-    assert edited.points[:1].tobytes() == tile.points.tobytes()
 
 
 def test_one_stage_is_the_sum_of_the_tallies() -> None:
@@ -181,12 +113,6 @@ def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_poin
     assert int(edited.free[50, 50]) == 0b1111
     assert alone is tile, "one vehicle teaches nothing, and a map that never learned must not look like one that did"
     assert fuse(tile, votes[:1])[1].free is not None, "unless one is all that a change takes"
-
-
-def test_ten_drives_of_one_vehicle_are_one_vote() -> None:
-    drives = [TileVote("a", i, str(i), states=states_plane({CELL: EMPTY})) for i in range(10)]
-    other = vote("b", states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))
-    assert fuse(make_tile(wall([CELL], [0.45])), [*drives, other])[0][CELL] == CellState.UNDETERMINED
 
 
 def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
@@ -269,40 +195,6 @@ def test_more_votes_than_sixteen_bits_hold_are_counted() -> None:
     states, tally = count([vote(str(i), plane) for i in range(4096)], "columns", 4096)
     assert states[CELL] == EMPTY
     assert tally[CELL].tolist() == [0, 0, 0, 4096 * VOTE_UNIT, 0]
-
-
-def random_drive(rng: np.random.Generator, vehicle: str, end_ns: int) -> TileVote:
-    states = states_plane()
-    states[:6, :6] = rng.choice(np.array([0, 1, 2, 3, 4, 255], np.uint8), size=(6, 6))
-    cells = [(r, c) for r, c in itertools.product(range(6), range(6)) if states[r, c] == OCCUPIED]
-    points = wall(cells, [0.45, 0.75]) + rng.uniform(0, 0.1, size=(2 * len(cells), 3)).astype(np.float32)
-    free, gone = words_plane({}), words_plane({})
-    free[:6, :6], gone[:6, :6] = rng.integers(0, 64, size=(6, 6)), rng.integers(0, 16, size=(6, 6))
-    return TileVote(
-        vehicle,
-        end_ns,
-        str(rng.integers(1 << 40)),
-        states=states,
-        gone=Words.of(gone),
-        new_points=points,
-        free=Words.of(free),
-    )
-
-
-@given(seed=st.integers(0, 2**32 - 1), rule=st.sampled_from(["paper", "columns"]), min_votes=st.integers(1, 3))
-@settings(max_examples=25, deadline=None)
-def test_order_never_matters(seed: int, rule: Rule, min_votes: int) -> None:
-    """Any order of the same drives, from vehicles with one or several drives, gives bit-identical tiles."""
-    rng = np.random.default_rng(seed)
-    drives = [random_drive(rng, f"v{rng.integers(5)}", int(rng.integers(3))) for _ in range(8)]
-    tile = make_tile(wall(list(itertools.product(range(6), range(6))), [0.05, 0.45, 1.05]))
-    results = set()
-    for _ in range(3):
-        order = [drives[i] for i in rng.permutation(len(drives))]
-        states, edited = fuse(tile, order, FuseSettings(min_votes=min_votes), rule)
-        free = b"never learned" if edited.free is None else edited.free.tobytes()
-        results.add((states.tobytes(), edited.points.tobytes(), free))
-    assert len(results) == 1
 
 
 def test_states_over_a_window_of_tiles() -> None:

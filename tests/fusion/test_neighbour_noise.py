@@ -13,7 +13,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.loss_budget import Odds
-from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled, without_spilled
+from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled
 from mapvote.fusion.tile_vote import TileVote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
@@ -224,9 +224,3 @@ def test_what_spilled_is_told_as_empty_and_goes_with_its_wall_as_was_voted() -> 
     assert len(edited.points) == 0
     unsaid = [TileVote(vote.vehicle, 0, vote.digest, states=states) for vote in votes]
     assert (fuse_tile(tile, unsaid, "columns", FuseSettings())[0].states == states).all(), "of surfaces' ballots alone"
-
-
-def test_where_nothing_spilled_the_states_are_told_as_they_are() -> None:
-    points = wall(BORDER_M + 0.15)
-    states = states_of(points, CE)
-    assert without_spilled(states, tile_of(points), []) is states

@@ -8,21 +8,15 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from hand_made import SHAPE, make_tile, states_plane, two_walls, wall
+from hand_made import make_tile, states_plane, two_walls, wall
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
-from mapvote.core.types import Bool, CellState
+from mapvote.core.types import CellState
 from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.persistence import (
     DAY_S,
-    ages_days,
-    denied_last,
-    doubtful,
-    expected_days,
     history_days,
     remembered,
     temporary,
@@ -30,16 +24,9 @@ from mapvote.fusion.persistence import (
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
-CELL, OTHER = (10, 10), (200, 3)
+CELL = (10, 10)
 SETTINGS = FuseSettings(stay_days=30.0, prior_stay_days=30.0, min_votes=2)
 START_S = 1_700_000_000
-
-
-def at(*cells: tuple[int, int]) -> Bool:
-    out = np.zeros(SHAPE, dtype=np.bool_)
-    for cell in cells:
-        out[cell] = True
-    return out
 
 
 def memory(stays: int = 0, stayed_days: float = 0.0, came_s: int = 0, cell: tuple[int, int] = CELL) -> Memory:
@@ -55,66 +42,6 @@ def drive(day: float, states: dict[tuple[int, int], int], vehicle: str = "v") ->
 
 def drives(*said: tuple[float, int]) -> list[TileVote]:
     return [drive(day, {CELL: state}) for day, state in said]
-
-
-def age(seen: Sequence[TileVote], breaks: int = 2) -> float:
-    return float(ages_days(seen, at(CELL), breaks)[0])
-
-
-@given(st.integers(0, 50), st.floats(0, 300), st.floats(0, 100))
-def test_the_expected_stay_is_prior_past_and_present_over_one_more_than_the_past_stays(
-    stays: int, stayed_days: float, days: float
-) -> None:
-    found = expected_days(memory(stays, stayed_days), at(CELL), days, SETTINGS)
-    assert found.tolist() == pytest.approx([(30.0 + stayed_days + days) / (1 + stays)], abs=1e-4)
-
-
-def test_where_nothing_is_remembered_what_is_new_is_expected_to_stay_as_long_as_the_prior_says() -> None:
-    assert expected_days(None, at(CELL, OTHER), 0.0, SETTINGS).tolist() == [30.0, 30.0]
-    assert expected_days(None, at(CELL, OTHER), np.array([1.0, 2.5]), SETTINGS).tolist() == [31.0, 32.5]
-
-
-def test_each_cell_has_its_own_past() -> None:
-    past = memory(1, 10.0, cell=CELL)
-    assert expected_days(past, at(CELL, OTHER), 0.0, SETTINGS).tolist() == [20.0, 30.0]  # CELL comes first
-
-
-def test_new_things_are_in_doubt_where_others_came_and_went_and_nothing_else_ever_is() -> None:
-    states = states_plane({CELL: CO, OTHER: CO, (1, 1): CE, (1, 2): UO, (1, 3): UN})
-    assert np.argwhere(doubtful(states, memory(1, 0.0), SETTINGS)).tolist() == [list(CELL)]
-    assert not doubtful(states, None, SETTINGS).any()
-    assert not doubtful(states, memory(1, 30.0), SETTINGS).any(), "thirty days are just long enough"
-    assert doubtful(states, memory(1, 29.9), SETTINGS)[CELL]
-    everywhere = doubtful(states, None, SETTINGS.model_copy(update={"prior_stay_days": 29.0}))
-    assert np.argwhere(everywhere).tolist() == [list(CELL), list(OTHER)]
-
-
-def test_a_thing_is_as_old_as_the_time_from_its_first_sighting_to_its_last() -> None:
-    assert age(drives((0, CO), (1, CO), (5, CO))) == 5.0
-    assert age(drives((5, CO), (0, CO), (1, CO))) == 5.0, "in whatever order the drives are given"
-    assert age(drives((0, UE), (2, CO), (5, UN), (7, UO))) == 0.0, "only who sees it says that it is there"
-    assert age(drives((0, UE), (1, UN))) == 0.0, "nothing was ever there"
-    assert age([]) == 0.0
-
-
-def test_so_many_in_a_row_that_see_nothing_begin_it_anew_and_fewer_do_not() -> None:
-    assert age(drives((0, CO), (1, UE), (4, CO))) == 4.0
-    assert age(drives((0, CO), (1, UE), (2, UE), (4, CO), (6, CO))) == 2.0
-    assert age(drives((0, CO), (1, UE), (2, CO), (3, UE), (4, CO))) == 4.0, "not in a row"
-    assert age(drives((0, CO), (1, UE), (2, UE))) == 0.0, "gone"
-    assert age(drives((0, CO), (1, UE), (4, CO)), breaks=1) == 0.0
-    assert age(drives((0, CO), (1, UE), (2, UE), (4, CO)), breaks=3) == 4.0
-
-
-def test_cells_age_each_by_itself_and_others_are_not_asked() -> None:
-    seen = [drive(0, {CELL: CO, (0, 0): CO}), drive(2, {OTHER: CO}), drive(3, {CELL: CO, OTHER: UE}), drive(9, {})]
-    assert ages_days(seen, at(CELL, OTHER), 1).tolist() == [3.0, 0.0]
-
-
-def test_a_clock_that_stood_before_1970_is_taken_for_1970() -> None:
-    early = TileVote("v", -5 * DAY_S * 10**9, "x", states=states_plane({CELL: CO}))
-    late = TileVote("v", 2 * DAY_S * 10**9, "y", states=states_plane({CELL: CO}))
-    assert age([early, late]) == 2.0
 
 
 NEW = states_plane({CELL: CO})
@@ -140,53 +67,19 @@ def test_what_is_new_where_things_come_and_go_stays_out_until_it_can_be_expected
     assert np.argwhere(temporary(NEW, tile, seen, SETTINGS)).tolist() == ([list(CELL)] if stays_out else [])
 
 
-def test_absence_is_counted_by_the_quorum() -> None:
+def test_a_clock_that_stood_before_1970_is_taken_for_1970() -> None:
     tile = replace(make_tile(wall([], [])), memory=memory(1, 0.0))
-    seen = drives((0.0, CO), (1.0, UE), (31.0, CO))
-    assert not temporary(NEW, tile, seen, SETTINGS).any(), "one vehicle that saw nothing is not believed"
-    assert temporary(NEW, tile, seen, SETTINGS.model_copy(update={"min_votes": 1})).any()
+    seen = [replace(drive(0, {CELL: CO}), end_ns=day * DAY_NS) for day in (-5, 2)]
+    assert temporary(NEW, tile, seen, FuseSettings(stay_days=3.0, prior_stay_days=0.0))[CELL], "two days, not seven"
 
 
 STANDS, BARE = make_tile(wall([CELL], [0.75])), make_tile(wall([], []))
 
 
-def second(vehicle: str, when_s: int, state: int) -> TileVote:
-    return TileVote(vehicle, when_s * 10**9 + 999_999_999, vehicle, states=states_plane({CELL: state}))
-
-
-def test_what_came_is_remembered_with_the_first_sighting_among_the_votes_that_decided_it() -> None:
-    votes = [second("a", START_S + 7, CO), second("b", START_S + 2, CO), second("c", START_S, UE)]
-    after = remembered(Memory.none(), BARE, STANDS, votes, NEW)
-    assert after.came_s[CELL] == START_S + 2
-    assert after.came_s.sum() == START_S + 2, "and nowhere else"
-    assert not after.stays.any()
-    assert not after.stayed_s.any()
-
-
-def test_what_went_adds_a_stay_and_how_long_it_was_and_can_come_again() -> None:
-    before = memory(stays=2, stayed_days=1.0, came_s=START_S)
-    votes = [second("a", START_S + 500, CE), second("b", START_S + 400, CE), second("c", START_S + 300, UO)]
-    after = remembered(before, STANDS, BARE, votes, states_plane({CELL: CE}))
-    assert (after.stays[CELL], after.stayed_s[CELL], after.came_s[CELL]) == (3, DAY_S + 400, 0)
-    assert (before.stays[CELL], before.came_s[CELL]) == (2, START_S), "what was remembered before is left alone"
-
-
-def test_what_was_surveyed_leaves_no_stay_when_it_goes() -> None:
-    nothing = Memory.none()
-    after = remembered(nothing, STANDS, BARE, [second("a", START_S, CE)], states_plane({CELL: CE}))
-    assert after is nothing
-
-
 def test_a_thing_never_left_before_it_came() -> None:
     """Clocks differ between vehicles: what was seen gone before it was seen there stayed for no time at all."""
-    before = memory(came_s=START_S)
-    after = remembered(before, STANDS, BARE, [second("a", START_S - 90, CE)], states_plane({CELL: CE}))
+    after = remembered(memory(came_s=START_S), STANDS, BARE, [drive(-0.1, {CELL: CE})], states_plane({CELL: CE}))
     assert (after.stays[CELL], after.stayed_s[CELL]) == (1, 0)
-
-
-def test_what_stands_on_unasked_is_not_remembered_as_new() -> None:
-    before = Memory.none()
-    assert remembered(before, STANDS, STANDS, [second("a", START_S, UO)], states_plane({CELL: UO})) is before
 
 
 @pytest.mark.parametrize(("end_ns", "came_s"), [(0, 1), (-(10**18), 1), (2**32 * 10**9, 2**32 - 2)])
@@ -225,19 +118,6 @@ def test_without_a_history_everything_new_is_there_to_stay() -> None:
     assert len(fuse_tile(tile, votes, "columns", SETTINGS)[1].points) == 1
     states = fuse_tile(tile, votes, "columns", SETTINGS, 2, lambda: votes)[0].states
     assert states[CELL] == UN
-
-
-@pytest.mark.parametrize(
-    ("said", "denied"), [([UE, CO], False), ([CO, UE], True), ([CO, UN], False), ([UE, CO, UN], False)]
-)
-def test_the_last_who_could_tell_has_a_veto_and_those_before_have_none(said: list[int], denied: bool) -> None:
-    passed = [drive(day, {CELL: state}, f"v{day}") for day, state in enumerate(said)]
-    assert denied_last(states_plane({CELL: CO}), None, passed)[CELL] == denied
-
-
-def test_what_stands_where_nothing_new_was_decided_did_not_come() -> None:
-    same = remembered(Memory.none(), BARE, STANDS, [second("a", START_S, CO)], states_plane({CELL: UO}))
-    assert same.came_s[CELL] == 0
 
 
 def entered_after(
@@ -315,13 +195,6 @@ def decided(tile: Tile, cell: tuple[int, int], *said: int, live: bool = True) ->
     return int(fuse_tile(tile, votes, "columns", FuseSettings(), 2, history)[0].states[cell])
 
 
-def brought(tile: Tile, cell: tuple[int, int]) -> Tile:
-    """The tile, remembering that vehicles put there what stands in a cell."""
-    planes = Memory.none().planes.copy()
-    planes[1][cell] = 1
-    return Tile(tile.window, tile.points, tile.ground_z, memory=Memory.of(planes))
-
-
 def test_a_car_that_had_left_before_the_last_vehicle_passed_waits_for_the_next() -> None:
     tile = two_walls().tiles[0, 0]
     assert decided(tile, LAWN, CO, CO) == CO
@@ -331,20 +204,5 @@ def test_a_car_that_had_left_before_the_last_vehicle_passed_waits_for_the_next()
     assert decided(tile, LAWN, CO, CO, UE, live=False) == CO, "one round on files is of one moment"
 
 
-def test_what_vehicles_brought_goes_only_if_the_last_of_them_saw_it_gone() -> None:
-    tile = brought(two_walls().tiles[0, 0], WALL)
-    assert decided(tile, WALL, CE, CE) == CE
-    assert decided(tile, WALL, CE, CE, UO) == UN
-
-
 def test_what_was_surveyed_falls_by_a_quorum_so_that_no_one_vehicle_can_hold_it_up() -> None:
     assert decided(two_walls().tiles[0, 0], WALL, CE, CE, UO) == CE
-
-
-def test_a_cell_waits_by_itself() -> None:
-    tile = two_walls().tiles[0, 0]
-    both = [states_plane({LAWN: CO, (21, 21): CO}), states_plane({LAWN: CO, (21, 21): CO}), states_plane({LAWN: UE})]
-    votes = [TileVote(f"v{i}", i * 10**9, str(i), states=plane) for i, plane in enumerate(both)]
-    states = fuse_tile(tile, votes, "columns", FuseSettings(), 2, lambda: votes)[0].states
-    assert [int(states[cell]) for cell in (LAWN, (21, 21))] == [UN, CO]
-    assert np.count_nonzero(states == CO) == 1

@@ -48,12 +48,6 @@ def test_a_vote_counts_where_its_cell_is_as_old_as_its_map_and_nowhere_else() ->
     assert spoken(unspent(vote(2), tile)) == []
 
 
-def test_where_a_vote_is_spent_so_is_the_free_space_that_it_saw() -> None:
-    free = unspent(vote(3), changed(cell=3, other=5)).free
-    assert free is not None
-    assert free.cells.tolist() == [10 * 256 + 10]
-
-
 def test_on_a_tile_that_never_changed_every_vote_counts() -> None:
     cast = vote(0)
     assert unspent(cast, TILE) is cast
@@ -77,16 +71,6 @@ def cells_of(found: np.ndarray) -> list[list[int]]:
 def test_a_tile_does_not_differ_from_itself_nor_from_a_copy() -> None:
     assert cells_of(differing(TILE, TILE)) == []
     assert cells_of(differing(TILE, make_tile(TILE.points.copy()))) == []
-
-
-def test_a_point_more_less_or_elsewhere_is_a_difference_in_its_cell() -> None:
-    more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
-    assert cells_of(differing(TILE, more)) == cells_of(differing(more, TILE)) == [list(THIRD)]
-    less = make_tile(TILE.points[:-1])
-    assert cells_of(differing(TILE, less)) == [list(OTHER)]
-    emptied = make_tile(wall([], []))
-    assert cells_of(differing(TILE, emptied)) == cells_of(differing(emptied, TILE)) == [list(CELL), list(OTHER)]
-    assert cells_of(differing(emptied, make_tile(wall([], [])))) == []
 
 
 @given(st.integers(0, 2), st.sampled_from([CELL, OTHER]))
@@ -113,13 +97,6 @@ def test_cells_differ_that_hold_other_points_whatever_coordinates_these_share(a:
     one, other = (make_tile(np.array(points, np.float32).reshape(-1, 3)) for points in (a, b))
     cells = [[r, c] for r in (0, 1) for c in (0, 1) if of_cell(a, r, c) != of_cell(b, r, c)]
     assert cells_of(differing(one, other)) == cells_of(differing(other, one)) == cells
-
-
-def test_points_that_swap_their_heights_are_other_points() -> None:
-    """A sum would not notice."""
-    a = make_tile(wall([CELL], [0.45, 0.75]) + np.array([[0.01, 0, 0], [0, 0, 0]], np.float32))
-    b = make_tile(wall([CELL], [0.45, 0.75]) + np.array([[0, 0, 0], [0.01, 0, 0]], np.float32))
-    assert cells_of(differing(a, b)) == [list(CELL)]
 
 
 def test_a_point_in_the_very_corner_of_a_tile_at_height_zero_is_a_point() -> None:

@@ -15,7 +15,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.fusion.sparse_columns import Words, nothing_reached
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, one_each, restrict
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, restrict
 
 UO, UE, CO, CE, UN = CellState
 WINDOW = Lattice().tile((0, 0))
@@ -41,11 +41,6 @@ def test_a_drive_as_old_as_the_window_still_speaks_and_one_a_moment_older_does_n
     assert newest_votes([], policy) == []
 
 
-def test_the_window_is_counted_from_the_newest_drive_on_the_tile_not_from_today() -> None:
-    policy = FuseSettings(max_age_days=1)
-    assert len(newest_votes([drive("a", 10, {}), drive("b", 20, {})], policy)) == 2
-
-
 def test_of_too_many_vehicles_those_that_passed_last_speak_with_all_their_drives() -> None:
     policy = FuseSettings(latest_vehicles=2)
     votes = [drive("a", 1, {}), drive("b", 2, {}), drive("c", 3, {}), drive("a", 4, {})]
@@ -65,15 +60,6 @@ def test_a_vote_agrees_where_it_backs_what_was_decided_and_not_where_something_e
     assert vote.agreed(FLAT, decided, CO).tolist() == [0]
     assert vote.agreed(FLAT[::-1].copy(), decided, CO).tolist() == [1]
     assert vote.agreed(FLAT, decided, UO).tolist() == []
-
-
-def test_in_a_cell_the_drive_that_ended_last_speaks_and_silence_overrides_nothing() -> None:
-    early, late = drive("v", 1, {HERE: CE, THERE: UO}), drive("v", 2, {HERE: UE})
-    one = fold([late, early], WINDOW)
-    assert one.states is not None
-    assert one.states[HERE] == UE
-    assert one.states[THERE] == UO
-    assert (one.vehicle, one.end_ns) == ("v", 2)
 
 
 @settings(max_examples=25)
@@ -107,19 +93,6 @@ def test_points_of_a_cell_come_from_the_drive_that_speaks_there() -> None:
     assert points is not None
     assert sorted(points[:, 2].tolist()) == pytest.approx([0.45, 1.05])
     assert len(points) == 2
-
-
-def test_what_a_drive_saw_free_stays_seen_when_a_later_drive_speaks() -> None:
-    early = drive("v", 1, {HERE: UE}, free=Words.of(words_plane({HERE: 0b01})))
-    late = drive("v", 2, {HERE: UE}, free=Words.of(words_plane({HERE: 0b10})))
-    free = fold([early, late], WINDOW).free
-    assert free is not None
-    assert free.words.tolist() == [0b11]
-
-
-def test_every_vehicle_has_one_vote_and_they_come_by_name() -> None:
-    votes = one_each([drive("b", 1, {}), drive("a", 2, {}), drive("b", 3, {})], WINDOW)
-    assert [(v.vehicle, v.end_ns) for v in votes] == [("a", 2), ("b", 3)]
 
 
 def test_a_silenced_cell_says_nothing_and_the_others_all_they_said() -> None:
