@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -67,7 +68,8 @@ def test_every_cell_of_every_version_is_as_the_rules_have_it(seed: int) -> None:
     tile = make_tile(wall(WALL, list(HEIGHTS)))
     first = {cell: CellMap(HEIGHTS) for cell in WALL} | {cell: CellMap() for cell in LAWN}
     versions = {1: Version("import", first, False, 0, 0.0, settings)}
-    there, casts, votes, now_s = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False), [], [], START_S
+    there, now_s = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False), START_S
+    casts, votes = list[Cast](), list[TileVote]()
     for _ in range(9):
         for cell in rng.sample(WALL + LAWN, 2):
             there[cell] = not there[cell]
@@ -84,7 +86,7 @@ def test_every_cell_of_every_version_is_as_the_rules_have_it(seed: int) -> None:
         lately = [unspent(vote, tile) for vote in votes if vote.end_ns >= oldest]
         drives = [unspent(vote, tile) for vote in newest_votes(votes, settings)]
         rng.shuffle(drives)
-        tile = fuse_tile(tile, drives, "columns", settings, newest + 1, lambda lately=lately: lately)[1]
+        tile = fuse_tile(tile, drives, "columns", settings, newest + 1, partial(list, lately))[1]
         before = versions[newest]
         cells, knows = fuse(before, casts, settings, now_s, newest + 1, lambda *_: True, lambda *_: True)
         assert {cell: held_by(tile, cell) for cell in cells} == cells
