@@ -27,7 +27,7 @@ from mapvote.core.types import F64, Drive
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.localiser import Localiser
 from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import PosePrior, register
+from mapvote.localisation.ndt import PosePrior, refine, thin_for_levels
 from mapvote.localisation.odometry import Tracker
 from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.slam.build import build_map
@@ -105,7 +105,7 @@ def starts(point_map: PointMap, drive: Drive, T: F64, count: int = 100) -> list[
         guess[:3, :3] = exp([0, 0, 0, 0, 0, yaw])[:3, :3] @ guess[:3, :3]
         guess[:3, 3] += [np.cos(way), np.sin(way), 0.0]
         points = deskew(drive.read_scan(int(i)), motion_at(drive.stamps_ns, T, int(i)))
-        result = register(MapWindow(point_map)(guess[:3, 3]), points, guess)
+        result = refine(MapWindow(point_map)(guess[:3, 3]), thin_for_levels(points), guess)
         found.append(float(np.linalg.norm(result.T_map_lidar[:3, 3] - T[i, :3, 3])) < 0.2)
     return found
 

@@ -1,14 +1,16 @@
 """NDT finds motions that are known by construction, and says how far it may be trusted."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
-from mapvote.core.types import F64, Scan
+from mapvote.core.types import F64, Registration, Scan
 from mapvote.localisation import ndt
-from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, register
+from mapvote.localisation.ndt import NdtMap, PosePrior, best_of, build_ndt, likeliest, refine, thin_for_levels
 from mapvote.localisation.prepare import deskew, twist_between
 from streets import street, surface
 
@@ -23,6 +25,10 @@ def ndt_map() -> NdtMap:
 @pytest.fixture(scope="module")
 def scan() -> F64:
     return transform(inverse(T_TRUE), street(2))
+
+
+def register(ndt_map: NdtMap, points: F64, guess: F64, **how: Any) -> Registration:
+    return refine(ndt_map, thin_for_levels(points), guess, **how)
 
 
 def errors(T: F64) -> tuple[float, float]:
@@ -111,25 +117,6 @@ def test_a_precise_prior_decides_what_the_geometry_leaves_open() -> None:
     np.testing.assert_allclose(held.T_map_lidar[:3, 3], [0.5, 0.0, 1.8], atol=0.06)
 
 
-def test_the_window_moves_and_finds_again_what_was_entered(scan: F64) -> None:
-    grown = NdtMap(np.zeros(3))
-    grown.enter(street(1, 2.0))
-    grown.recentre(np.array([500.0, 0.0, 0.0]))
-    assert register(grown, scan, T_TRUE).inlier_share == 0.0
-    grown.recentre(np.array([20.0, 5.0, 0.0]))
-    assert errors(register(grown, scan, T_TRUE).T_map_lidar)[0] < 0.02
-
-
-def test_adding_in_two_halves_gives_the_map_of_adding_at_once(ndt_map: NdtMap) -> None:
-    points = street(1, 2.0)
-    halves = NdtMap(ndt_map.centre)
-    halves.enter(points[: len(points) // 2])
-    halves.enter(points[len(points) // 2 :])
-    for one, two in zip(ndt_map.levels, halves.levels, strict=True):
-        assert one.n == two.n
-        np.testing.assert_allclose(one.voxels.cells[: one.n], two.voxels.cells[: two.n], rtol=1e-6, atol=1e-9)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-15, 15), st.floats(-3, 3), st.floats(-0.6, 0.6), st.integers(0, 2**31))
 def test_deskew_undoes_the_motion_of_a_scan(speed: float, sideways: float, yaw_rate: float, seed: int) -> None:
@@ -144,14 +131,11 @@ def test_deskew_undoes_the_motion_of_a_scan(speed: float, sideways: float, yaw_r
     np.testing.assert_allclose(twist_between(np.eye(4), exp(0.1 * twist), 0.1), twist, atol=1e-9)
 
 
-def test_a_map_that_grows_point_by_point_is_the_map_of_all_points_and_makes_rows_for_voxels_only() -> None:
-    rng = np.random.default_rng(5)
-    points = np.concatenate([rng.uniform(-30, 30, (4000, 3)) * [1, 1, 0.1], rng.normal(0, 0.4, (50000, 3))])
-    at_once, in_pieces = NdtMap(np.zeros(3)), NdtMap(np.zeros(3))
-    at_once.enter(points)
-    for piece in np.array_split(points, 97):
-        in_pieces.enter(piece)
-    for one, other in zip(at_once.levels, in_pieces.levels, strict=True):
-        assert one.n == other.n
-        assert len(one.voxels.place) <= max(2 * one.n, 1024)
-        np.testing.assert_array_equal(one.voxels.cells[: one.n], other.voxels.cells[: other.n])
+def test_of_many_guesses_the_likeliest_come_first_and_the_best_of_them_is_refined(ndt_map: NdtMap, scan: F64) -> None:
+    away = [8.0, -5.0, 0.4, 3.0, -12.0]
+    guesses, clouds = [T_TRUE @ from_xyz_rpy(x, 0.5 * x, 0.0) for x in away], thin_for_levels(scan)
+    assert likeliest(ndt_map, clouds[0], guesses, 2)[0] is guesses[2]
+    assert len(likeliest(ndt_map, clouds[0], guesses, 9, points=50)) == len(guesses)
+    assert errors(best_of(ndt_map, clouds, guesses, 3).T_map_lidar)[0] < 0.02
+    lost = best_of(ndt_map, clouds, guesses[:2], 1)
+    assert lost.score == register(ndt_map, scan, likeliest(ndt_map, clouds[0], guesses[:2], 1)[0]).score

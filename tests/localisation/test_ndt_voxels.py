@@ -137,3 +137,4 @@ def test_there_is_room_for_any_number_of_voxels(voxels: int) -> None:
     assert made.n == voxels
     assert (made.window.rows >= 0).sum() == voxels
     assert (made.voxels.sums[:voxels, 0] == 2.0).all()
+    assert len(made.voxels.place) <= max(2 * voxels, 1024), "rows are made for voxels, not for points"

@@ -130,15 +130,6 @@ def test_every_cell_of_the_window_up_to_its_rim_has_a_number_and_those_around_it
     assert (cell == -1).sum() == 4 * SIDE + 4
 
 
-def test_ranges_on_the_edge_of_a_sorting_step_are_sorted_all_the_same() -> None:
-    reach = np.concatenate([np.arange(1, 60) * 0.25 + e for e in (-1e-9, 0.0, 1e-9)])
-    points = np.column_stack([reach, np.full(len(reach), 1e-5), np.full(len(reach), 1.8)])
-    view = cast_rays(
-        points, np.array([0.0, 0.0, 1.8]), np.ones(len(reach), bool), np.zeros(len(reach), bool), flat_reference()
-    )
-    assert view.counts.sum() > 0
-
-
 def wide_reference(side: int = 301) -> Reference:
     """Flat ground at 0 over a window of 45 m to each side."""
     grid = Grid(Lattice(), -(side // 2), -(side // 2), side, side)
@@ -167,27 +158,6 @@ def test_near_the_sensor_only_some_fans_mark_what_they_pass_and_all_of_them_see(
     assert not marked[distance < from_m - 0.45].any()
     assert marked[distance > from_m + 0.45].all()
     assert (view.sight[rows, cols] == Sight.CLEAR).all()
-
-
-@given(st.integers(0, 2**31), st.booleans())
-@settings(max_examples=8, deadline=None)
-def test_all_rays_of_one_fan_are_walked_at_once_each_to_its_own_end(seed: int, hilly: bool) -> None:
-    """A dozen beams of one firing, in any order: the words of the fan are those of each ray by itself."""
-    rng = np.random.default_rng(seed)
-    reference = flat_reference(rng.uniform(-1.0, 1.0, (SIDE, SIDE)) if hilly else None)
-    origin = np.array([0.3, -0.2, 1.7])
-    reach = rng.permutation(np.concatenate([rng.uniform(0.8, 8.0, 11), [3.0, 3.0]]))
-    flat = along(128 * int(rng.integers(16)), reach)
-    points = origin + np.column_stack([flat, reach * np.tan(rng.uniform(-0.5, 0.9, len(reach)))])
-    yes, no = np.ones(len(points), bool), np.zeros(len(points), bool)
-    together = cast_rays(points, origin, yes, no, reference)
-    apart = [cast_rays(p[None], origin, yes[:1], no[:1], reference) for p in points]
-    np.testing.assert_array_equal(together.passed, np.bitwise_or.reduce([view.passed for view in apart]))
-    np.testing.assert_array_equal(together.hit, np.bitwise_or.reduce([view.hit for view in apart]))
-    np.testing.assert_array_equal(together.counts, np.sum([view.counts for view in apart], axis=0))
-    surely, possibly = brute_passed(points, origin, reference)
-    assert not (together.passed & ~possibly).any()
-    assert not (surely & ~together.passed).any()
 
 
 @pytest.mark.parametrize("way", [(1, 0), (0, 1), (-1, 0), (0, -1)])
@@ -235,25 +205,6 @@ def test_a_ray_goes_on_over_what_is_below_the_window_and_above_a_word() -> None:
     assert not view.passed[row, 45:50].any()
     assert set(view.passed[row, 40:45].tolist()) == {1 << 5}
     assert not (view.passed >> np.uint64(63)).any()
-
-
-def test_words_hold_what_is_passed_up_to_19_m_and_nothing_above() -> None:
-    reference, origin = flat_reference(), np.array([0.0, 0.0, 1.8])
-    view = cast_rays(np.array([[6.0, 0.0, 60.0]]), origin, np.array([True]), np.array([False]), reference)
-    together = int(np.bitwise_or.reduce(view.passed.ravel()))
-    assert together == (1 << 63) - (1 << 6)
-
-
-def test_the_middle_of_a_fan_is_the_mean_of_its_rays() -> None:
-    """Two rays at the edges of a fan of 0.18 degrees: at 14 m the fan passes between them."""
-    reference, origin = wide_reference(), np.array([0.0, 0.0, 1.0])
-    azimuth = (128 + np.array([0.02, 0.98])) * 2 * np.pi / FANS
-    points = np.column_stack([40.0 * np.cos(azimuth), 40.0 * np.sin(azimuth), [1.0, 1.0]])
-    view = cast_rays(points, origin, np.ones(2, bool), np.zeros(2, bool), reference)
-    middle = cast_rays(
-        np.array([[*along(128, np.array([40.0]))[0], 1.0]]), origin, np.ones(1, bool), np.zeros(1, bool), reference
-    )
-    np.testing.assert_array_equal(view.passed, middle.passed)
 
 
 def test_without_sight_the_same_voxels_are_passed() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from mapvote.config import NdtSettings
 from mapvote.core.columns import flat_cells
@@ -19,13 +20,13 @@ from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
-from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
 from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
 from mapvote.localisation.odometry import Tracker
 from mapvote.localisation.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
-from mapvote.localisation.prepare import deskew, solid_sample
+from mapvote.localisation.prepare import Sample, deskew, solid_sample
 
 CELL_M = 1.0
 LAYER_M = 1.0
@@ -81,7 +82,7 @@ def laid_out(point_map: PointMap) -> CoarseMap:
         bit = np.uint32(1) << np.floor(height[tall] / LAYER_M).astype(np.uint32)
         at = ((points[tall, 1] - y0) / CELL_M).astype(np.int64), ((points[tall, 0] - x0) / CELL_M).astype(np.int64)
         np.bitwise_or.at(words, at, bit)
-    low = _with_beside((words & np.uint32(0b11)) != 0)
+    low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)  # and the four cells beside each
     r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
     first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
     spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
@@ -102,16 +103,6 @@ def highest(scores: U8, most: int) -> I64:
     least = 255 - int(np.searchsorted(counts, most))
     found = np.flatnonzero(scores >= max(least, 0))
     return found[np.argsort(scores[found], kind="stable")[::-1][:most]]
-
-
-def _with_beside(cells: Bool) -> Bool:
-    """Every cell with its four neighbours."""
-    out = cells.copy()
-    out[1:] |= cells[:-1]
-    out[:-1] |= cells[1:]
-    out[:, 1:] |= cells[:, :-1]
-    out[:, :-1] |= cells[:, 1:]
-    return out
 
 
 def _dilated(words: U32) -> U32:
@@ -340,7 +331,8 @@ class GlobalSearch:
         ndt_map = self.map_around(T[:3, 3])
         points = scan.points
         if scan.time_s is not None:
-            points = deskew(scan, Tracker(self.map_around, self.ndt).guess_motion(ndt_map, scan, T, None))
+            tracker = Tracker(self.map_around, self.ndt)
+            points = deskew(scan, tracker.guess_motion(ndt_map, scan.stamp_ns, Sample(scan), T))
         T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
         few = solid_sample(points, LEVELS[-1].points_m)
         return self.judge.fit(ndt_map, few, T), T

@@ -23,7 +23,7 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
 from mapvote.localisation.odometry import TWIST_AGE_S, Fix, Tracker
 from mapvote.localisation.pose_check import Judge, Verdict
-from mapvote.localisation.prepare import deskew, motion_at, solid_sample, twist_between
+from mapvote.localisation.prepare import Sample, deskew, motion_at, solid_sample, twist_between
 
 LOOKS = 3
 """In turn that must hold before the first vote."""
@@ -170,7 +170,8 @@ class Localiser:
         twist = self.tracker.twist
         if len(self._waiting) == 1 and newest.fix.scan.time_s is not None:
             self.tracker.move_to(T_map_lidar, newest.fix.scan.stamp_ns)
-            twist = self.tracker.guess_motion(self.map_around(T_map_lidar[:3, 3]), newest.fix.scan, T_map_lidar, None)
+            around, sample = self.map_around(T_map_lidar[:3, 3]), Sample(newest.fix.scan)
+            twist = self.tracker.guess_motion(around, newest.fix.scan.stamp_ns, sample, T_map_lidar)
         for waiting in self._waiting:
             self._register_anew(waiting, shift @ waiting.fix.registration.T_map_lidar, twist)
         self._held, self._confirmed = 0, False

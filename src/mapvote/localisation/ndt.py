@@ -223,21 +223,6 @@ def thinned(points_lidar: F32) -> dict[float, I64]:
     return chosen
 
 
-def register(
-    ndt_map: NdtMap,
-    points_lidar: NDArray[np.floating],
-    T_map_lidar_guess: F64,
-    *,
-    prior: PosePrior | None = None,
-    first_level: int = 0,
-) -> Registration:
-    """The pose of a de-skewed scan (n, 3) in the map, from a guess; ``prior`` enters as a factor at the finest level.
-
-    Never raises for bad overlap: the inlier share and the score are low instead, and the caller abstains.
-    """
-    return refine(ndt_map, thin_for_levels(points_lidar), T_map_lidar_guess, prior, first_level)
-
-
 def refine(
     ndt_map: NdtMap,
     clouds: list[F32],
@@ -246,7 +231,11 @@ def refine(
     first_level: int = 0,
     settled: tuple[float, float] = SETTLED,
 ) -> Registration:
-    """:func:`register` for a scan already thinned by :func:`thin_for_levels`; ``settled``: see SETTLED."""
+    """The pose in the map of a de-skewed scan, thinned by :func:`thin_for_levels`, from a guess.
+
+    ``prior`` enters as a factor at the finest level; ``settled``: see SETTLED. Never raises for bad overlap: the inlier
+    share and the score are low instead, and the caller abstains.
+    """
     T = np.array(T_map_lidar_guess, dtype=np.float64)
     iterations, covariance, work = 0, np.empty((6, 6)), room_to_work()
     last = len(ndt_map.levels) - 1
@@ -266,6 +255,15 @@ def _known(prior: PosePrior | None) -> Certainty:
     if prior is None:
         return Certainty(COVARIANCE_SCALE, variance, np.eye(4), np.zeros((6, 6)))
     return Certainty(COVARIANCE_SCALE, variance, np.ascontiguousarray(prior.T_map_lidar), prior.information)
+
+
+def best_of(
+    ndt_map: NdtMap, clouds: list[F32], guesses: Sequence[F64], most: int, prior: PosePrior | None = None,
+    points: int = 1 << 30,
+) -> Registration:  # fmt: skip
+    """The ``most`` likeliest of guessed poses (4, 4), see :func:`likeliest`, refined: the one with the best score."""
+    chosen = likeliest(ndt_map, clouds[0], guesses, most, points)
+    return max((refine(ndt_map, clouds, guess, prior) for guess in chosen), key=lambda found: found.score)
 
 
 def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:

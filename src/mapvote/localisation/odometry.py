@@ -13,13 +13,7 @@ import numpy as np
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F32, F64, Registration, Scan
-from mapvote.localisation.ndt import (
-    LEVELS,
-    NdtMap,
-    PosePrior,
-    fitness,
-    refine,
-)
+from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, best_of, fitnesses, refine
 from mapvote.localisation.prepare import Sample, deskew, twist_between
 
 _REFINED = 3
@@ -84,7 +78,9 @@ class Tracker:
         sample = Sample(scan)
         if reach >= _STEP_M:
             seed = self._levelled(ndt_map, sample, seed)
-        twist = self.twist if self._knows_motion(scan) else self._guess_motion(ndt_map, scan, sample, seed, prior)
+        twist = (
+            self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan.stamp_ns, sample, seed, prior)
+        )
         clouds = sample.clouds(twist)
         result = refine(ndt_map, clouds, seed, prior, self._first_level(reach))
         if result.score < _POOR * self._usual_score:
@@ -117,12 +113,11 @@ class Tracker:
     def _knows_motion(self, scan: Scan) -> bool:
         return scan.time_s is None or bool(self.twist.any()) or self._measured
 
-    def guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
+    def guess_motion(
+        self, ndt_map: NdtMap, stamp_ns: int, sample: Sample, seed: F64, prior: PosePrior | None = None
+    ) -> F64:
         """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
-        return self._guess_motion(ndt_map, scan, Sample(scan), seed, prior)
-
-    def _guess_motion(self, ndt_map: NdtMap, scan: Scan, sample: Sample, seed: F64, prior: PosePrior | None) -> F64:
-        age = 1e-9 * (scan.stamp_ns - self.last_stamp_ns)
+        age = 1e-9 * (stamp_ns - self.last_stamp_ns)
         moved: list[tuple[float, F64]] = []
         for speed in _SPEEDS_MPS:
             twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -151,10 +146,9 @@ class Tracker:
     def _levelled(self, ndt_map: NdtMap, sample: Sample, seed: F64) -> F64:
         """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
         road that lies metres from the scan's own."""
-        coarse = sample.coarse(np.zeros(6))
         steps = np.arange(_STEP_M, _REACH_M + 1e-6)
         guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
-        fits = [fitness(ndt_map, coarse, guess) for guess in guesses]
+        fits = fitnesses(ndt_map, sample.coarse(np.zeros(6))[0], np.array(guesses))
         best = int(np.argmax(fits))
         return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
 
@@ -188,9 +182,8 @@ class Tracker:
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
             guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
-        ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, clouds[:1], guess))[:_RECONSIDERED]
-        found = [result, *(refine(ndt_map, clouds, guess, prior) for guess in ranked)]
-        return max(found, key=lambda registration: registration.score)
+        found = best_of(ndt_map, clouds, guesses, _RECONSIDERED, prior)
+        return found if found.score > result.score else result
 
     def _search(
         self, ndt_map: NdtMap, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
@@ -201,9 +194,7 @@ class Tracker:
         guesses = [
             centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
         ]
-        sample = [np.ascontiguousarray(clouds[0][:, :: max(1, clouds[0].shape[1] // 1000)])]
-        ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, sample, guess))
-        return max((refine(ndt_map, clouds, guess, prior) for guess in ranked[:_REFINED]), key=lambda r: r.score)
+        return best_of(ndt_map, clouds, guesses, _REFINED, prior, 1000)
 
     def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
         """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""

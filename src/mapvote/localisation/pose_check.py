@@ -15,6 +15,7 @@ import numpy as np
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, Bool
 from mapvote.localisation.ndt import SETTLED, NdtGrid, NdtMap, fitness, fitnesses, in_rows, refine
+from mapvote.localisation.ndt_solver import SEVEN
 
 MIN_FIT = 0.6
 """Of what the map leads to expect, from which a pose may be voted with; benchmarks/localisation.py shows how often
@@ -156,16 +157,13 @@ def height_above_lowest(points: F64) -> F64:
     return out
 
 
-_BESIDE = np.array([(0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)])
-
-
 def _is_near_map(points: F64, grid: NdtGrid) -> Bool:
     """(n,) whether the point's voxel, or one beside it, holds anything."""
     rows = grid.window.rows
     at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
     here = np.flatnonzero(((at >= 1) & (at < np.array(rows.shape) - 1)).all(axis=1))
     out = np.zeros(len(points), dtype=np.bool_)
-    beside = at[here, None] + _BESIDE
+    beside = at[here, None] + SEVEN
     out[here] = (rows[beside[..., 0], beside[..., 1], beside[..., 2]] >= 0).any(axis=1)
     return out
 
