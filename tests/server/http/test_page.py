@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
-from threading import Event, Thread
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-import uvicorn
 from msgspec.structs import replace
 
 from chromium import Chromium, program
@@ -22,7 +17,6 @@ from live_server import serving
 from mapvote.codec.ballot import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.http.app import create_app
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from mapvote.server.views.cutout import whole_page
@@ -196,39 +190,6 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
         # a level of a tile asked for while it is published may be proposed no more
         assert [said for said in browser.errors if "404" not in said or "/v1/clouds/" not in said] == []
-
-
-@contextmanager
-def slowly(store: Path) -> Iterator[tuple[str, ThreadPoolExecutor, Event]]:
-    """(address, where it fuses, one tile at a time, what lets go on who waits there) of a server in this process."""
-    opened, go_on = Store.open(f"sqlite:///{store}"), Event()
-    with ThreadPoolExecutor(1) as fusing:
-        app = create_app(opened, opened=True, executor=fusing)
-        server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", timeout_graceful_shutdown=1))
-        thread = Thread(target=server.run)
-        thread.start()
-        while not server.started:
-            time.sleep(0.01)
-        try:
-            yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", fusing, go_on
-        finally:
-            go_on.set()
-            server.should_exit = True
-            thread.join()
-    opened.close()
-
-
-@pytest.mark.slow
-def test_what_the_desk_shows_is_published_without_being_decided_again(browser: Chromium, store: Path) -> None:
-    """How far a publish is that must decide, and that it can be cancelled: tests/server/http/test_desk.py."""
-    with slowly(store) as (url, fusing, go_on):
-        ready(browser, url)
-        fusing.submit(go_on.wait, 60)  # from here on no tile can be fused
-        enter(browser, "document.querySelector('#publish')")
-        browser.wait("document.activeElement.className === 'yes'")
-        press(browser, "Enter")
-        browser.wait("document.querySelector('#which-map').innerText.endsWith('version 3')")
-        browser.open("about:blank")
 
 
 @pytest.mark.slow

@@ -55,7 +55,6 @@ from mapvote.server.http.schemas import (
     RotateAsk,
     as_json,
     as_table,
-    iso,
     problems,
 )
 from mapvote.server.http.security import operator, reviewer, sees_names
@@ -71,7 +70,7 @@ from mapvote.server.store.votes import withdraw
 from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
 from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
 from mapvote.server.views.explain import CellStory, explain_cell, seen
-from mapvote.server.views.geojson import feature_rows, tile_squares
+from mapvote.server.views.geojson import feature_rows, tile_squares, utc
 from mapvote.server.views.history import changes_between, log_of, overview, page_between
 
 _MOST_EVIDENCE = 50
@@ -202,7 +201,7 @@ def fresh(request: Request, format: Places = "json") -> Response:
     store = services(request).store
     tiles, known = tiles_seen(store), sees_names(request)
     answer = [
-        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(seen(t["last_seen_ns"], known))}
+        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": utc(seen(t["last_seen_ns"], known))}
         for t in tiles
     ]
     if format == "csv":

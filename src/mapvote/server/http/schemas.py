@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -147,11 +146,3 @@ async def unreadable(request: Request, error: Exception) -> Response:
     Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
     """
     return refuse(MapvoteError("the body is no JSON in UTF-8"))
-
-
-def iso(stamp_ns: int | None) -> str | None:
-    """ISO 8601 in UTC, milliseconds."""
-    if stamp_ns is None:
-        return None
-    whole = datetime.fromtimestamp(min(stamp_ns // 10**9, 253_402_300_799), UTC)
-    return whole.strftime("%Y-%m-%dT%H:%M:%S") + f".{stamp_ns // 10**6 % 1000:03d}Z"

@@ -27,13 +27,13 @@ from mapvote.server.http.schemas import (
     VersionQuery,
     as_json,
     as_table,
-    iso,
     problems,
 )
 from mapvote.server.http.security import own
 from mapvote.server.http.services import services
 from mapvote.server.store.admission import Receipt, examine
 from mapvote.server.store.votes import withdraw
+from mapvote.server.views.geojson import utc
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()
@@ -56,7 +56,7 @@ def versions(request: Request, format: Table = "json") -> Response:
     listed = []
     for v in services(request).store.versions():
         entry = {name: getattr(v, name) for name in ("number", "parent", "kind", "target", "published_by", "reason")}
-        listed.append(entry | {"created": iso(v.created_ns), "policy": v.policy})
+        listed.append(entry | {"created": utc(v.created_ns), "policy": v.policy})
     if format == "csv":
         return as_table([{name: value for name, value in entry.items() if name != "policy"} for entry in listed])
     return as_json({"versions": listed})

@@ -130,12 +130,13 @@ def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
 
 
 def utc(stamp_ns: int | None) -> str | None:
-    """ISO 8601, whole seconds; ``None`` where unknown."""
+    """ISO 8601 in UTC, whole seconds, the year 9999 at most; ``None`` where unknown."""
     if stamp_ns is None:
         return None
-    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return datetime.fromtimestamp(min(stamp_ns // 10**9, _LAST_S), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
+_LAST_S = 253_402_300_799
 NEAR_M = 15.0
 MOST_NEIGHBOURS = 5
 MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
