@@ -62,7 +62,7 @@ def by_beam(scan: Scan) -> Beams:
 
 def real_scan(file: Path) -> Scan:
     """A PCD scan, without what the sensor says of its own mount (returns nearer than 1 m)."""
-    table, _ = read_pcd_table(file)
+    table = read_pcd_table(file)
     points = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float32)
     near = np.isfinite(points).all(axis=1) & (np.linalg.norm(points, axis=1) > 1.0)
     return Scan(0, points[near], intensity=table["intensity"][near].astype(np.float32) / np.float32(255.0))

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pypcd4 import Encoding, PointCloud
 
 from mapvote.codec.ballot import (
     Ballot,
@@ -167,3 +171,11 @@ class AtOnce:
 
     def flush(self) -> list[Fix]:
         return []
+
+
+def save_pcd(path: Path, points: NDArray[np.floating], encoding: str, **fields: NDArray[Any]) -> None:
+    """A PCD file of points (n, 3) and fields (n,) in their own types, by pypcd4: "ascii", "binary" or
+    "binary_compressed"."""
+    columns: Any = [*np.ascontiguousarray(points.T), *fields.values()]
+    kinds = tuple(column.dtype.type for column in columns)
+    PointCloud.from_points(columns, ("x", "y", "z", *fields), kinds).save(path, Encoding(encoding))

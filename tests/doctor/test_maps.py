@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from faults import kinds_of, verdict
+from hand_made import save_pcd
 from mapvote.core import geometry
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
@@ -20,7 +21,6 @@ from mapvote.doctor.maps import check_cloud, check_map, examine_points, in_memor
 from mapvote.formats import write_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.formats.maps.pcd import save_pcd
 
 Change = Callable[[F64], F64]
 
@@ -149,7 +149,7 @@ def test_a_tile_that_is_missing_between_others_is_told(sound: PointMap, points: 
 def test_points_that_are_not_finite_are_counted_or_an_error(tmp_path: Path, points: F64, share: float) -> None:
     broken = points.astype(np.float32)
     broken[: int(share * len(points))] = np.nan
-    save_pcd(tmp_path / "m.pcd", broken)
+    save_pcd(tmp_path / "m.pcd", broken, "binary")
     found = diagnose(tmp_path / "m.pcd").findings
     assert any(f"{int(share * len(points))} of {len(points)} points are not finite" in f.what for f in found)
     assert any(f.severity == "error" for f in found) == (share > 0.05)

@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from hand_made import save_pcd
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
@@ -27,7 +28,6 @@ from mapvote.formats.geo.projector import read_projector
 from mapvote.formats.maps.autoware import write_autoware
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.ply import write_ply
 
 POINTS = np.random.default_rng(0).uniform([-30, -30, -1], [30, 30, 5], (80, 3))
@@ -120,7 +120,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("good")
     cloud = Cloud(POINTS)
     for name, encoding in (("ascii", "ascii"), ("binary", "binary"), ("packed", "binary_compressed")):
-        write_pcd(folder / f"{name}.pcd", cloud, encoding=encoding)
+        save_pcd(folder / f"{name}.pcd", POINTS.astype(np.float32), encoding)
     write_ply(folder / "m.ply", cloud)
     write_las(folder / "m.las", cloud)
     write_las(folder / "m.laz", cloud)

@@ -27,7 +27,7 @@ from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.projector import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
-from mapvote.formats.maps.tiling import to_map
+from mapvote.formats.maps.tiling import map_of
 from mapvote.slam.clean_map import lone_points
 
 Pieces = Callable[[], Iterator[NDArray[np.floating]]]
@@ -238,7 +238,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
     """(findings, errors first; the map, if one can be made of it) of a map in any format."""
     try:
         if not is_map_folder(path):
-            return examine_points(str(path), joined(list(stream_cloud(path))))
+            return examine_points(str(path), joined(stream_cloud(path)))
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
@@ -262,7 +262,7 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
     if any_error(found):
         return in_order(found), None
     try:
-        point_map = to_map(where, cloud)
+        point_map = map_of(where, [cloud])
     except MapvoteError as error:
         return in_order([*found, Finding("error", str(error))]), None
     return in_order([*found, *check_map(point_map)]), point_map

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -45,6 +47,20 @@ def read_text(file: Path) -> str:
         raise MapvoteError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
         raise MapvoteError(f"{file}: not a text file ({error.reason} at byte {error.start}); copy it again") from error
+
+
+@contextmanager
+def reading(path: Path, kind: str, mend: str = "copy or export it again") -> Iterator[None]:
+    """Whatever goes wrong within is one MapvoteError that names the file: libraries let through what numpy, struct and
+    their own parsers raise. ``kind``: what the file is not a whole one of."""
+    try:
+        yield
+    except MapvoteError:
+        raise
+    except OSError as error:
+        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:
+        raise MapvoteError(f"{path}: not a whole {kind} ({first_line(error)}); {mend}") from error
 
 
 def first_line(error: BaseException) -> str:

@@ -25,8 +25,8 @@ import yaml
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.maps.autoware import METADATA, TILES
-from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.pcd import read_pcd
+from mapvote.formats.maps.cloud import Cloud, joined
+from mapvote.formats.maps.pcd import stream_pcd
 from mapvote.live.cdr import blank_message, define, from_cdr, header_of, to_cdr
 from mapvote.live.dds import Network, Publication, Subscription
 from mapvote.live.messages import MAP_FRAME, cloud_of
@@ -155,7 +155,7 @@ class MapLoader:
         out["new_pointcloud_with_ids"] = clouds = []
         for cell in cells:
             try:
-                cloud = _message_of(read_pcd(self.folder / TILES / cell.id))
+                cloud = _message_of(joined(stream_pcd(self.folder / TILES / cell.id)))
             except MapvoteError as error:  # a version was replaced, and its tile deleted, while it was read
                 log.warning("%s", error)
                 continue

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hand_made import Say, make_ballot, states_plane, wall
+from hand_made import Say, make_ballot, save_pcd, states_plane, wall
 from mapvote.codec.arrays import pack_plane
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles
@@ -95,7 +95,7 @@ def test_a_map_larger_than_memory_is_the_same_map(tmp_path: Path, suffix: str, m
     elif suffix == ".laz":
         write_las(file, cloud)
     else:
-        write_pcd(file, cloud, encoding="ascii" if "ascii" in suffix else "binary", double=True)
+        save_pcd(file, points, "ascii" if "ascii" in suffix else "binary", **fields)
     made, _ = import_cloud(file, folder=tmp_path)
     assert isinstance(made.tiles, LazyTiles)
     assert (len(made.tiles), made.n_points) == (4, 4000)

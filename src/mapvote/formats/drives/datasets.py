@@ -284,10 +284,6 @@ def _mulran_poses(table: Path) -> Trajectory:
     return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
 
 
-def _newer_college_table(file: Path) -> NDArray[np.void]:
-    return read_pcd_table(file)[0]
-
-
 def _newer_college_poses(file: Path) -> Trajectory:
     return replace(read_trajectory(file), of_vehicle=True)
 
@@ -344,7 +340,7 @@ BOREAS = Dataset(
 MULRAN = Dataset(("Ouster/*.bin",), BinLayout().read, "global_pose.csv", _mulran_poses, MULRAN_MOUNT)
 NEWER_COLLEGE = Dataset(
     ("raw_format/ouster_scan/cloud_*_*.pcd", "ouster_scan/cloud_*_*.pcd"),
-    _newer_college_table,
+    read_pcd_table,
     "ground_truth/registered_poses.csv",
     _newer_college_poses,
     NEWER_COLLEGE_MOUNT,

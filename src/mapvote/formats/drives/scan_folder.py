@@ -9,7 +9,8 @@ store the points in the map frame then: they are taken back into the sensor's fr
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
@@ -28,10 +29,10 @@ from mapvote.formats.drives.trajectory import Trajectory, check_rigid, has_times
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import is_autoware
-from mapvote.formats.maps.cloud import Cloud, xyz
-from mapvote.formats.maps.las import read_las
-from mapvote.formats.maps.pcd import read_pcd_table
-from mapvote.formats.maps.ply import read_ply
+from mapvote.formats.maps.cloud import Cloud, joined, table_of, xyz
+from mapvote.formats.maps.las import stream_las
+from mapvote.formats.maps.pcd import read_pcd_table, read_viewpoint
+from mapvote.formats.maps.ply import stream_ply
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
@@ -303,21 +304,19 @@ def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
     files = scan_files(*found)
     columns = options.columns
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
-        ".ply": lambda file: _table(read_ply(file)),
-        ".las": lambda file: _table(read_las(file)),
-        ".laz": lambda file: _table(read_las(file)),
+        ".ply": lambda file: _table(stream_ply(file)),
+        ".las": lambda file: _table(stream_las(file)),
+        ".laz": lambda file: _table(stream_las(file)),
         ".npy": lambda file: _read_npy(file, columns),
     }
     read = readers.get(found[1]) or layout_of(files, columns, options.dtype).read
     return open_scan_folder(path, options, ScanFolder(files, read_stamps(path, files, options), read))
 
 
-def _table(cloud: Cloud) -> NDArray[np.void]:
-    columns = {axis: cloud.points[:, i] for i, axis in enumerate("xyz")} | dict(cloud.fields)
-    table = np.empty(len(cloud.points), dtype=[(name, column.dtype) for name, column in columns.items()])
-    for name, column in columns.items():
-        table[name] = column
-    return table
+def _table(pieces: Iterable[Cloud]) -> NDArray[np.void]:
+    cloud = joined(pieces)
+    fields = [(name, column.dtype) for name, column in cloud.fields.items()]
+    return table_of(cloud, [*((axis, cloud.points.dtype) for axis in "xyz"), *fields])
 
 
 def _read_npy(file: Path, columns: str | None) -> NDArray[np.void]:
@@ -361,7 +360,7 @@ def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
     index = {file: i for i, file in enumerate(files)}
 
     def read(file: Path) -> NDArray[np.void]:
-        table, _ = read_pcd_table(file)
+        table = read_pcd_table(file)
         return (
             _to_lidar(str(file), table, viewpoints[index[file]]) if viewpoints is not None and in_map_frame else table
         )
@@ -387,23 +386,18 @@ def _viewpoints(files: list[Path]) -> F64 | None:
 
 
 def _viewpoint_of(file: Path) -> F64:
-    """tx ty tz qw qx qy qz from the header alone; no point is read."""
-    with file.open("rb") as stream:
-        for line in stream:
-            if line.startswith(b"VIEWPOINT"):
-                values = np.array([float(word) for word in line.split()[1:]])
-                if len(values) == 7 and np.linalg.norm(values[3:]) > 0.5:
-                    return values
-            if line.startswith(b"DATA"):
-                break
+    """tx ty tz qw qx qy qz; the identity where there is none, or the header is broken (which the reader reports)."""
+    with suppress(MapvoteError):
+        viewpoint = read_viewpoint(file)
+        if np.linalg.norm(viewpoint[3:]) > 0.5:
+            return viewpoint
     return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _points_lie_around(viewpoints: F64, files: list[Path]) -> bool:
     """Whether points lie around the viewpoint, not around the origin, in the scan taken farthest from the origin."""
     far = int(np.argmax(np.linalg.norm(viewpoints[:, :3, 3], axis=1)))
-    table, _ = read_pcd_table(files[far])
-    points = xyz(str(files[far]), table).astype(np.float64)
+    points = xyz(str(files[far]), read_pcd_table(files[far])).astype(np.float64)
     centre = viewpoints[far, :3, 3]
     to_origin = np.nanmedian(np.linalg.norm(points, axis=1))
     return bool(np.linalg.norm(centre) > 10.0 and np.nanmedian(np.linalg.norm(points - centre, axis=1)) < to_origin)

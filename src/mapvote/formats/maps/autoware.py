@@ -27,8 +27,8 @@ from mapvote.formats.atomic import folder_beside, whole_file, whole_folder
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, warn_of_float32
-from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
+from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
 
 log = logging.getLogger("mapvote.formats")
@@ -69,7 +69,7 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
         tile = next((f for f in (path / name, path / TILES / name) if f.is_file()), None)
         if tile is None:
             raise MapvoteError(f"{path / name}: missing, but {METADATA} lists it; copy the map again")
-        cloud = read_pcd(tile)
+        cloud = joined(stream_pcd(tile))
         outside = ((cloud.points[:, :2] < corner - 0.01) | (cloud.points[:, :2] > corner + size + 0.01)).any(axis=1)
         if outside.any():
             raise MapvoteError(
@@ -125,7 +125,7 @@ def write_autoware(path: Path, cloud: Cloud | CloudPieces, *, side_m: int = SIDE
         corners = {}
         for (x, y), tile in squares(str(path), clouds, side_m):
             corners[f"{x}_{y}.pcd"] = x, y
-            save_pcd(folder / TILES / f"{x}_{y}.pcd", tile.points, tile.fields)
+            save_pcd(folder / TILES / f"{x}_{y}.pcd", tile)
         (folder / METADATA).write_text(metadata(corners, side_m))
         (folder / PROJECTOR).write_text(projector)
 
@@ -232,7 +232,7 @@ def lay_version(
         corners[name] = x, y
         if name not in known and not (tiles / name).is_file():
             with whole_file(tiles / name) as partial:
-                save_pcd(partial, tile.points, tile.fields)
+                save_pcd(partial, tile)
             written += 1
     history = [laid for laid in _history(folder) if laid.version != version] + [_Laid(version, list(corners))]
     _write(folder / HISTORY, msgspec.json.encode(history[-keep - 1 :]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -120,8 +120,9 @@ class CloudPieces:
             yield replace(piece, fields=fields)
 
 
-def joined(pieces: Sequence[Cloud]) -> Cloud:
+def joined(pieces: Iterable[Cloud]) -> Cloud:
     """Pieces of one file as one cloud."""
+    pieces = list(pieces)
     if len(pieces) == 1:
         return pieces[0]
     names = [name for name in KEPT if all(name in piece.fields for piece in pieces)]

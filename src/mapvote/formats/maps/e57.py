@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import first_line, require
+from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.cloud import Cloud
 
@@ -29,7 +29,7 @@ def stream_e57(path: Path) -> Iterator[Cloud]:
     MapvoteError if it is damaged, or holds no scan of cartesian or spherical points.
     """
     library = require("pye57", "e57", str(path))
-    try:
+    with reading(path, "E57 file"):
         file = library.E57(str(path))
         size = path.stat().st_size * MAX_POINTS_PER_BYTE
         counts = [file.get_header(i).point_count for i in range(file.scan_count)]
@@ -42,12 +42,6 @@ def stream_e57(path: Path) -> Iterator[Cloud]:
         for i in range(file.scan_count):
             if counts[i]:
                 yield replace(_scan(file, i), frame=frame)
-    except MapvoteError:
-        raise
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # libE57 and pye57 raise their own
-        raise MapvoteError(f"{path}: not a whole E57 file ({first_line(error)}); copy or export it again") from error
 
 
 def _scan(file: Any, index: int) -> Cloud:

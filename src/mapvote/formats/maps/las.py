@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import require
+from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
 from mapvote.formats.geo.units import METRES, with_units
 from mapvote.formats.maps import laz_subprocess
-from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces, joined, other_fields
+from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces, other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
 
 log = logging.getLogger("mapvote.formats")
@@ -83,31 +83,19 @@ def is_las(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in (".las", ".laz")
 
 
-def read_las(path: Path) -> Cloud:
-    """The whole file; see :func:`stream_las`."""
-    return joined(list(stream_las(path)))
-
-
 def stream_las(path: Path) -> Iterator[Cloud]:
     """The points of a LAS, LAZ or COPC file as float64, piece by piece, in the coordinate system that it names.
 
     One piece without points if the file has none. MapvoteError if it is damaged or cut off.
     """
     laspy = require("laspy", "las", str(path))
-    compressed = _check_counts(path)
-    try:
-        if compressed:
+    with reading(path, "LAS or LAZ file"):
+        if _check_counts(path):
             yield from _apart(path)
         else:
             with laspy.open(path) as file:
                 head = read_head(file)
                 yield from _clouds(path, head, read_pieces(file, head))
-    except MapvoteError:
-        raise
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # laspy and lazrs raise their own, numpy's and struct's
-        raise MapvoteError(f"{path}: not a whole LAS or LAZ file ({error}); copy or export it again") from error
 
 
 def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
@@ -177,12 +165,9 @@ def _check_counts(path: Path) -> bool:
     Offsets of the LAS 1.4 specification: 25 minor version, 96 start of the points, 100 VLRs, 104 point format (LAZ
     sets a high bit), 107 points (to 1.3), 243 EVLRs and 247 points (1.4).
     """
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as stream:
-            header = stream.read(255).ljust(255, b"\0")
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(255).ljust(255, b"\0")
     start, vlrs = struct.unpack_from("<II", header, 96)
     evlrs, points = (
         struct.unpack_from("<IQ", header, 243) if header[25] >= 4 else (0, struct.unpack_from("<I", header, 107)[0])

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,10 @@ from pypcd4 import Encoding, MetaData, PointCloud
 
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import first_line
+from mapvote.formats.extras import reading
 from mapvote.formats.maps.cloud import (
     Cloud,
     CloudPieces,
-    joined,
     kept_fields,
     other_fields,
     table_of,
@@ -34,8 +32,6 @@ _BLOCK = 500_000
 _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
 _TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}\.pcd")
-NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
-ENCODINGS = tuple(e.value for e in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED))
 
 
 def is_pcd(path: Path) -> bool:
@@ -55,27 +51,23 @@ def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
         yield from stream_pcd(file)
 
 
-def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
-    """Every field of a PCD file as a structured array (n,), and its VIEWPOINT (tx ty tz qw qx qy qz).
+def read_pcd_table(path: Path) -> NDArray[np.void]:
+    """Every field of a PCD file as a structured array (n,).
 
     MapvoteError if the file is not a PCD, cut off, or says more points than it holds.
     """
-    try:
-        cloud = PointCloud.from_path(path)
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    table = np.atleast_1d(cloud.pc_data)
-    with path.open("rb") as file:
-        about = _header(file)
-        _check_count(path, len(table), about, _rest(file, about, skip=True))
-    return table, np.array(cloud.metadata.viewpoint, dtype=np.float64)
+    with reading(path, "PCD file"):
+        table = np.atleast_1d(PointCloud.from_path(path).pc_data)
+        with path.open("rb") as file:
+            about = _header(file)
+            _check_count(path, len(table), about, _rest(file, about, skip=True))
+    return table
 
 
-def _unreadable(path: Path, error: Exception) -> MapvoteError:
-    if isinstance(error, OSError):
-        return MapvoteError(f"{path}: cannot be read ({error.strerror or error})")
-    # pypcd4 lets through whatever numpy, struct, lzf and pydantic raise
-    return MapvoteError(f"{path}: not a whole PCD file ({first_line(error)}); copy or export it again")
+def read_viewpoint(path: Path) -> F64:
+    """tx ty tz qw qx qy qz (7,) of the header alone; no point is read."""
+    with reading(path, "PCD file"), path.open("rb") as file:
+        return np.array(_header(file).viewpoint, dtype=np.float64)
 
 
 def _check_count(path: Path, found: int, about: MetaData, beyond: int = 0) -> None:
@@ -90,28 +82,18 @@ def _check_count(path: Path, found: int, about: MetaData, beyond: int = 0) -> No
         raise MapvoteError(f"{path}: cut off: {found} points, but its header says {about.points}; copy it again")
 
 
-def read_pcd(path: Path) -> Cloud:
-    """The whole file; see :func:`stream_pcd`."""
-    return joined(list(stream_pcd(path)))
-
-
 def stream_pcd(path: Path) -> Iterator[Cloud]:
     """The points of a PCD file, piece by piece (binary_compressed, one block by its nature, in one); its VIEWPOINT is
     not applied: map points are in map metres already. MapvoteError as :func:`read_pcd_table`."""
-    try:
-        with path.open("rb") as file:
-            about = _header(file)
-            compressed = about.points and about.data == Encoding.BINARY_COMPRESSED
-            tables = iter([read_pcd_table(path)[0]]) if compressed else _blocks(file, about)
-            found = 0
-            for table in tables:
-                found += len(table)
-                yield Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
-            _check_count(path, found, about, 0 if compressed else _rest(file, about))
-    except MapvoteError:
-        raise
-    except Exception as error:
-        raise _unreadable(path, error) from error
+    with reading(path, "PCD file"), path.open("rb") as file:
+        about = _header(file)
+        compressed = about.points and about.data == Encoding.BINARY_COMPRESSED
+        tables = iter([read_pcd_table(path)]) if compressed else _blocks(file, about)
+        found = 0
+        for table in tables:
+            found += len(table)
+            yield Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
+        _check_count(path, found, about, 0 if compressed else _rest(file, about))
 
 
 def _header(file: BinaryIO) -> MetaData:
@@ -162,49 +144,27 @@ def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
     return len(file.read().rstrip(b"\0"))
 
 
-def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, encoding: str = "binary", double: bool = False) -> None:
-    """A cloud as x, y, z, float32, which is all that PCL reads, or float64 if ``double``; and its fields.
+def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, double: bool = False) -> None:
+    """A cloud and its fields, binary, x, y, z as float32, which is all that PCL reads, or float64 if ``double``.
 
-    The frame is not written: PCD has no place for it. ``encoding`` other than binary takes the whole cloud into memory.
-    Whole or not at all.
+    The frame is not written: PCD has no place for it. Whole or not at all.
     """
-    clouds, kind = CloudPieces.of(cloud), np.float64 if double else np.float32
+    clouds = CloudPieces.of(cloud)
     if not double:
         warn_of_float32(str(path), clouds.corners)
     with whole_file(path) as partial:
-        if encoding != Encoding.BINARY:
-            whole = joined(list(clouds))
-            save_pcd(partial, whole.points.astype(kind), whole.fields, encoding=encoding)
-            return
-        about = _as_header({**dict.fromkeys("xyz", np.dtype(kind)), **clouds.kinds}, clouds.n)
-        kinds = list(zip(about.fields, (about.build_dtype()[name] for name in about.fields), strict=True))
-        with partial.open("wb") as stream:
-            stream.write(about.compose_header(Encoding.BINARY).encode())
-            for piece in clouds:
-                stream.write(table_of(piece, kinds).tobytes())
+        save_pcd(partial, clouds, np.float64 if double else np.float32)
 
 
-def _as_header(kinds: Mapping[str, np.dtype[Any]], n: int) -> MetaData:
-    """PCL's intensity is a float, and so is written as one."""
-    kinds = {name: np.dtype(np.float32) if name == "intensity" else kind for name, kind in kinds.items()}
+def save_pcd(path: Path, cloud: Cloud | CloudPieces, xyz_type: type[np.floating] = np.float32) -> None:
+    """A cloud and its fields straight to ``path``. PCL's intensity is a float, and so is written as one."""
+    clouds = CloudPieces.of(cloud)
+    kinds = dict.fromkeys("xyz", np.dtype(xyz_type)) | dict(clouds.kinds)
+    if "intensity" in kinds:
+        kinds["intensity"] = np.dtype(np.float32)
     columns = [np.empty(1, dtype=kind) for kind in kinds.values()]
     one = PointCloud.from_points(columns, tuple(kinds), tuple(kind.type for kind in kinds.values())).metadata
-    return one.derive(points=n, width=n)
-
-
-def save_pcd(
-    path: Path,
-    points: NDArray[np.floating],
-    fields: Mapping[str, NDArray[Any]] = NO_FIELDS,
-    *,
-    encoding: str = "binary",
-) -> None:
-    """Points (n, 3) and fields (n,) as they are, in their own precision, straight to ``path``.
-
-    PCL's intensity is a float, and so is written as one.
-    """
-    columns = {axis: np.ascontiguousarray(points[:, i]) for i, axis in enumerate("xyz")} | dict(fields)
-    if "intensity" in columns:
-        columns["intensity"] = columns["intensity"].astype(np.float32)
-    kinds: Any = tuple(column.dtype.type for column in columns.values())
-    PointCloud.from_points(list(columns.values()), tuple(columns), kinds).save(path, Encoding(encoding))
+    with path.open("wb") as stream:
+        stream.write(one.derive(points=clouds.n, width=clouds.n).compose_header(Encoding.BINARY).encode())
+        for piece in clouds:
+            stream.write(table_of(piece, list(kinds.items())).tobytes())

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import first_line, require
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, kept_fields, other_fields, table_of, xyz
+from mapvote.formats.extras import reading, require
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, kept_fields, other_fields, table_of, xyz
 
 _BLOCK = 500_000
 """Vertices handed on at a time."""
@@ -23,16 +22,11 @@ def is_ply(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() == ".ply"
 
 
-def read_ply(path: Path) -> Cloud:
-    """The whole file; see :func:`stream_ply`."""
-    return joined(list(stream_ply(path)))
-
-
 def stream_ply(path: Path) -> Iterator[Cloud]:
     """The vertices of a PLY file, ascii or binary, float or double; faces are ignored. Binary vertices without lists
     stay on disk until their piece is read. MapvoteError if the file is damaged or holds no element "vertex"."""
     library = require("plyfile", "ply", str(path))
-    try:
+    with reading(path, "PLY file of vertices"):
         with path.open("rb") as stream:  # a file that plyfile opens stays open where it is damaged
             file = library.PlyData.read(stream)
         if "vertex" not in file:
@@ -43,13 +37,6 @@ def stream_ply(path: Path) -> Iterator[Cloud]:
             part = np.array(vertices[start : start + _BLOCK])
             part = part.astype(part.dtype.newbyteorder("="))
             yield Cloud(xyz(str(path), part), other_fields(part.dtype.names or ()), fields=kept_fields(part))
-    except MapvoteError:
-        raise
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # plyfile lets through what numpy and its own parser raise
-        what = first_line(error)
-        raise MapvoteError(f"{path}: not a whole PLY file of vertices ({what}); copy or export it again") from error
 
 
 def write_ply(path: Path, cloud: Cloud | CloudPieces) -> None:

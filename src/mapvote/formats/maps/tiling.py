@@ -108,11 +108,6 @@ def in_map_metres(
         yield replace(piece, points=convert(piece.points), frame=frame)
 
 
-def to_map(where: str, cloud: Cloud) -> PointMap:
-    """:func:`map_of` a cloud that is in memory as a whole."""
-    return map_of(where, [cloud])
-
-
 def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look: Look | None = None) -> PointMap:
     """The map of a cloud in pieces: tiles cut, ground computed, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
