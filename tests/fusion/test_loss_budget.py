@@ -17,7 +17,6 @@ from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.loss_budget import (
-    Odds,
     PendingDeletions,
     agreed_odds,
     alike_beside,
@@ -30,7 +29,7 @@ from mapvote.fusion.loss_budget import (
     waypoints,
 )
 from mapvote.fusion.offline import update_map
-from mapvote.fusion.tile_vote import TileVote, fold, silenced
+from mapvote.fusion.tile_vote import Odds, TileVote, fold, silenced
 
 CELL, FLAT = (10, 10), 10 * 256 + 10
 EMPTY, STANDS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED

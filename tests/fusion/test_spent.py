@@ -14,7 +14,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote.fusion.fuse import changed_in, differing, unspent
+from mapvote.fusion.fuse import differing, unspent
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote
 
@@ -126,12 +126,3 @@ def test_what_is_known_to_be_free_makes_a_difference(
 def test_differences_of_points_and_of_free_space_add_up() -> None:
     more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
     assert cells_of(differing(TILE, replace(more, free=words_plane({OTHER: 4})))) == [list(OTHER), list(THIRD)]
-
-
-def test_an_edited_tile_remembers_the_version_of_each_change_and_keeps_the_older_ones() -> None:
-    more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
-    first = changed_in(7, TILE, more)
-    assert first.changed[THIRD] == 7
-    assert first.changed.sum() == 7
-    second = changed_in(9, replace(more, memory=first), replace(make_tile(more.points[1:]), memory=first))
-    assert (second.changed[CELL], second.changed[OTHER], second.changed[THIRD]) == (9, 0, 7)

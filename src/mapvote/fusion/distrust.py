@@ -31,7 +31,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.tile_vote import TileVote, states_of
+from mapvote.fusion.tile_vote import TileVote
 
 _ASKED_CELLS = slice(None, None, 13)
 """The flat cells compared, enough for a share; the stride divides no tile's side, so that no column is left out."""
@@ -68,15 +68,13 @@ def deniers(
     if settings.max_denial >= 1.0 or not len(changed):
         return np.zeros(len(votes), dtype=np.bool_)
     came_true = np.zeros(len(votes), dtype=np.int64) if tile is None else borne_out(votes, tile)
-    return denying(states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial, came_true)
+    said = np.stack([vote.states.reshape(-1)[changed] for vote in votes if vote.states is not None])
+    return denying(said, states.reshape(-1)[changed], settings.max_denial, came_true)
 
 
 def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
     """(n,) in how many cells each vote no longer counts because the map is now as voted: built on, or empty."""
-    found = np.zeros(len(votes), dtype=np.int64)
-    if all(vote.unrestricted is None for vote in votes):
-        return found
-    holds = tile.obstacle_words.reshape(-1)
+    found, holds = np.zeros(len(votes), dtype=np.int64), tile.obstacle_words.reshape(-1)
     for i, vote in enumerate(votes):
         if vote.unrestricted is not None and vote.states is not None:
             sent = vote.unrestricted.reshape(-1)
@@ -199,16 +197,6 @@ def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
     silent = {copy.vehicle for copy in copies} - {drive.vehicle for drive in heard}
     groups = {copy.heard_digest for copy in copies if copy.vehicle in silent}
     return max(0, len(silent) - len(groups))
-
-
-def difference(a: U8, b: U8) -> tuple[int, int]:
-    """(cells in which the masks of two planes of states (256, 256) differ, in how many the lesser would differ from
-    itself), in the rows that are compared.
-
-    The tile's rim is not compared: its neighbours are unknown.
-    """
-    moved, looked = _look(masks_of([a, b]))
-    return int(_differing(looked[0], looked[1], _RIM, TILE_CELLS**2)), int(moved.min())
 
 
 def masks_of(planes: Iterable[U8]) -> U64:

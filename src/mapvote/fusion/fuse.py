@@ -16,21 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.change_time import lately_changed
 from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, originals, without
 from mapvote.fusion.edit import add_points, delete_points, words_gone
-from mapvote.fusion.loss_budget import Odds, PendingDeletions, agreed_odds, beyond_budget
+from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import nothing_reached
-from mapvote.fusion.tile_vote import TileVote, one_each, silenced
+from mapvote.fusion.tile_vote import Odds, TileVote, offered, one_each, silenced
 
 Rule = Literal["paper", "columns"]
 """How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""
@@ -103,6 +102,9 @@ class Heard:
     votes: Sequence[TileVote]
     states: U8
     """(256, 256) CellState or NO_VOTE."""
+    edits: U8
+    """(256, 256) the states by which the tile's points come and go: others where noise spilled over
+    (fusion/neighbour_noise.py)."""
     tally: NDArray[Any]
     quorum: int
     denied: Bool | None = None
@@ -113,16 +115,8 @@ class Heard:
     odds: Odds = field(default_factory=Odds.none)
     """See :class:`Decision`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
-    voted: U8 | None = None
-    """(256, 256) as the points are edited, where that differs from ``states``: where noise spilled over
-    (fusion/neighbour_noise.py)."""
     past: History | None = None
     """The votes of a longer time, without copies, read at first use; None if there is no history."""
-
-    @property
-    def edits(self) -> U8:
-        """(256, 256) the states by which the tile's points come and go."""
-        return self.states if self.voted is None else self.voted
 
 
 def fuse_tile(
@@ -140,7 +134,8 @@ def fuse_tile(
     heard = decide_tile(tile, drives, rule, settings, history)
     edited, added, deleted = _edit(tile, heard.votes, heard.edits, heard.quorum)
     if edited is not tile:
-        memory = changed_in(version, tile, edited)
+        changed = np.flatnonzero(differing(tile, edited))
+        memory = (tile.memory or Memory.none()).with_changed(changed, version)
         runs = None if heard.past is None else (heard.past, settings.min_votes)
         edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits, runs))
     names, why = frozenset(vote.vehicle for vote in heard.votes), (heard.copies, heard.odds, heard.pending)
@@ -162,7 +157,7 @@ def decide_tile(
     silenced = liars_among(copies, drives)
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced, tile)
     if any(vote.states is None for vote in votes):
-        return Heard(votes, states, tally, quorum, past=past)
+        return Heard(votes, states, states, tally, quorum, past=past)
     names = {vote.vehicle for vote in votes}
     spoken = [drive for drive in drives if drive.vehicle in names]
     states = lately_changed(states, spoken, tally, quorum) if rule == "columns" else states
@@ -179,7 +174,7 @@ def decide_tile(
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
     told = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
-    return Heard(votes, told, tally, quorum, denied, passing, copies, odds, pending, voted=states, past=past)
+    return Heard(votes, told, states, tally, quorum, denied, passing, copies, odds, pending, past)
 
 
 def _originals_of(
@@ -200,7 +195,7 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tup
         edited, deleted = delete_points(edited, gone)
     added = 0
     if (states == int(CellState.CHANGED_OCCUPIED)).any():
-        edited, added = add_points(edited, *_offered(votes, states, tile.window), quorum)
+        edited, added = add_points(edited, *offered(votes, states, tile.window), quorum)
     return _learn_free(edited, votes, quorum, points_added=added > 0), added, deleted
 
 
@@ -228,21 +223,6 @@ def hear(
             quorum = max(2, quorum - int(found.sum()))
             states, tally = count(heard, rule, quorum)
     return heard, states, tally, quorum
-
-
-def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:
-    """(points, intensity, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so."""
-    found: list[tuple[F32, U8, I64, I32]] = [
-        (np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32))
-    ]
-    for number, vote in enumerate(votes):
-        if vote.new_points is not None and len(vote.new_points):
-            cells = flat_cells(grid, vote.new_points)
-            keep = vote.agreed(cells, states, CellState.CHANGED_OCCUPIED)
-            whose = np.full(len(keep), number, dtype=np.int32)
-            found.append((vote.new_points.take(keep, axis=0), vote.measured()[keep], cells[keep], whose))
-    points, intensity, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return points, intensity, cells, voters
 
 
 def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
@@ -295,11 +275,6 @@ def differing(a: Tile, b: Tile) -> Bool:
         return differ
     nothing = np.uint64(0)
     return np.asarray(differ | ((nothing if a.free is None else a.free) != (nothing if b.free is None else b.free)))
-
-
-def changed_in(version: int, before: Tile, after: Tile) -> Memory:
-    """What ``after`` remembers if ``version`` made it of ``before``."""
-    return (before.memory or Memory.none()).with_changed(np.flatnonzero(differing(before, after)), version)
 
 
 def _other_points(a: Tile, b: Tile) -> Bool:

@@ -21,64 +21,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from mapvote.codec.arrays import unpack_plane
 from mapvote.codec.ballot import UNSAID, changed_cells_of, in_nats, pack_odds
 from mapvote.config import FuseSettings
-from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import F64, I8, I32, I64, U8, CellState
+from mapvote.fusion.tile_vote import Odds, TileVote
 
 
-@dataclass(frozen=True, slots=True)
-class Odds:
-    """The confidence of some cells of a tile; none is stated of all others."""
-
-    cells: I64
-    """(n,) flat cells of the tile, ascending."""
-    steps: I8
-    """(n,) log-odds in steps, see :func:`mapvote.codec.ballot.in_steps`."""
-
-    @classmethod
-    def none(cls) -> Odds:
-        """No cell has a stated confidence."""
-        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
-
-    def at(self, cells: I64) -> I8:
-        """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""
-        plane = np.full(CELLS, UNSAID, dtype=np.int8)
-        plane[self.cells] = self.steps
-        return plane[cells]
-
-    def within(self, mine: Bool) -> Odds:
-        """Only those of the flat cells given (65536,)."""
-        keep = mine[self.cells]
-        return Odds(self.cells[keep], self.steps[keep])
-
-
-class Sure(Protocol):
-    """A vote that may say how sure its vehicle is."""
-
-    @property
-    def states(self) -> U8 | None: ...
-    @property
-    def odds(self) -> Odds | None: ...
-
-
-def folded(drives: Sequence[Sure], last: Sequence[Bool]) -> Odds | None:
-    """The confidence of a vehicle's ``drives``, each in the flat cells (65536,) in which it is the ``last`` to vote;
-    None if none states any."""
-    parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
-    if not parts:
-        return None
-    cells = np.concatenate([part.cells for part in parts])
-    order = np.argsort(cells)
-    return Odds(cells[order], np.concatenate([part.steps for part in parts])[order])
-
-
-def agreed_odds(votes: Sequence[Sure], states: U8, quorum: int) -> Odds:
+def agreed_odds(votes: Sequence[TileVote], states: U8, quorum: int) -> Odds:
     """Of the cells decided as changed, ``states`` (256, 256): the agreed confidence of those who voted for it, one of
     ``votes`` a vehicle. None for a cell of which fewer than ``quorum`` state theirs."""
     cells = changed_cells_of(states)

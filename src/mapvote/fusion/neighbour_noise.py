@@ -17,7 +17,7 @@ from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import TileVote, offered
 
 REACH_M = 0.45
 """How far about a point its plane is fitted, a voxel and a half: some eight points of a wall."""
@@ -54,7 +54,7 @@ def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
         _beside_their_surface(points, flat == kind, tile.window)
         for points, kind in (
             (_going(tile, flat), int(CellState.CHANGED_EMPTY)),
-            (_coming(votes, states, tile.window), int(CellState.CHANGED_OCCUPIED)),
+            (offered(votes, states, tile.window)[0], int(CellState.CHANGED_OCCUPIED)),
         )
         if len(points) >= _ENOUGH
     ]
@@ -65,15 +65,6 @@ def _going(tile: Tile, states: U8) -> F32:
     points, cells = (part[states[tile.cells] == int(CellState.CHANGED_EMPTY)] for part in (tile.points, tile.cells))
     z, ground, base = points[:, 2].astype(np.float64), tile.ground_z.reshape(-1)[cells], tile.base.reshape(-1)[cells]
     return np.asarray(points[column_bits(z, ground, base)[1]])
-
-
-def _coming(votes: Sequence[TileVote], states: U8, window: Grid) -> F32:
-    found = [np.zeros((0, 3), dtype=np.float32)]
-    for vote in votes:
-        if vote.new_points is not None and len(vote.new_points):
-            cells = flat_cells(window, vote.new_points)
-            found.append(vote.new_points[vote.agreed(cells, states, CellState.CHANGED_OCCUPIED)])
-    return np.concatenate(found)
 
 
 def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:

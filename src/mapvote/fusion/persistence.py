@@ -58,26 +58,16 @@ def seen_since(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64
 
     Of all ``drives`` that count there, each by itself. ``breaks`` drives in a row that see nothing end a thing.
     """
-    n = len(cells)
-    since, last, absent = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
-    for drive in sorted(drives, key=lambda drive: (drive.end_ns, drive.digest)):
-        if drive.states is None:
-            continue
-        seen = drive.states.reshape(-1)[cells]
-        there, nothing = seen == _CO, seen == _UE
+    since, last, absent = (np.full(len(cells), value, np.int64) for value in (-1, -1, 0))
+    said, ends_ns, _ = said_in_order([drive for drive in drives if drive.states is not None], cells)
+    for seen, end_s in zip(said, np.maximum(ends_ns // 10**9, 0).tolist(), strict=True):
+        there = seen == _CO
         absent[there] = 0
-        absent[nothing] += 1
+        absent[seen == _UE] += 1
         since[absent >= breaks] = -1
-        end_s = max(drive.end_ns // 10**9, 0)
         since[there & (since < 0)] = end_s
         last[there] = end_s
     return since, last
-
-
-def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
-    """(n,) for how long something has been seen in ``cells`` (256, 256) without a break; see :func:`seen_since`."""
-    since, last = seen_since(drives, np.flatnonzero(cells), breaks)
-    return np.where(since < 0, 0.0, (last - since) / DAY_S)
 
 
 def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings) -> Bool:
@@ -88,7 +78,8 @@ def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: Fuse
     """
     cells = doubtful(states, tile.memory, settings)
     if cells.any():
-        age = ages_days(drives, cells, settings.min_votes)
+        since, last = seen_since(drives, np.flatnonzero(cells), settings.min_votes)
+        age = np.where(since < 0, 0.0, (last - since) / DAY_S)
         stays = (age >= settings.stay_days) | (expected_days(tile.memory, cells, age, settings) >= settings.stay_days)
         cells[cells] = ~stays
     return cells

@@ -12,15 +12,40 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.ballot import Planes, spoken_cells
+from mapvote.codec.ballot import UNSAID, Planes, spoken_cells
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
-from mapvote.fusion.loss_budget import Odds, folded
+from mapvote.core.types import F32, I8, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
 from mapvote.fusion.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Odds:
+    """The confidence of some cells of a tile; none is stated of all others."""
+
+    cells: I64
+    """(n,) flat cells of the tile, ascending."""
+    steps: I8
+    """(n,) log-odds in steps, see :func:`mapvote.codec.ballot.in_steps`."""
+
+    @classmethod
+    def none(cls) -> Odds:
+        """No cell has a stated confidence."""
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
+
+    def at(self, cells: I64) -> I8:
+        """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""
+        plane = np.full(CELLS, UNSAID, dtype=np.int8)
+        plane[self.cells] = self.steps
+        return plane[cells]
+
+    def within(self, mine: Bool) -> Odds:
+        """Only those of the flat cells given (65536,)."""
+        keep = mine[self.cells]
+        return Odds(self.cells[keep], self.steps[keep])
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +74,7 @@ class TileVote:
     version: int = 0
     """Of the map that the vehicle drove with."""
     unrestricted: U8 | None = None
-    """Its states as they were sent, where :func:`restrict` has silenced some."""
+    """Its states as they were sent, where :func:`silenced` left some out."""
 
     def __post_init__(self) -> None:
         if self.states is not None:
@@ -110,21 +135,13 @@ class TileVote:
         counts = self.tally[cells // TILE_CELLS, cells % TILE_CELLS, : int(CellState.UNDETERMINED)]
         return np.asarray(counts.any(axis=-1))
 
-    def passed(self) -> Words:
-        """The voxels that rays passed through, in cells with a vote."""
-        if self.free is None:
-            return Words.none()
-        if self.states is not None:
-            return self.free.at(self.states.reshape(-1)[self.free.cells] != NO_VOTE)
-        return self.free.within(self.spoken())
-
     def mark_passed(self, reached: U64) -> None:
-        """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of what it has
-        :meth:`passed`."""
+        """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of the voxels that rays
+        passed through, in cells with a vote."""
         if self.states is not None and self.free is not None:
             mark_spoken(reached, self.free.cells, self.free.words, self.states.reshape(-1))
-        else:
-            passed = self.passed()
+        elif self.free is not None:
+            passed = self.free.within(self.spoken())
             mark(reached, passed.cells, passed.words)
 
     def mark_deleted(self, emptied: Words, reached: U64) -> None:
@@ -147,12 +164,6 @@ class TileVote:
             return Words.none()
         marked = self.gone.at(self.agreed(self.gone.cells, decided, CellState.UNCHANGED_OCCUPIED))
         return marked if self.tally is None else marked.at(~self.supports(CellState.CHANGED_EMPTY, marked.cells))
-
-
-def states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
-    """(votes, cells) what each vehicle decided, in some or all of the flat cells; nothing in one stage."""
-    planes = [vote.states.reshape(-1)[cells] for vote in votes if vote.states is not None]
-    return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
 class Dated(Protocol):
@@ -183,11 +194,6 @@ def newest_votes(votes: Iterable[D], settings: FuseSettings) -> list[D]:
         return recent
     chosen = set(ranked[: settings.latest_vehicles])
     return [v for v in recent if v.vehicle in chosen]
-
-
-def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
-    """The vote with every cell outside ``counts`` (256, 256) silenced; None means that all of it counts."""
-    return vote if counts is None else silenced(vote, np.flatnonzero(~counts))
 
 
 def silenced(vote: TileVote, cells: I64) -> TileVote:
@@ -254,6 +260,17 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     )
 
 
+def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
+    """The confidence of a vehicle's ``drives``, each in the flat cells (65536,) in which it is the ``last`` to vote;
+    None if none states any."""
+    parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
+    if not parts:
+        return None
+    cells = np.concatenate([part.cells for part in parts])
+    order = np.argsort(cells)
+    return Odds(cells[order], np.concatenate([part.steps for part in parts])[order])
+
+
 def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
     """Of drives in the order of time, the flat cells (65536,) in which each has a vote and none after it has."""
     since, found = np.zeros(CELLS, dtype=np.bool_), []
@@ -287,3 +304,19 @@ def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
     for drive in drives:
         by_vehicle.setdefault(drive.vehicle, []).append(drive)
     return [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
+
+
+def offered(votes: Sequence[TileVote], decided: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:
+    """(points (n, 3), intensity (n,), cells (n,), numbers of their votes (n,)) that ``votes`` offer for the cells
+    ``decided`` (256, 256) as changed-occupied for which they voted so too."""
+    found: list[tuple[F32, U8, I64, I32]] = [
+        (np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32))
+    ]
+    for number, vote in enumerate(votes):
+        if vote.new_points is not None and len(vote.new_points):
+            cells = flat_cells(grid, vote.new_points)
+            keep = vote.agreed(cells, decided, CellState.CHANGED_OCCUPIED)
+            whose = np.full(len(keep), number, dtype=np.int32)
+            found.append((vote.new_points.take(keep, axis=0), vote.measured()[keep], cells[keep], whose))
+    points, intensity, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, intensity, cells, voters

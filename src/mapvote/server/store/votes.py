@@ -23,7 +23,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool
 from mapvote.fusion.fuse import unspent
 from mapvote.fusion.persistence import history_days
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, restrict
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED, is_sound, remembered
@@ -256,7 +256,7 @@ def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, B
     """The vote without the cells of changes that reviewers held, or rejected after its drive first arrived."""
     for seq, cells in bars:
         if seq is None or first_seq < seq:
-            vote = restrict(vote, ~cells)
+            vote = silenced(vote, np.flatnonzero(cells))
     return vote
 
 

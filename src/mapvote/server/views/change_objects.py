@@ -18,7 +18,8 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
-from mapvote.fusion.loss_budget import Odds, alike_beside, change_probability
+from mapvote.fusion.loss_budget import alike_beside, change_probability
+from mapvote.fusion.tile_vote import Odds
 from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]

@@ -33,7 +33,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U64, Bool, CellState, Drive, Scan
-from mapvote.fusion.loss_budget import Odds
+from mapvote.fusion.tile_vote import Odds
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
