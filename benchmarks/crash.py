@@ -3,12 +3,13 @@
     python benchmarks/crash.py --kills 200 --database sqlite
     python benchmarks/crash.py --kills 200 --database postgresql
 
-A child takes in ballots on one thread and publishes on another; the parent kills it with SIGKILL at a random moment
-(with PostgreSQL, every fourth time the database server itself), then opens the store as a new process would and checks:
-every acknowledged ballot is there, every version is whole, the next publish succeeds. Ends with 1 at the first failure.
+A child takes in ballots on one thread and publishes on another; the parent kills it with SIGKILL after a random number
+of acknowledgements (with PostgreSQL, every fourth time the database server itself), then opens the store as a new
+process would and checks: every acknowledged ballot is there, every version is whole, the next publish succeeds. Ends
+with 1 at the first failure.
 
 With ``--server`` what is killed is `mapvote serve` itself, to which vehicles send ballots by HTTP while an operator
-publishes again and again (benchmarks/crash_server.py). That takes some seconds a kill.
+publishes again and again. That takes some seconds a kill.
 """
 
 from __future__ import annotations
@@ -23,14 +24,18 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import httpx2
 import numpy as np
 import sqlalchemy as sa
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from live_server import serving
+from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
@@ -48,8 +53,16 @@ TILES = [(row, col) for row in range(2) for col in range(4)]
 CELLS = [(r, c) for r in range(10, 40, 3) for c in range(10, 40, 3)]
 HEIGHTS = [0.45, 0.75, 1.05]
 S = 1_000_000_000
-Kill = Callable[[str, int, float, "PostgresCluster | None"], list[tuple[str, str]]]
-"""(database URL, seed, moment_s, the cluster to kill too) -> (vehicle, drive) of what was acknowledged before."""
+MOST = 20
+"""Acknowledgements before a kill."""
+LAST_S = 0.02
+"""At most so long after the last of them."""
+VEHICLES = 4
+"""Pairs of vehicles that send to a server at once."""
+Drives = list[tuple[str, str]]
+"""(vehicle, drive) of what was acknowledged."""
+Kill = Callable[[str, int, random.Random, "PostgresCluster | None"], Drives]
+"""(database URL, number, moment, the cluster to kill too) -> what was acknowledged before."""
 
 
 def first_map(url: str) -> None:
@@ -106,8 +119,8 @@ def work(url: str, seed: int, acknowledge: int) -> None:
                 raise receipt
 
 
-def killed_once(url: str, seed: int, moment_s: float, cluster: PostgresCluster | None) -> list[tuple[str, str]]:
-    """Start a worker, kill it (or the database under it) after ``moment_s``; what it had acknowledged."""
+def killed_once(url: str, seed: int, rng: random.Random, cluster: PostgresCluster | None) -> Drives:
+    """Start a worker, kill it (or the database under it); what it had acknowledged."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -121,17 +134,97 @@ def killed_once(url: str, seed: int, moment_s: float, cluster: PostgresCluster |
     with os.fdopen(reading) as lines:
         if lines.readline() != "ready\n":
             raise SystemExit(f"kill {seed}: the worker ended before it began (status {os.waitpid(child, 0)[1]})")
-        time.sleep(moment_s)
+        told = [lines.readline() for _ in range(rng.randint(1, MOST))]
+        time.sleep(rng.uniform(0.0, LAST_S))
         if cluster is not None:
             cluster.stop(crash=True)
         os.kill(child, signal.SIGKILL)
-        acknowledged = [(words[0], words[1]) for line in lines if len(words := line.split()) == 2]
+        acknowledged = [(words[0], words[1]) for line in (*told, *lines) if len(words := line.split()) == 2]
     status = os.waitpid(child, 0)[1]
     if cluster is not None:
         cluster.start()
     elif os.WTERMSIG(status) != signal.SIGKILL:
         raise SystemExit(f"kill {seed}: the worker ended by itself (status {status})")
     return acknowledged
+
+
+class Traffic:
+    """Vehicles and an operator at one server, until it is gone."""
+
+    def __init__(self, url: str, seed: int, home: Path) -> None:
+        self.acknowledged: Drives = []
+        self._news = threading.Condition()
+        self._url, self._seed, self._home = url, seed, home
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=self._vehicles, args=(i,)) for i in range(VEHICLES)]
+        self._threads.append(threading.Thread(target=self._operator))
+        for thread in self._threads:
+            thread.start()
+
+    def wait(self, acknowledged: int) -> None:
+        """Until so many ballots are acknowledged."""
+        with self._news:
+            if not self._news.wait_for(lambda: len(self.acknowledged) >= acknowledged, 120.0):
+                raise SystemExit(f"kill {self._seed}: {len(self.acknowledged)} ballots were acknowledged in 120 s")
+
+    def end(self) -> None:
+        """After the kill: wait until everybody has noticed."""
+        self._over.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _vehicles(self, number: int) -> None:
+        rng, turn = random.Random(self._seed * VEHICLES + number), 0
+        with MapClient(self._url, home=self._home / str(number), attempts=1) as client:
+            while not self._over.is_set():
+                turn += 1
+                tile, cell = rng.choice(TILES), rng.choice(CELLS)
+                with contextlib.suppress(MapvoteError):  # gone, or published meanwhile: an honest refusal
+                    point_map = client.fetch()
+                    content, version = point_map.tiles[tile], point_map.version or 1
+                    for ballot in votes_on(content, version, tile, cell, f"v{number}", f"{self._seed}.{turn}"):
+                        if client.send(ballot) != "spooled":
+                            with self._news:
+                                self.acknowledged.append((ballot.vehicle, ballot.drive))
+                                self._news.notify_all()
+
+    def _more_than(self, seen: int) -> bool:
+        return len(self.acknowledged) > seen
+
+    def _operator(self) -> None:
+        seen = 0
+        with httpx2.Client(base_url=self._url, timeout=10.0) as http:
+            while not self._over.is_set():
+                with self._news:  # without a pause no vehicle ever has the newest map on a slow machine
+                    self._news.wait_for(partial(self._more_than, seen), 0.5)
+                    seen = len(self.acknowledged)
+                with contextlib.suppress(httpx2.TransportError):
+                    http.request("POST", "/v1/publish", json={"override": True})
+
+
+def killed_server(url: str, seed: int, rng: random.Random, cluster: PostgresCluster | None) -> Drives:
+    """Start a server, kill it (and the database under it)."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, log = Path(name), Path(name) / "log"
+        (folder / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
+        store = url.removeprefix("sqlite:///")
+        with serving(store, "--config", folder / "server.toml", log=log) as (address, process):
+            traffic = Traffic(address, seed, folder)
+            try:
+                traffic.wait(rng.randint(1, MOST))
+                time.sleep(rng.uniform(0.0, LAST_S))
+                if cluster is not None:
+                    cluster.stop(crash=True)
+                if process.poll() is not None:
+                    raise SystemExit(f"kill {seed}: the server ended by itself: {log.read_text()[-4000:]}")
+            finally:
+                process.kill()
+                traffic.end()
+        if "Traceback" in log.read_text():
+            raise SystemExit(f"kill {seed}: the server stumbled: {log.read_text()[-4000:]}")
+    if cluster is not None:
+        cluster.start()
+    return traffic.acknowledged
 
 
 def check(url: str, acknowledged: set[tuple[str, str]], whole: set[int]) -> int:
@@ -173,7 +266,7 @@ def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None, kill: 
     newest = 1
     for i in range(kills):
         power_cut = cluster if cluster is not None and i % 4 == 3 else None
-        acknowledged |= set(kill(url, seed * 1000 + i, rng.uniform(0.0, 0.5), power_cut))
+        acknowledged |= set(kill(url, seed * 1000 + i, rng, power_cut))
         newest = check(url, acknowledged, whole)
         if i % 10 == 9:
             print(f"{i + 1} kills, {len(acknowledged)} acknowledged ballots", file=sys.stderr)
@@ -187,9 +280,7 @@ def main() -> None:
     parser.add_argument("--server", action="store_true", help="kill `mapvote serve` under HTTP load")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    kill: Kill = killed_once
-    if options.server:
-        from crash_server import killed_server as kill
+    kill: Kill = killed_server if options.server else killed_once
     if options.database == "sqlite":
         with tempfile.TemporaryDirectory() as folder:
             run(f"sqlite:///{folder}/store.db", options.kills, options.seed, None, kill)

@@ -23,16 +23,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from fusion import HOUSE, KIOSK, said, street
 from hand_made import Say, make_ballot
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 VEHICLES = 3
 
@@ -63,9 +62,7 @@ def vote(store: Store, says: list[Say], drive: str) -> None:
     for vehicle in range(VEHICLES):
         mine = {tile: says[(vehicle + i) % len(says)] for i, tile in enumerate(point_map.tiles)}
         end_ns = DAY_NS + vehicle + 10**9 * store.current()
-        data = encode(make_ballot(point_map, mine, f"v{vehicle}", drive, end_ns=end_ns, version=store.current()))
-        (receipt,) = accept(store, [examine(data)])
-        assert isinstance(receipt, Receipt), receipt
+        send(store, make_ballot(point_map, mine, f"v{vehicle}", drive, end_ns=end_ns, version=store.current()))
 
 
 def timed(file: Path, tiles: int) -> float:

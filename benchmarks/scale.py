@@ -47,10 +47,28 @@ def as_sent(say: Any) -> Any:
     return Sent(**vars(say))
 
 
+def sizes(store: Any) -> dict[str, tuple[int, int]]:
+    """Rows and bytes of everything that is large."""
+    import sqlalchemy as sa
+
+    from mapvote.server.store import schema
+
+    large = {
+        "planes of tiles": (schema.blobs, ("data",)),
+        "ballots": (schema.ballot_tiles, schema.BALLOT_PLANES),
+        "decisions": (schema.decisions, ("states", "tally")),
+    }
+    found = {}
+    with store.database.reading() as connection:
+        for name, (table, columns) in large.items():
+            size = sum((sa.func.coalesce(sa.func.length(table.c[c]), 0) for c in columns), start=sa.literal(0))
+            row = connection.execute(sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(size), 0))).one()
+            found[name] = int(row[0]), int(row[1])
+    return found
+
+
 def measure(folder: Path, tiles: int, vehicles: int) -> dict[str, float]:
     """One store, filled and published."""
-    from growth import sizes
-
     from fusion import Fleet
     from mapvote.config import FuseSettings
     from mapvote.server.store.policy import Policy

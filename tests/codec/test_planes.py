@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all
+from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, unpack_all
 from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane, zstd
 from mapvote.codec.ballot import (
     MOST_OFF_M,
@@ -35,7 +35,10 @@ from mapvote.codec.ballot import (
     unpack_sureness,
     unpack_words,
 )
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import pack_memory, unpack_memory_plane
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.tile_history import PLANES, Memory
 from mapvote.core.types import F32, I8, U64, CellState, MapvoteError
 
 SIZE = 1000
@@ -256,3 +259,20 @@ def test_a_path_that_is_not_whole_is_refused() -> None:
         unpack_path(pack_plane(np.zeros((100_001, 2), np.int32)))
     with pytest.raises(MapvoteError, match="damaged"):
         unpack_path(b"no frame")
+
+
+def test_tiles_that_differ_in_their_memory_alone_are_equal_and_not_unequal() -> None:
+    tile = TileHashes("p", "g", None, memory="m")
+    for same in (TileHashes("p", "g", None), TileHashes("p", "g", None, memory="n")):
+        assert tile == same
+        assert not tile != same  # noqa: SIM202  # msgspec's own answer would be another
+    assert tile != TileHashes("p", "g", "f", memory="m")
+
+
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 1e-4, 0.1, 1.0]))
+@settings(max_examples=8, deadline=None)
+def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    planes = np.where(rng.random((PLANES, *SHAPE)) < share, rng.integers(1, 2**32, (PLANES, *SHAPE)), 0)
+    digest, packed = pack_memory(Memory.of(planes.astype(np.uint32)))
+    np.testing.assert_array_equal(unpack_memory_plane(packed[digest], digest).planes, planes)

@@ -49,6 +49,10 @@ class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, TileHashes) and self._map() == other._map()
 
+    def __ne__(self, other: object) -> bool:
+        """A Struct without msgspec's equality compares by identity here, not by :meth:`__eq__`."""
+        return not self == other
+
     def __hash__(self) -> int:
         return hash(self._map())
 

@@ -171,6 +171,7 @@ def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) 
     assert (version.number, version.kind, version.target) == (3, "rollback", 1)
     assert heights(store) == 3
     assert store.tiles(3) == store.tiles(1)
+    assert (list(store.manifest(since=2).tiles), store.manifest(since=1).tiles) == (["0,0"], {})
     send(store, *old)
     assert not publish(store, POLICY).published
     base = store.point_map()
