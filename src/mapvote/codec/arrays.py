@@ -58,7 +58,7 @@ def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
         if size is not None and size > limit:
             raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
         frame = zstd.ZstdDecompressor()
-        raw = frame.decompress(data, limit + 1)
+        raw = frame.decompress(data, limit + 1 if size is None else size)
     except zstd.ZstdError as error:
         raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
     if len(raw) > limit or not frame.eof:

@@ -1,4 +1,5 @@
-"""A hostile network at a real server: no 500, no state change, the right status."""
+"""A hostile network at a real server: no 500, no state change, the right status. Whatever bytes come, reading a ballot
+ends in a ballot or in one clear refusal, in little memory."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +20,9 @@ import pytest
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from live_server import serving_here
 from mapvote.codec.ballot import MAX_TILE_INDEX, encode
-from mapvote.core.types import CellState
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import keys
+from mapvote.server.store.admission import examine
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.store import Store
 from mutants import bomb, mutants
@@ -98,19 +101,46 @@ def storm(site: Site, n: int, seed: int) -> Counter[int]:
     return answers
 
 
-@pytest.mark.slow
-def test_500_mutated_ballots(site: Site) -> None:
-    answers = storm(site, 500, seed=1)
-    assert answers[422] > 250, answers
-    before = site.commits()
-    assert site.put(honest()).status_code in (200, 201)
-    assert site.commits() != before, "who writes is seen"
+def refusal_of(data: bytes) -> str | None:
+    """Why a server refuses this, None if it can count it; MapvoteError is the only way to say no."""
+    try:
+        examine(data)
+    except MapvoteError as error:
+        return str(error)
+    return None
+
+
+def test_an_honest_ballot_is_read() -> None:
+    assert refusal_of(honest()) is None
+
+
+def test_500_mutants_end_in_a_ballot_or_a_refusal() -> None:
+    answers = [refusal_of(data) for data in mutants(honest(), 500)]
+    refusals = [answer for answer in answers if answer is not None]
+    assert 250 < len(refusals) < 500, "most are refused; a plane of the future and a harmless flip are not"
+    assert all(refusal.startswith("ballot") and len(refusal) < 500 for refusal in refusals)
+
+
+def test_a_bomb_of_a_gigabyte_costs_no_memory() -> None:
+    small = msgspec.msgpack.decode(honest())
+    small["tiles"][0]["new_points"] = bomb(1 << 30)
+    data = msgspec.msgpack.encode(small)
+    assert len(data) < 200_000
+    tracemalloc.start()
+    with pytest.raises(MapvoteError, match="larger than"):
+        examine(data)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 120e6
 
 
 @pytest.mark.slow
 def test_10_000_mutated_ballots(site: Site) -> None:
     answers = storm(site, 10_000, seed=2)
     assert answers[422] > 5000, answers
+    before = site.commits()
+    assert site.put(honest()).status_code in (200, 201)
+    assert site.commits() != before, "who writes is seen"
 
 
 @pytest.mark.parametrize(
@@ -127,7 +157,7 @@ def test_10_000_mutated_ballots(site: Site) -> None:
         (changed(start_ns=-(1 << 63)), None, ""),
         (changed(settings_hash="a\x00b"), 422, "not readable"),
         (changed(settings_hash="0" * 64), 409, "fleet's configuration"),
-        (changed(method="evidence"), 422, "evidence"),
+        (changed(method="evidence"), 409, "evidence"),
         (changed(base={"0,0": "f" * 64, "0,1": "f" * 64}), 409, "fetch"),
         (changed(base={}), 422, "base hash"),
         (changed(tiles=[]), 422, "no tile"),

@@ -1,5 +1,9 @@
-"""What a ballot must be: founded on enough scans, borne out by its priors, within what can be."""
+"""What a ballot must be: founded on enough scans, borne out by its priors, within what can be and what its vehicle may
+leave in the store. What was unpacked is remembered, within bounds."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +11,26 @@ import msgspec
 import numpy as np
 import pytest
 
-from hand_made import Say, make_ballot, states_plane, two_walls, wall
-from mapvote.codec.ballot import Ballot, encode
+from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.ballot import Ballot, Planes, encode
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.store.admission import Receipt, accept, examine
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.errors import TooMany
+from mapvote.server.http.schemas import refuse
+from mapvote.server.store.admission import (
+    Incoming,
+    Intake,
+    Quota,
+    Receipt,
+    Votes,
+    accept,
+    examine,
+    refuse_out_of_reach,
+)
+from mapvote.server.store.database import Remembered
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 
 def ballot(**more: object) -> Ballot:
@@ -97,3 +116,116 @@ def test_a_drive_is_no_older_than_the_map_and_not_of_tomorrow(tmp_path: Path) ->
         assert isinstance(answer, Receipt), answer
     assert Store.open(f"sqlite:///{tmp_path / 's.db'}").point_map().surveyed_ns == now - 100
     store.close()
+
+
+def drive(vehicle: str, name: str, tiles: int = 1) -> Incoming:
+    says = {(0, col): Say(states_plane({(3, 3): CellState.UNCHANGED_EMPTY})) for col in range(tiles)}
+    return examine(encode(make_ballot(two_walls(), says, vehicle, name)))
+
+
+def test_so_many_drives_a_day_each_vehicle_for_itself_and_a_restart_forgets_nothing(database_url: str) -> None:
+    clock = Clock(1_800_000_000_000_000_000)
+    store = Store.create(database_url, two_walls(), clock=clock)
+    quota = Quota(drives_a_day=3, tiles_a_drive=2, stored_bytes=1 << 40)
+    intake = Intake(store, quota)
+    for i in range(3):
+        assert isinstance(intake.write([drive("a", f"d{i}")])[0], Receipt)
+    for again in (intake, Intake(store, quota)):
+        (refused,) = again.write([drive("a", "d3")])
+        assert isinstance(refused, TooMany)
+        assert "try again tomorrow" in str(refused)
+        assert refuse(refused).headers["retry-after"] == "3600", "it is counted again once an hour"
+        (repeated,) = again.write([drive("a", "d0")])
+        assert isinstance(repeated, Receipt)
+        assert repeated.result == "repeated"
+    assert isinstance(intake.write([drive("b", "d0")])[0], Receipt)
+    clock.now += DAY_NS + 1
+    assert isinstance(intake.write([drive("a", "d3")])[0], Receipt)
+    store.close()
+
+
+def test_so_many_tiles_a_drive(database_url: str) -> None:
+    store = Store.create(database_url, two_walls())
+    intake = Intake(store, Quota(drives_a_day=9, tiles_a_drive=2, stored_bytes=1 << 40))
+    (refused,) = intake.write([drive("a", "d", tiles=3)])
+    assert "3 tiles, the limit is 2" in str(refused)
+    assert isinstance(intake.write([drive("a", "d", tiles=2)])[0], Receipt)
+    store.close()
+
+
+@pytest.mark.contract
+def test_so_many_bytes_in_all(database_url: str) -> None:
+    store = Store.create(database_url, two_walls())
+    one = drive("a", "d0")
+    intake = Intake(store, Quota(drives_a_day=99, tiles_a_drive=9, stored_bytes=2 * one.size + 1))
+    receipts = [intake.write([drive("a", f"d{i}")])[0] for i in range(3)]
+    assert [isinstance(receipt, Receipt) for receipt in receipts] == [True, True, False]
+    assert "bytes in the store" in str(receipts[2])
+    store.close()
+
+
+MAP = {(0, 0), (0, 1)}
+
+
+def votes_on(*tiles: TileIndex, cell: tuple[int, int] | None = None) -> Sequence[Votes]:
+    fill = CellState.UNCHANGED_EMPTY
+    plane = states_plane(fill=fill) if cell is None else states_plane({cell: fill})
+    return examine(encode(make_ballot(two_walls(), dict.fromkeys(tiles, Say(plane))))).votes
+
+
+def test_votes_on_the_map_and_beside_it_are_heard() -> None:
+    assert refuse_out_of_reach(votes_on((0, 0), (0, 1), (0, 2), (1, 2), (-1, 0)), MAP) is None
+
+
+@pytest.mark.parametrize("tile", [(0, 5), (-5, 0), (4000, 4000), (0, -5)])
+def test_a_vote_at_the_other_end_of_the_world_is_not(tile: TileIndex) -> None:
+    refused = refuse_out_of_reach(votes_on((0, 0), tile), MAP)
+    assert refused is not None
+    assert "more than 200 m from the map" in str(refused)
+
+
+def test_it_is_the_cell_that_counts_not_its_tile() -> None:
+    """Tile 0,4 begins 153.6 m from the map and ends 230.4 m from it: the limit is in its column 154."""
+    assert refuse_out_of_reach(votes_on((0, 1), (0, 3), (0, 4), cell=(0, 153)), MAP) is None
+    assert refuse_out_of_reach(votes_on((0, 1), (0, 3), (0, 4), cell=(0, 155)), MAP) is not None
+
+
+def test_one_drive_is_one_way() -> None:
+    long_map = {(0, col) for col in range(40)}
+    assert refuse_out_of_reach(votes_on(*[(0, col) for col in range(0, 40, 3)]), long_map) is None
+    refused = refuse_out_of_reach(votes_on((0, 0), (0, 1), (0, 5), (0, 6)), long_map)
+    assert refused is not None
+    assert "send each part as a drive of its own" in str(refused)
+    assert "0,5" in str(refused)
+
+
+def test_a_drive_of_one_tile_is_one_way() -> None:
+    assert refuse_out_of_reach(votes_on((0, 1)), MAP) is None
+
+
+BYTES = SHAPE[0] * SHAPE[1]
+
+
+def unpacked(state: int) -> Planes:
+    return Planes(np.full(SHAPE, state, dtype=np.uint8), None, None, None, None, None, None)
+
+
+def test_what_was_not_asked_for_longest_is_forgotten_first_and_never_more_is_kept_than_may_be() -> None:
+    remembered = Remembered(2 * BYTES)
+    remembered.put("a", unpacked(0))
+    remembered.put("b", unpacked(1))
+    assert remembered.get(["a", "c"]).keys() == {"a"}
+    remembered.put("c", unpacked(2))
+    remembered.put("a", unpacked(0))
+    assert remembered.get("abc").keys() == {"a", "c"}
+    assert remembered.bytes == 2 * BYTES
+    for name in "defg":
+        remembered.put(name, unpacked(3))
+    assert remembered.get("abcdefg").keys() == {"f", "g"}
+
+
+def test_a_vote_larger_than_all_that_may_be_kept_is_not_kept() -> None:
+    remembered = Remembered(BYTES - 1)
+    remembered.put("a", unpacked(0))
+    assert remembered.get("a") == {}
+    assert remembered.bytes == 0

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from postgres_cluster import programs
 
@@ -57,3 +58,11 @@ def test_a_bit_flipped_anywhere_is_named_and_all_else_is_published(database: str
 
 def test_a_bit_flipped_in_any_table_is_named() -> None:
     bench("flipped_bits", "--flips", "6", "--every-table")
+
+
+def test_the_postgresql_of_the_tests_is_durable(postgres_url: str) -> None:
+    engine = sa.create_engine(postgres_url)
+    with engine.connect() as connection:
+        for setting in ("fsync", "synchronous_commit"):
+            assert connection.execute(sa.text(f"SHOW {setting}")).scalar_one() == "on"
+    engine.dispose()

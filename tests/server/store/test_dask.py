@@ -1,29 +1,33 @@
-"""Fusion on a cluster: a real Dask scheduler and worker processes give, byte for byte, what one machine gives."""
+"""Fusion on a cluster: a real Dask scheduler and worker processes give, byte for byte, what one machine gives, and are
+sent no secret."""
 
 from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls, wall
 from live_server import mapvote
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.store import schema
+from mapvote.server.store import fusion_jobs, schema
+from mapvote.server.store.database import address_of
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from stores import send
 
-pytestmark = pytest.mark.slow
 TILES = [(row, col) for row in range(2) for col in range(3)]
 CELLS = [(r, c) for r in range(10, 40, 5) for c in range(10, 40, 5)]
 HEIGHTS = [0.45, 0.75, 1.05]
@@ -91,6 +95,7 @@ def published(store: Store) -> dict[str, list[tuple[object, ...]]]:
         }
 
 
+@pytest.mark.slow
 def test_a_cluster_publishes_byte_for_byte_what_one_machine_does(
     cluster: str, database_url: str, tmp_path: Path
 ) -> None:
@@ -110,6 +115,7 @@ def test_a_cluster_publishes_byte_for_byte_what_one_machine_does(
     there.close()
 
 
+@pytest.mark.slow
 def test_the_verb_fuses_on_the_cluster_and_says_when_there_is_none(cluster: str, tmp_path: Path) -> None:
     voted(f"sqlite:///{tmp_path / 'store.db'}").close()
     verb = mapvote("publish", tmp_path / "store.db", "--cluster", "tcp://127.0.0.1:1")
@@ -120,3 +126,37 @@ def test_the_verb_fuses_on_the_cluster_and_says_when_there_is_none(cluster: str,
     done = subprocess.run(verb, capture_output=True, text=True, env=ENVIRONMENT, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "published" in done.stdout
+
+
+class Elsewhere(Executor):
+    """A cluster: what is to be done there is pickled on its way."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **more: Any) -> Future[Any]:
+        self.sent.append(pickle.dumps((fn, args, more)))
+        done: Future[Any] = Future()
+        function, arguments, named = pickle.loads(self.sent[-1])
+        done.set_result(function(*arguments, **named))
+        return done
+
+
+def test_a_task_for_a_cluster_carries_no_password_its_worker_has_its_own(
+    postgres_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = sa.make_url(postgres_url).set(password="a-secret")
+    store = Store.create(whole.render_as_string(hide_password=False), two_walls())
+    says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
+    send(store, *[make_ballot(two_walls(), says, vehicle, "d1") for vehicle in ("a", "b")])
+    monkeypatch.setenv("MAPVOTE_STORE", whole.render_as_string(hide_password=False))
+    fusion_jobs._database.cache_clear()
+    cluster = Elsewhere()
+    assert publish(store, FuseSettings(max_deleted_share=1.0), executor=cluster).version == 2
+    assert cluster.sent
+    assert not any(b"a-secret" in sent for sent in cluster.sent)
+    used = fusion_jobs._database(address_of(whole))
+    assert used.url.password == "a-secret"
+    used.close()
+    fusion_jobs._database.cache_clear()
+    store.close()

@@ -9,15 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sqlalchemy as sa
+from numpy.typing import DTypeLike
 
 from hand_made import Say, make_ballot, two_walls
 from histories import START_S, WALL, History, seen_along
+from mapvote.codec.arrays import unpack_bytes
 from mapvote.config import FuseSettings
-from mapvote.core.grid import CELLS
-from mapvote.core.types import CellState
+from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.types import N_STATES, CellState
+from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile, rule_of
 from mapvote.server.store import schema
-from mapvote.server.store.decisions import REASONS, Record, Standing, packed_cells, records_of
+from mapvote.server.store.decisions import (
+    REASONS,
+    Record,
+    Standing,
+    pack_tally,
+    packed_cells,
+    records_of,
+    unpack_tally_plane,
+)
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.queries import oldest_kept, tile_as_of
@@ -159,3 +170,27 @@ def _sent(connection: sa.Connection, seqs: list[int]) -> dict[int, list[int]]:
     stored = stored_votes(connection, HERE, seqs)
     votes = read_votes(connection, HERE, stored)
     return {s.seq: np.flatnonzero(v.spoken()).tolist() for s, v in zip(stored, votes, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("dtype", "unit", "most", "width"),
+    [
+        (np.uint8, VOTE_UNIT, 16, 1),
+        (np.uint16, VOTE_UNIT, 256, 1),
+        (np.uint16, VOTE_UNIT, 257, 2),
+        (np.int32, VOTE_UNIT, 256, 4),
+        (np.int32, 1, 2**31, 4),
+    ],
+    ids=["few votes", "whole votes", "more than a byte holds", "as one-stage sums them", "large sums"],
+)
+def test_a_tally_comes_back_as_it_was_whatever_it_is_written_in(
+    dtype: DTypeLike, unit: int, most: int, width: int
+) -> None:
+    rng = np.random.default_rng(1)
+    planes = (rng.integers(0, most, (N_STATES, TILE_CELLS, TILE_CELLS)) * unit).astype(dtype)
+    planes.flat[0] = (most - 1) * unit
+    packed = pack_tally(np.moveaxis(planes, 0, -1))
+    assert len(unpack_bytes(packed, 4 * N_STATES * CELLS, "tally")) == width * N_STATES * CELLS
+    again = unpack_tally_plane(packed)
+    assert again.dtype == np.int32
+    np.testing.assert_array_equal(again, np.moveaxis(planes, 0, -1))

@@ -93,10 +93,10 @@ MOST_ASKED = 500
 
 
 class Question:
-    """A statement that is asked for every tile, without lists: made into SQL once for each kind of database, for
-    SQLAlchemy's own work on each answer takes longer than the database's."""
+    """A statement without lists, asked for every tile or in every publish: made into SQL once for each kind of
+    database, for SQLAlchemy's own work takes longer than the database's."""
 
-    def __init__(self, statement: sa.Select[Any]) -> None:
+    def __init__(self, statement: sa.Select[Any] | sa.CompoundSelect[Any]) -> None:
         self._statement = statement
         self._made: dict[str, SQLCompiler] = {}
 

@@ -20,7 +20,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.database import insert_rows, is_sound
+from mapvote.server.store.database import Question, insert_rows, is_sound
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 
@@ -191,11 +191,10 @@ def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, b
 
 def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex]:
     """Tiles that may be fused otherwise since an event: a ballot there was set aside, or one of their planes mended."""
-    q, e, t, v = schema.quarantine.c, schema.events.c, schema.ballot_tiles.c, schema.version_tiles
-    aside = connection.execute(sa.select(q.name).where(q.kind == "ballot", q.seq > since)).scalars()
+    t, v = schema.ballot_tiles.c, schema.version_tiles
+    aside = _SET_ASIDE.ask(connection, since=since).scalars()
     ballots = {int(name.split()[0]) for name in aside}
-    mended = connection.execute(sa.select(e.detail).where(e.kind == MENDED, e.seq > since)).scalars()
-    planes = {detail.removeprefix("plane ") for detail in mended}
+    planes = {detail.removeprefix("plane ") for detail in _MENDED.ask(connection, since=since).scalars()}
     queries = []
     if ballots:
         queries.append(sa.select(t.row, t.col).where(t.ballot.in_(ballots)))
@@ -203,3 +202,8 @@ def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex
         shows = sa.or_(*(v.c[name].in_(planes) for name in schema.TILE_PLANES))
         queries.append(sa.select(v.c.row, v.c.col).where(shows))
     return {(row, col) for query in queries for row, col in connection.execute(query)}
+
+
+_Q, _E, _SINCE = schema.quarantine.c, schema.events.c, sa.bindparam("since", type_=sa.BigInteger)
+_SET_ASIDE = Question(sa.select(_Q.name).where(_Q.kind == sa.literal("ballot"), _Q.seq > _SINCE))
+_MENDED = Question(sa.select(_E.detail).where(_E.kind == sa.literal(MENDED), _E.seq > _SINCE))

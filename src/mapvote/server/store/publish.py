@@ -33,6 +33,7 @@ from mapvote.server.store.integrity import quarantine
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
+    current_number,
     current_version,
     end_votes,
     load_tile,
@@ -207,7 +208,7 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
     """Publish a version; Conflict if its parent is the newest no more. ``unvoted``: this vehicle's votes are gone."""
     try:
         with store.database.writing() as connection:
-            if current_version(connection).number != version.parent:
+            if current_number(connection) != version.parent:
                 raise Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
             if version.target is not None:
                 version_of(connection, version.target)

@@ -26,7 +26,7 @@ from mapvote.fusion.persistence import history_days
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.database import MOST_ASKED, is_sound, remembered
+from mapvote.server.store.database import MOST_ASKED, Question, is_sound, remembered
 from mapvote.server.store.decisions import Why
 from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.policy import Policy, policy_in
@@ -91,6 +91,23 @@ _REVIEWS_ON = (
 )
 
 
+_SINCE = sa.bindparam("since", type_=sa.BigInteger)
+_STANDING = Question(
+    sa.select(_T.c.row, _T.c.col).distinct().join(_B, _B.c.seq == _T.c.ballot).where(_stands_at(_MARK))
+)
+_TOUCHED = Question(
+    sa.union(  # each is answered by an index of its own
+        *(
+            sa.select(_T.c.row, _T.c.col).where(_T.c.ballot.in_(sa.select(_B.c.seq).where(one, _B.c.seq <= _MARK)))
+            for one in (_B.c.seq > _SINCE, _B.c.gone_seq > _SINCE)
+        ),
+        sa.select(_C.c.row, _C.c.col)
+        .join(_W, _W.c.seq == _C.c.review)
+        .where(_W.c.seq <= _MARK, (_W.c.seq > _SINCE) | (_W.c.gone_seq > _SINCE)),
+    )
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Polled:
     """Standing votes, reviews and damage on some tiles, each read by one statement."""
@@ -100,7 +117,18 @@ class Polled:
     bars: Mapping[TileIndex, Sequence[tuple[int | None, Bool]]]
     """(event, cells (256, 256)) of changes that reviewers rejected then, or hold: None."""
     rows: Rows
-    """Sequence numbers of the votes that count there."""
+    """The stored planes of the votes that count there."""
+    read: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
+    """Votes by tile and ballot that were checked and unpacked: nothing is read twice for one round."""
+    fresh: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
+    """These in the cells in which they are not spent."""
+
+    def unspent(self, seq: int, vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None) -> TileVote:
+        """The vote of a ballot in the cells of ``tile`` in which it is not spent."""
+        key = *tile.index, seq
+        if key not in self.fresh:
+            self.fresh[key] = unspent(vote, tile, misread)
+        return self.fresh[key]
 
 
 def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
@@ -133,19 +161,9 @@ def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collectio
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
     """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review was added or
     removed after it."""
-    b, t = schema.ballots, schema.ballot_tiles
-    if since is None:
-        queries = [sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(_stands_at(mark))]
-    else:  # asked apart, each is answered by an index of its own
-        lately = (b.c.seq > since) & (b.c.seq <= mark), (b.c.gone_seq > since) & (b.c.seq <= mark)
-        queries = [sa.select(t.c.row, t.c.col).where(t.c.ballot.in_(sa.select(b.c.seq).where(one))) for one in lately]
-    found = {(row.row, row.col) for query in queries for row in connection.execute(query)}
-    if since is not None:
-        w, c = schema.reviews, schema.review_cells
-        changed = (w.c.seq <= mark) & ((w.c.seq > since) | (w.c.gone_seq > since))
-        reviewed = sa.select(c.c.row, c.c.col).distinct().join(w, w.c.seq == c.c.review).where(changed)
-        found |= {(row.row, row.col) for row in connection.execute(reviewed)}
-    return sorted(found)
+    asked = {"mark": mark} if since is None else {"mark": mark, "since": since}
+    rows = (_STANDING if since is None else _TOUCHED).ask(connection, **asked)
+    return sorted({(row.row, row.col) for row in rows})
 
 
 def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
@@ -232,14 +250,14 @@ def judged_on(
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
     standing = _judged(polled.standing[index], index, asked)
-    votes = iter(read_votes(connection, index, [vote for vote, why in standing if not why], polled.rows))
+    votes = iter(read_votes(connection, index, [vote for vote, why in standing if not why], polled))
     found = []
     for stored, why in standing:
         if why:
             found.append(Judged(stored, why))
             continue
         sent = next(votes)
-        fresh = unspent(sent, tile, misread)
+        fresh = polled.unspent(stored.seq, sent, tile, misread)
         obedient = _obedient(fresh, stored.first_seq, polled.bars[index])
         found.append(Judged(stored, "", obedient, _cells_lost(sent, fresh), _cells_lost(fresh, obedient)))
     return found
@@ -249,6 +267,8 @@ def _cells_lost(before: TileVote, after: TileVote) -> I64:
     """(n,) flat cells that the vote ``before`` determines and ``after`` does not."""
     if before is after:
         return np.empty(0, dtype=np.int64)
+    if before.states is not None and after.states is not None:
+        return np.flatnonzero(before.states != after.states)
     return np.flatnonzero(before.spoken() != after.spoken())
 
 
@@ -275,7 +295,8 @@ def recent_votes(
     ready = [vote for vote, why in judged if why in ("", "window")]
     oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
-    return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled.rows)]
+    votes = zip(chosen, read_votes(connection, index, chosen, polled), strict=True)
+    return [polled.unspent(stored.seq, vote, tile, misread) for stored, vote in votes]
 
 
 def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
@@ -333,25 +354,26 @@ def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, St
 
 
 def read_votes(
-    connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote], known: Rows | None = None
+    connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote], polled: Polled | None = None
 ) -> list[TileVote]:
     """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are.
 
-    ``known``: rows that were read before.
+    ``polled``: what was read before.
     """
-    rows = dict(known or {})
-    rows |= read_rows(connection, index[0], [(index[1], vote) for vote in stored if (*index, vote.seq) not in rows])
-    mine = {vote.seq: rows[*index, vote.seq] for vote in stored}
-    _check(mine.values())
-    unpacked = remembered.get(row.sum for row in mine.values())
-    for row in mine.values():
+    known, read = ({}, {}) if polled is None else (polled.rows, polled.read)
+    new = {vote.seq: vote for vote in stored if (*index, vote.seq) not in read}
+    missing = [(index[1], vote) for vote in new.values() if (*index, vote.seq) not in known]
+    rows = {**known, **read_rows(connection, index[0], missing)} if missing else known
+    mine = [(vote, rows[*index, vote.seq]) for vote in new.values()]
+    _check(row for _, row in mine)
+    unpacked = remembered.get(row.sum for _, row in mine)
+    for vote, row in mine:
         if row.sum not in unpacked:
             unpacked[row.sum] = unpack_planes(row)
             remembered.put(row.sum, unpacked[row.sum])
-    return [
-        TileVote.of(unpacked[mine[vote.seq].sum], vote.vehicle, vote.end_ns, vote.digest, vote.version)
-        for vote in stored
-    ]
+        planes = unpacked[row.sum]
+        read[*index, vote.seq] = TileVote.of(planes, vote.vehicle, vote.end_ns, vote.digest, vote.version)
+    return [read[*index, vote.seq] for vote in stored]
 
 
 def _check(rows: Iterable[Any]) -> None:
