@@ -3,6 +3,7 @@ ends in a ballot or in one clear refusal, in little memory."""
 
 from __future__ import annotations
 
+import json
 import re
 import sqlite3
 import subprocess
@@ -217,13 +218,23 @@ def test_odd_keys_are_refused(site: Site, key: str) -> None:
         ("publish", {"parent": -(1 << 64)}),
         ("publish", {"reason": "a\nb"}),
         ("publish", {"reason": "a" * 201}),
+        ("publish", {"reason": "a\ud800"}),
         ("publish", {"no such thing": 1}),
+        ("replay", {"vehicle": "a\x00b"}),
+        ("keys", {"name": "../boss"}),
+        ("keys", {"name": "b", "role": "admin"}),
+        ("keys", {"name": "b", "days": 1e300}),
+        ("keys/rotate", {"name": "a\x00b"}),
+        ("keys/rotate", {"name": "boss", "overlap_days": -1}),
+        ("keys/revoke", {"name": "a\ud800"}),
     ],
 )
 def test_an_operators_slip_is_422(site: Site, path: str, body: dict[str, Any]) -> None:
     headers = {"Authorization": f"Bearer {site.operator}"}
     before = site.commits()
-    assert httpx2.post(f"{site.url}/v1/{path}", json=body, headers=headers, timeout=300.0).status_code == 422
+    headers["Content-Type"] = "application/json"
+    answer = httpx2.post(f"{site.url}/v1/{path}", content=json.dumps(body), headers=headers, timeout=300.0)
+    assert answer.status_code == 422
     assert site.commits() == before
 
 
@@ -236,6 +247,7 @@ def schemathesis(site: Site, examples: int, *options: str) -> tuple[int, int]:
     checks = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
     command = [str(program), "run", f"{site.url}/openapi.json", "--checks", checks, "--seed", "1", "--no-color"]
     command += ["--max-examples", str(examples), "-H", f"Authorization: Bearer {site.operator}", *options]
+    command += ["--exclude-path-regex", "/v1/keys/.+"]  # they end the key that the requests are sent with
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-1000:]
     tested = re.search(r"Selected: (\d+)/(\d+)", done.stdout)
@@ -246,11 +258,11 @@ def schemathesis(site: Site, examples: int, *options: str) -> tuple[int, int]:
 @pytest.mark.slow
 def test_schemathesis_on_every_route(site: Site) -> None:
     tested, declared = schemathesis(site, 5)
-    assert tested == declared >= 12
+    assert tested == declared - 2 >= 12
 
 
 @pytest.mark.slow
 def test_schemathesis_at_length(site: Site) -> None:
     """All but the stream of events, which answers for as long as it is listened to."""
     tested, declared = schemathesis(site, 100, "--exclude-path", "/v1/events")
-    assert tested == declared - 1
+    assert tested == declared - 3

@@ -12,6 +12,7 @@ import structlog
 from anyio import to_thread
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
@@ -25,7 +26,7 @@ from mapvote.server.http import (
     vehicle_routes,
 )
 from mapvote.server.http.event_routes import deliver
-from mapvote.server.http.schemas import unreadable
+from mapvote.server.http.schemas import unreadable, unusable
 from mapvote.server.http.security import Guard, Hosts, Probe, Watch
 from mapvote.server.http.services import READING, Services, make_services
 from mapvote.server.store.round import Gate
@@ -86,6 +87,7 @@ def create_app(
         # which holds for one thread only. These were made when their module was imported.
         app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
+    app.add_exception_handler(RequestValidationError, unusable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened, owner=owner)
     probe = Probe(parts.check_ready)
     app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)

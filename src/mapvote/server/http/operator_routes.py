@@ -299,7 +299,7 @@ async def mend(request: Request) -> Response:
     return as_json({"damage": found})
 
 
-@router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413), summary="Put a damaged plane back")
+@router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
 async def restore(request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
     by, parts = operator(request), services(request)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 from fastapi import Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -76,7 +77,7 @@ class IssueAsk(BaseModel):
     """Whose key, and what it opens."""
 
     model_config = ConfigDict(extra="forbid")
-    name: str = Field(max_length=200, description="1-64 of letters, digits, dot, underscore, dash")
+    name: str = Field(max_length=200, pattern=PLAIN, description="1-64 of letters, digits, dot, underscore, dash")
     role: str = Field(default="vehicle", max_length=20, description="vehicle, reader, reviewer or operator")
     days: float | None = Field(default=None, description="the key expires after so many days; null: never")
 
@@ -85,7 +86,7 @@ class RotateAsk(BaseModel):
     """Whose key is replaced."""
 
     model_config = ConfigDict(extra="forbid")
-    name: str = Field(max_length=200)
+    name: str = Field(max_length=200, pattern=PLAIN)
     overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
 
 
@@ -93,7 +94,7 @@ class RevokeAsk(BaseModel):
     """Whose keys are revoked."""
 
     model_config = ConfigDict(extra="forbid")
-    name: str = Field(max_length=200)
+    name: str = Field(max_length=200, pattern=PLAIN)
     keep_votes: bool = Field(default=False, description="whether its standing ballots still count")
 
 
@@ -146,3 +147,11 @@ async def unreadable(request: Request, error: Exception) -> Response:
     Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
     """
     return refuse(MapvoteError("the body is no JSON in UTF-8"))
+
+
+async def unusable(request: Request, error: Exception) -> Response:
+    """A parameter or a body that is not what OpenAPI declares: 422 with each place and what is wrong there, as text
+    that can be encoded whatever was sent."""
+    assert isinstance(error, RequestValidationError)
+    found = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+    return refuse(MapvoteError(found[:1000].encode(errors="replace").decode()))
