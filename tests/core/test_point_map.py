@@ -10,20 +10,17 @@ import numpy as np
 import pytest
 
 import mapvote
-from hand_made import two_walls
+from hand_made import make_map, two_walls
 from mapvote.core.grid import TILE_CELLS, Lattice
-from mapvote.core.point_map import all_points, cut_tiles
+from mapvote.core.point_map import cut_tiles
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, Drive, MapvoteError, Scan
 from mapvote.localisation.ndt import PosePrior
 
 
-def test_the_repr_of_a_map_is_one_line() -> None:
+def test_the_repr_of_a_map_and_of_a_tile_is_one_line() -> None:
     assert repr(two_walls()) == "PointMap('test-map': 24 points in 2 tiles)"
-
-
-def test_the_repr_of_a_tile_is_one_line() -> None:
     assert repr(two_walls().tiles[0, 0]) == "Tile(0, 0: 12 points)"
 
 
@@ -77,12 +74,17 @@ def tile(points: np.ndarray, ground_z: np.ndarray | None = None, free: np.ndarra
     return Tile(window, points, np.zeros((256, 256), np.float32) if ground_z is None else ground_z, free)
 
 
-def test_a_map_from_points_holds_them() -> None:
-    points = np.random.default_rng(0).uniform(-100, 100, (500, 3))
-    point_map = mapvote.map_from_points(points)
-    found = all_points(point_map)
-    order, stored = np.lexsort(points.T), np.lexsort(found.T)
-    np.testing.assert_allclose(found[stored], points[order], atol=1e-5)
+def test_what_lies_under_points_is_that_of_their_tiles_and_nothing_beyond_the_map() -> None:
+    rng = np.random.default_rng(1)
+    ground = {(0, c): rng.normal(0.0, 1.0, (256, 256)).astype(np.float32) for c in (0, 1)}
+    point_map = make_map({index: Tile(Lattice().tile(index), POINTS, z) for index, z in ground.items()})
+    points = rng.uniform((-40.0, -10.0, 0.0), (190.0, 80.0, 1.0), (500, 3))
+    rows, cols = Lattice().cells_of(points)
+    inside = (rows >= 0) & (rows < 256) & (cols >= 0) & (cols < 512)
+    wide = np.hstack([ground[0, 0], ground[0, 1]])
+    expected = np.where(inside, wide[rows.clip(0, 255), cols.clip(0, 511)], np.nan)
+    np.testing.assert_array_equal(point_map.ground_under(points), expected.astype(np.float64))
+    assert point_map.ground_under(np.zeros((0, 3))).shape == (0,)
 
 
 @pytest.mark.parametrize("side_m", [300.0, 90_000.0])

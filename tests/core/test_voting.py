@@ -66,13 +66,6 @@ def test_ten_scans_of_the_paper() -> None:
         assert plurality(tally)[0, 0] == expected
 
 
-@given(st.lists(tallies, min_size=1, max_size=5), st.randoms())
-def test_the_order_of_ballots_never_matters(ballots: list[np.ndarray], random: object) -> None:
-    shuffled = list(ballots)
-    random.shuffle(shuffled)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(plurality(np.sum(ballots, axis=0)), plurality(np.sum(shuffled, axis=0)))
-
-
 @given(tallies)
 def test_the_wire_keeps_small_tallies_exact_and_large_ones_in_proportion(tally: np.ndarray) -> None:
     np.testing.assert_array_equal(to_wire(tally), tally)
@@ -114,19 +107,6 @@ def test_where_it_abstains_a_change_needs_more_than_half_of_the_others_and_a_quo
         expected = UN
     tally = np.array(votes, dtype=np.int32)[:, None] * VOTE_UNIT
     assert decide_cells(tally, tally, True, quorum * VOTE_UNIT).tolist() == [expected]
-
-
-def test_a_quorum_that_is_just_reached_is_reached() -> None:
-    tally = np.array([[0], [0], [0], [32], [0]], dtype=np.int32)
-    assert decide_cells(tally, tally, True, 32).tolist() == [CE]
-    assert decide_cells(tally, tally, True, 33).tolist() == [UN]
-
-
-def test_no_quorum_is_asked_of_what_stays_as_it_is() -> None:
-    for state in (UO, UE):
-        tally = np.zeros((N_STATES, 1), dtype=np.int32)
-        tally[state] = 1
-        assert decide_cells(tally, np.zeros_like(tally), True, 99).tolist() == [state]
 
 
 @pytest.mark.parametrize("voters", [0, 1, 15, 16, 255, 256, 600])
