@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core.columns import flat_cells
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_of_cells, window_around
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, window_around
 
 small = st.integers(-2000, 2000)
 sizes = st.integers(1, 600)
@@ -43,14 +43,6 @@ def test_tiles_cover_a_window_once(grid: Grid) -> None:
         common = grid.lattice.tile(tile).intersection(grid)
         seen[common.slices_in(grid)] += 1
     assert (seen == 1).all()
-
-
-@given(small, small)
-def test_a_cell_lies_in_the_tile_that_is_computed_for_it(row: int, col: int) -> None:
-    tile_row, tile_col = tile_of_cells(np.array([row]), np.array([col]))
-    tile = Lattice().tile((int(tile_row[0]), int(tile_col[0])))
-    assert tile.row0 <= row < tile.row0 + TILE_CELLS
-    assert tile.col0 <= col < tile.col0 + TILE_CELLS
 
 
 def test_the_vehicle_stands_in_the_middle_cell_of_its_window() -> None:

@@ -20,7 +20,7 @@ from mapvote.comparison.patches import (
 )
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.geometry import inverse, rotation_angle, transform
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
+from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
@@ -214,15 +214,9 @@ def with_free_space_of(point_map: PointMap, maps: Sequence[PointMap], T: F64) ->
 def _is_free(one: PointMap, places: F64) -> Bool:
     """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
     out = np.zeros(len(places), dtype=np.bool_)
-    rows, cols = one.lattice.cells_of(places)
-    layers = np.floor(places[:, 2] / CELL_SIZE).astype(np.int64)
-    tile_rows, tile_cols = tile_of_cells(rows, cols)
-    for (row, col), part in one.tiles.items():
-        mine = np.flatnonzero((tile_rows == row) & (tile_cols == col))
-        if part.free is None or not len(mine):
-            continue
-        r, c = rows[mine] - row * TILE_CELLS, cols[mine] - col * TILE_CELLS
-        bit = layers[mine] - part.base[r, c]
-        words = part.free[r, c] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
-        out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
+    for part, mine, cell in one.by_tile(places):
+        if part.free is not None:
+            bit = np.floor(places[mine, 2] / CELL_SIZE).astype(np.int64) - part.base[cell]
+            words = part.free[cell] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
+            out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
     return out

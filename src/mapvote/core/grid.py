@@ -148,9 +148,4 @@ def window_around(lattice: Lattice, x: float, y: float, side_m: float) -> Grid:
     return Grid(lattice, int(rows[0]) - half, int(cols[0]) - half, 2 * half + 1, 2 * half + 1)
 
 
-def tile_of_cells(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Tile row and column of lattice cells."""
-    return rows // TILE_CELLS, cols // TILE_CELLS
-
-
 CELLS = TILE_CELLS * TILE_CELLS

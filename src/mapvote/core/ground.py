@@ -10,7 +10,7 @@ import numpy as np
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, settle, tiles_around
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F32, F64, I32, I64, U8, Bool, read_only
+from mapvote.core.types import F32, F64, I32, I64, U8, read_only
 
 KNOWN_M = 3.0
 """Farther than this from any measured ground it is unknown."""
@@ -125,7 +125,7 @@ def lay_ground(
             ground[k * CELLS + cells], gap[k * CELLS + cells] = z, SEED
     if road:
         grow(start, heights, neighbours, ground, gap)
-    _sow(_Lows(start, heights, gap, ground), neighbours, _BROAD if road else 2)
+    _sow(start, heights, neighbours, ground, gap, _BROAD if road else 2)
     grow(start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
     settled = settle(start, heights, neighbours, ground, gap)
@@ -175,48 +175,38 @@ def _lowest_of_each(cells: I64, z: F32) -> Heights:
     return cells[order][first], z[order][first]
 
 
-class _Lows:
-    """What is known before ground grows: planes of a tile, computed when they are first read."""
+def _sow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, least: int) -> None:
+    """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things.
 
-    def __init__(self, start: I32 | I64, heights: F32, gap: U8, ground: F32) -> None:
-        self._start, self._heights, self._gap, self._ground = start, heights, gap, ground
-
-    def low(self, tile: int) -> F32:
-        """(256, 256) the lowest point of each cell without measured ground nearby, inf where there is none."""
-        cells = slice(tile * CELLS, (tile + 1) * CELLS)
-        first = self._start[tile * CELLS : (tile + 1) * CELLS + 1]
-        asked = (first[:-1] < first[1:]) & (self._gap[cells] > _BRIDGED_M / STEP_M)
-        low = np.full(CELLS, np.inf, dtype=np.float32)
-        low[asked] = self._heights[first[:-1][asked]]
-        return low.reshape(TILE_CELLS, TILE_CELLS)
-
-    def known(self, tile: int) -> F32:
-        """(256, 256) the ground that is known, inf elsewhere."""
-        cells = slice(tile * CELLS, (tile + 1) * CELLS)
-        known: F32 = np.where(self._gap[cells] > _BRIDGED_M / STEP_M, np.inf, self._ground[cells])
-        return known.reshape(TILE_CELLS, TILE_CELLS)
-
-    def sow(self, tile: int, lies: Bool) -> None:
-        """Ground shall grow from the cells ``lies`` (256, 256) of a tile, from their lowest points."""
-        cells = tile * CELLS + np.flatnonzero(lies)
-        self._ground[cells], self._gap[cells] = self._heights[self._start[cells]], SEED
-
-
-def _sow(lows: _Lows, neighbours: I32, least: int) -> None:
-    """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things."""
-    # What is sown here was not known before and is not called so yet: neither plane changes on the way.
-    low, known = (lru_cache(maxsize=_NEAR_TILES)(plane) for plane in (lows.low, lows.known))
+    Arguments as :func:`mapvote.core.ground_growing.grow`. What is sown here was not known before and is not called so
+    yet: no plane below changes on the way.
+    """
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)
     near = slice(TILE_CELLS - _AROUND_CELLS, 2 * TILE_CELLS + _AROUND_CELLS)
     thirds = [slice(k * TILE_CELLS, (k + 1) * TILE_CELLS) for k in range(3)]
+    unmeasured = gap > _BRIDGED_M / STEP_M
+
+    @lru_cache(maxsize=_NEAR_TILES)
+    def low(tile: int) -> F32:
+        """(256, 256) the lowest point of each cell without measured ground nearby, inf where there is none."""
+        first = start[tile * CELLS : (tile + 1) * CELLS + 1]
+        asked = (first[:-1] < first[1:]) & unmeasured[tile * CELLS : (tile + 1) * CELLS]
+        plane = nothing.reshape(-1).copy()
+        plane[asked] = heights[first[:-1][asked]]
+        return plane.reshape(nothing.shape)
+
+    @lru_cache(maxsize=_NEAR_TILES)
+    def known(tile: int) -> F32:
+        """(256, 256) the ground that is known, inf elsewhere."""
+        cells = slice(tile * CELLS, (tile + 1) * CELLS)
+        return np.where(unmeasured[cells], np.inf, ground[cells]).reshape(nothing.shape)
 
     @lru_cache(maxsize=_NEAR_TILES)
     def supported(tile: int) -> F32:
         if not np.isfinite(low(tile)).any():
             return nothing
         around = np.block([[low(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
-        out = np.empty((TILE_CELLS, TILE_CELLS), dtype=np.float32)
-        window = np.ascontiguousarray(around[near, near])
+        out, window = np.empty_like(nothing), np.ascontiguousarray(around[near, near])
         _support(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least, out)
         return out
 
@@ -227,4 +217,6 @@ def _sow(lows: _Lows, neighbours: I32, least: int) -> None:
                 for j, tile in enumerate(row):
                     envelope[thirds[i], thirds[j]] = np.minimum(supported(tile), known(tile)) if tile >= 0 else np.inf
             _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
-            lows.sow(k, np.isfinite(supported(k)) & (supported(k) <= envelope[thirds[1], thirds[1]] + 0.1))
+            lies = np.isfinite(supported(k)) & (supported(k) <= envelope[thirds[1], thirds[1]] + 0.1)
+            cells = k * CELLS + np.flatnonzero(lies)
+            ground[cells], gap[cells] = heights[start[cells]], SEED

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.columns import flat_cells
-from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
-from mapvote.core.ground import Heights, lay_ground
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.ground import lay_ground
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, MapvoteError
@@ -93,7 +93,8 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     tiles = np.empty((len(points_map), 2), dtype=np.int32)
     for start in range(0, len(points_map), _CHUNK):
         piece = slice(start, start + _CHUNK)
-        tiles[piece, 0], tiles[piece, 1] = tile_of_cells(*lattice.cells_of(points_map[piece]))
+        rows, cols = lattice.cells_of(points_map[piece])
+        tiles[piece, 0], tiles[piece, 1] = rows // TILE_CELLS, cols // TILE_CELLS
     number = _numbered(tiles)
     order = np.argsort(number, kind="stable")
     seams = np.flatnonzero(np.diff(number[order])) + 1
@@ -109,10 +110,6 @@ def _numbered(tiles: I32) -> NDArray[np.integer]:
     rows, cols = (high - low + 1).tolist()
     kind = np.uint16 if rows * cols <= 1 << 16 else np.int64
     return ((tiles[:, 0] - low[0]) * cols + (tiles[:, 1] - low[1])).astype(kind)
-
-
-def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileIndex, Heights]:
-    return {tile: (flat_cells(lattice.tile(tile), p), p[:, 2]) for tile, p in points.items()}
 
 
 def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:
@@ -146,9 +143,10 @@ def map_from_points(
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
     known = {} if road is None or len(road) == 0 else _stored(road, lattice)
-    ground = lay_ground(
-        _heights(stored, lattice), _heights(known, lattice), {tile: len(p) for tile, p in stored.items()}
+    heights, road_heights = (
+        {tile: (flat_cells(lattice.tile(tile), p), p[:, 2]) for tile, p in some.items()} for some in (stored, known)
     )
+    ground = lay_ground(heights, road_heights, {tile: len(p) for tile, p in stored.items()})
     tiles = {tile: Tile(lattice.tile(tile), stored[tile], ground[tile]) for tile in stored}
     if fields:
         for tile, mine in cut_tiles(points, lattice):

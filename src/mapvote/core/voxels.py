@@ -6,8 +6,6 @@ whole error in range and pose; the mean is as unbiased and several times less no
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -149,30 +147,6 @@ def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
         sums[k, 3] += points[i, 2] - sums[k, 6]
 
 
-class _Scratch(NamedTuple):
-    """Room to group a scan's points in, kept for the next one."""
-
-    table: I64
-    place: I32
-    of_point: I32
-    first: I64
-    keys: I64
-    rows: I32
-
-
-def _room_for(n: int) -> _Scratch:
-    """Room for a scan of n points."""
-    slots = 1 << (2 * n).bit_length()
-    return _Scratch(
-        np.zeros(slots, dtype=np.int64),
-        np.zeros(slots, dtype=np.int32),
-        np.empty(n, dtype=np.int32),
-        np.empty(n, dtype=np.int64),
-        np.empty(n, dtype=np.int64),
-        np.empty(n, dtype=np.int32),
-    )
-
-
 class VoxelCloud:
     """Sums of points per lattice voxel, and the number of scans that hit each voxel."""
 
@@ -183,7 +157,6 @@ class VoxelCloud:
         self._sums = np.zeros((1 << 15, 8))
         """Count, moments from the first point, the first point, scans: a row is one line of the processor's cache."""
         self._n = 0
-        self._scratch = _room_for(0)
 
     def enter(self, points_map: F64, skip: Bool | None = None) -> None:
         """Enter one scan: points (n, 3) in map metres, those of ``skip`` (n,) left out.
@@ -191,19 +164,15 @@ class VoxelCloud:
         Five points of a scan share a voxel: they are gathered before the cloud, which no cache holds, is read.
         """
         points = np.ascontiguousarray(points_map, dtype=np.float64)
-        if len(points) > len(self._scratch.keys):
-            self._scratch = _room_for(len(points))
-        table, place, of_point, first, keys, rows = self._scratch
-        keys = keys[: len(points)]
-        _enter_keys(points, self.lattice.x0, self.lattice.y0, CELL_SIZE, keys)
+        keys = voxel_keys(points, self.lattice.x0, self.lattice.y0)
         if skip is not None:
             keys[skip] = 0
-        table[:] = 0
-        m = _group(keys, table, place, of_point, first)
-        while self._n + m > len(self._sums):
+        of_point, first = grouped(keys, 1 << 16)
+        while self._n + len(first) > len(self._sums):
             self._grow()
-        self._n = _find(keys[first[:m]], self._keys, self._rows, self._n, rows)
-        _add(points, of_point, rows[:m], self._sums)
+        rows = np.empty(len(first), dtype=np.int32)
+        self._n = _find(keys[first], self._keys, self._rows, self._n, rows)
+        _add(points, of_point, rows, self._sums)
 
     def _grow(self) -> None:
         """Twice the room: every voxel is entered anew, in the order of rows."""

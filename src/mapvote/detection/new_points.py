@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
-from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
+from mapvote.core.point_map import cut_tiles
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
 from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.detection.shelf import Shelf, Slot
@@ -162,9 +163,7 @@ class NewPoints:
         return of_tile
 
     def _of_tiles(self, points: F64) -> dict[TileIndex, F64]:
-        rows, cols = tile_of_cells(*self.lattice.cells_of(points))
-        tiles = ((r, c) for r in np.unique(rows) for c in np.unique(cols[rows == r]))
-        return {(int(r), int(c)): points[(rows == r) & (cols == c)] for r, c in tiles}
+        return {tile: points[mine] for tile, mine in cut_tiles(points, self.lattice)}
 
 
 def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32, U8 | None]:
