@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,15 @@ def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> No
     (waits,) = desk(store).waiting
     with pytest.raises(MapvoteError, match="pending any more"):
         review(store, waits["id"], "accepted", by="anna")
+
+
+def test_the_desk_says_in_which_system_its_coordinates_lie(tmp_path: Path) -> None:
+    place = {"crs": "EPSG:32654", "offset": "300000.0,3900000.0,0.0"}
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", replace(two_walls(), georeference=place), BUDGET)
+    pending = desk(store).pending
+    store.close()
+    assert pending["georeference"] == place
+    assert "EPSG:32654" in pending["frame"]
 
 
 def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:

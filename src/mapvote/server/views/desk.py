@@ -75,7 +75,9 @@ def _desk_of(store: Store, found: Round) -> Desk:
     tiles = [_before_and_after(store, version, fused) for fused in found.changed]
     decided = {f.index: _decided(f) for f in found.changed}
     objects = change_objects([changed_cells(old, new, [decided[old.index]]) for old, new in tiles])
-    pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=version)
+    pending = to_geojson(
+        objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
+    )
     reviews = standing(store)
     cells = {o.id: _cells_of(o) for o in objects}
     for feature in pending["features"]:
