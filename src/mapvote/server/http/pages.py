@@ -20,6 +20,9 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
 _STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
+_PRELOADED = b'<link rel="modulepreload" href="viewer/%s">'
+_OF_A_FILE = "standalone.js", "bundle.js"
+"""Modules of a page that lies in a file of its own."""
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
 
@@ -44,7 +47,7 @@ def docs(request: Request) -> Response:
 @router.get("/", include_in_schema=False)
 async def index(request: Request) -> Response:
     """The operator's page."""
-    return _page(request, _assets()["index.html"].plain)
+    return _page(request, _index())
 
 
 @router.get("/viewer/{name:path}", include_in_schema=False)
@@ -82,6 +85,15 @@ def _assets() -> dict[str, _Asset]:
                 tag = f'"{hashlib.sha256(data).hexdigest()[:20]}"'
                 found[folder + file.name] = _Asset(kind, data, compress(data, 12), tag)
     return found
+
+
+@cache
+def _index() -> bytes:
+    """The operator's page, which asks for all its modules at once: each would be asked for by the one before it."""
+    assets = _assets()
+    modules = [name for name in assets if name.endswith(".js") and name not in ("app.js", *_OF_A_FILE)]
+    links = b"".join(_PRELOADED % name.encode() for name in sorted(modules, key=lambda name: ("/" not in name, name)))
+    return assets["index.html"].plain.replace(b"</head>", links + b"</head>", 1)
 
 
 def _page(request: Request, text: bytes) -> Response:
