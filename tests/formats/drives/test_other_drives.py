@@ -239,6 +239,10 @@ def test_kitti_raw_with_oxts(tmp_path: Path) -> None:
     assert np.allclose(prior[:, :3, 3] - prior[0, :3, 3], [[2.0 * i, 0, i] for i in (0, 1, 3, 4)], atol=1e-4)
     heading = prior[0, :3, 0]
     assert np.allclose(heading, [np.cos(0.5), np.sin(0.5), 0])
+    (drive / "prior.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4)
+    again = open_drive(drive, prior="oxts", sensor="hdl64e").T_map_lidar_prior
+    assert again is not None
+    assert np.array_equal(again, prior)
 
 
 def test_oxts_agree_with_the_reference_of_a_real_drive() -> None:

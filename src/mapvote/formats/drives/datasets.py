@@ -25,7 +25,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
-from msgspec import structs
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
@@ -90,28 +89,23 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
     times_ns = read_times_ns(table)
     stamps_ns: I64 = times_ns[lines_of_scans(len(times_ns), files, table)]
-    wanted = options.prior
-    if wanted == "oxts":  # a name of ours, no file
-        options = structs.replace(options, prior=None)
 
     def prior() -> Trajectory | F64 | None:
-        if wanted is None and has_kitti_360_poses(path):
+        if options.prior is None and has_kitti_360_poses(path):
             return kitti_360_poses(path, files, stamps_ns)
-        return _oxts_prior(path, files, stamps_ns, options, wanted=wanted == "oxts")
+        return _oxts_prior(path, files, stamps_ns, options)
 
     layout = layout_of(files, options.columns, options.dtype)
-    folder = ScanFolder(files, stamps_ns, layout.read, prior, zero_is_no_return=False)
+    folder = ScanFolder(files, stamps_ns, layout.read, prior, "oxts", zero_is_no_return=False)
     return open_scan_folder(path, options, folder)
 
 
-def _oxts_prior(
-    path: Path, files: list[Path], stamps_ns: I64, options: DriveOptions, *, wanted: bool
-) -> Trajectory | None:
+def _oxts_prior(path: Path, files: list[Path], stamps_ns: I64, options: DriveOptions) -> Trajectory | None:
     folder = path / "oxts" / "data"
     calib = next((f for d in (path, path.parent) if (f := d / "calib_imu_to_velo.txt").is_file()), None)
     if calib is None or not folder.is_dir():
         message = f"{path}: no prior: {'oxts/data' if calib else 'calib_imu_to_velo.txt'} is missing"
-        if wanted:
+        if options.prior == "oxts":
             raise MapvoteError(f"{message}; put it there, or --prior none")
         log.warning("%s", message)
         return None

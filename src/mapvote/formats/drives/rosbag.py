@@ -18,14 +18,11 @@ import scipy
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
+from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame
 from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields
-from mapvote.formats.drives.scan_folder import prior_file
+from mapvote.formats.drives.scan_folder import prior_of
 from mapvote.formats.drives.trajectory import (
     Trajectory,
-    has_times,
-    read_T_map_lidar,
-    read_trajectory,
     sorted_trajectory,
 )
 from mapvote.formats.extras import first_line, require
@@ -136,25 +133,15 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
 
 def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None, MapFrame]:
     """T_map_lidar of every scan (n, 4, 4) from a topic or a file, and the frame it is in."""
-    wanted = options.prior
-    if wanted in bag.topics(*POSES, *GNSS):
-        found = bag_trajectory(bag, wanted or "", map_frame(options))
-        T_base_lidar = mount_of(options, None, str(bag.path))
-        return found.at(stamps_ns, f"{bag.path}: {wanted}") @ T_base_lidar, found.frame
-    if wanted is not None and wanted.startswith("/") and not Path(wanted).is_file():
-        listed = ", ".join(bag.topics(*POSES, *GNSS)) or "none"
-        raise MapvoteError(f"{bag.path}: no pose topic {wanted}; topics with poses: {listed}")
-    file = prior_file(bag.path, options)
-    if file is None:
-        return None, MapFrame()
-    if has_times(file):
-        found = read_trajectory(file, map_frame(options))
-        T_base_lidar = mount_of(options, None, str(bag.path)) if found.of_vehicle else np.eye(4)
-        return found.at(stamps_ns, str(file)) @ T_base_lidar, found.frame
-    T_prior = read_T_map_lidar(file, bag.path)
-    if len(T_prior) != len(stamps_ns):
-        raise MapvoteError(f"{file}: {len(T_prior)} poses for {len(stamps_ns)} scans; one a scan, in order")
-    return T_prior, MapFrame()
+    topic, poses = options.prior, bag.topics(*POSES, *GNSS)
+    if topic is not None and topic.startswith("/") and topic not in poses and not Path(topic).is_file():
+        raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(poses) or 'none'}")
+
+    def own() -> Trajectory | None:
+        return None if topic is None else bag_trajectory(bag, topic, map_frame(options))
+
+    files = [bag.path] * len(stamps_ns)
+    return prior_of(bag.path, options, files, stamps_ns, own, topic if topic in poses else None)
 
 
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:

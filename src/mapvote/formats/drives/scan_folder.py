@@ -120,16 +120,15 @@ def stamp_in_name_ns(file: Path) -> int:
 
 
 def prior_file(folder: Path, options: DriveOptions) -> Path | None:
-    """The file that the prior comes from: the caller's, else drive.toml's, else prior.txt if it exists."""
-    wanted = options.prior
-    if wanted is None:
+    """The file that the options name, here or in ``folder``; else prior.txt, if it exists."""
+    if options.prior is None:
         return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
-    if wanted.lower() == "none":
-        return None
-    for file in (Path(wanted), folder / wanted):
+    for file in (Path(options.prior), folder / options.prior):
         if file.is_file():
             return file
-    raise MapvoteError(f"{wanted}: no such prior, neither here nor in {folder}; give a file of 3 x 4 rows, or none")
+    raise MapvoteError(
+        f"{options.prior}: no such prior, neither here nor in {folder}; give a file of 3 x 4 rows, or none"
+    )
 
 
 def of_scans(poses: F64, files: list[Path], table: Path) -> F64:
@@ -148,6 +147,8 @@ class ScanFolder:
     """A scan's points as a structured array (n,) with x, y, z and, where the file has them, intensity, ring, time."""
     prior: Callable[[], Trajectory | F64 | None] = lambda: None
     """The layout's own prior, where the caller names no other: a trajectory, or a pose (n, 4, 4) of every scan."""
+    prior_name: str | None = None
+    """By which the caller may ask for it."""
     T_base_lidar: F64 | None = None
     """The layout's own mount."""
     zero_is_no_return: bool = True
@@ -158,7 +159,8 @@ class ScanFolder:
 def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
     """The drive of a folder; scans are read one by one. MapvoteError says what is missing or does not fit."""
     bad_points = BadPoints(str(path))
-    T_prior, frame = prior_of(path, options, folder)
+    own = folder.prior, folder.prior_name, folder.T_base_lidar
+    T_prior, frame = prior_of(path, options, folder.files, folder.stamps_ns, *own)
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
         file = folder.files[i]
@@ -184,24 +186,29 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
     )
 
 
-def prior_of(path: Path, options: DriveOptions, folder: ScanFolder) -> tuple[F64 | None, MapFrame]:
-    """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the caller's file, else the layout's own."""
-    T_base_lidar = mount_of(options, folder.T_base_lidar, str(path))
-    file = prior_file(path, options)
-    refused = options.prior is not None and options.prior.lower() == "none"
-    own = folder.prior() if file is None and not refused else None
-    if file is not None:
-        if not has_times(file):
-            return of_scans(read_T_map_lidar(file, path), folder.files, file), MapFrame()
-        own = read_trajectory(file, map_frame(options))
-    if own is None:
+def prior_of(
+    path: Path,
+    options: DriveOptions,
+    files: list[Path],
+    stamps_ns: I64,
+    own: Callable[[], Trajectory | F64 | None],
+    own_name: str | None = None,
+    T_base_lidar: F64 | None = None,
+) -> tuple[F64 | None, MapFrame]:
+    """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the file that the options name, else prior.txt,
+    else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
+    if options.prior is not None and options.prior.lower() == "none":
         return None, MapFrame()
-    if not isinstance(own, Trajectory):
-        if len(own) != len(folder.files):
-            raise MapvoteError(f"{path}: {len(own)} poses for {len(folder.files)} scans; one a scan, in order")
-        return own, MapFrame()
-    T = own.at(folder.stamps_ns, str(file or path))
-    return (T @ T_base_lidar if own.of_vehicle else T), own.frame
+    file = None if options.prior is not None and options.prior == own_name else prior_file(path, options)
+    if file is not None and not has_times(file):
+        return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
+    found = own() if file is None else read_trajectory(file, map_frame(options))
+    if found is None:
+        return None, MapFrame()
+    if not isinstance(found, Trajectory):
+        return of_scans(found, files, path), MapFrame()
+    T = found.at(stamps_ns, str(file or path))
+    return (T @ mount_of(options, T_base_lidar, str(path)) if found.of_vehicle else T), found.frame
 
 
 KITTI = ("x", "y", "z", "intensity")
