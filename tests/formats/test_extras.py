@@ -6,8 +6,7 @@ from importlib import metadata
 
 import pytest
 
-from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import missing_extra, require
+from mapvote.formats.extras import missing_extra
 
 WRITTEN = [
     "numpy>=2",
@@ -36,8 +35,3 @@ def test_a_module_that_no_extra_brings_is_a_bug_and_stays_one(monkeypatch: pytes
     monkeypatch.setattr(metadata, "requires", lambda name: WRITTEN)
     assert missing_extra(ModuleNotFoundError(name="mapvote.no_such_room")) is None
     assert missing_extra(ModuleNotFoundError(name="numpy")) is None
-
-
-def test_a_format_without_its_package_is_one_clear_error() -> None:
-    with pytest.raises(MapvoteError, match=r"a\.xyz: needs the package no_such_package; .*'mapvote\[las\]'"):
-        require("no_such_package.part", "las", "a.xyz")

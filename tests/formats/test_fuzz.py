@@ -6,6 +6,8 @@ import re
 import resource
 import shutil
 import signal
+import struct
+import subprocess
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hand_made import save_pcd
+from live_server import mapvote
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
@@ -39,6 +42,10 @@ MEMORY = 2_000_000_000
 def drive(path: Path) -> None:
     for scan in open_drive(path, rate_hz=10.0):
         assert np.isfinite(scan.points).all()
+
+
+def camera_drive(path: Path) -> None:
+    open_drive(path, prior="poses.txt")
 
 
 def map_points(path: Path) -> None:
@@ -71,6 +78,9 @@ TARGETS = [
     Target("drive/velodyne/000001.bin", drive, "drive"),
     Target("drive/drive.toml", drive, "drive"),
     Target("drive/times.txt", drive, "drive"),
+    Target("drive/prior.txt", drive, "drive", times=15),
+    Target("drive/poses.txt", camera_drive, "drive", times=15),
+    Target("drive/calib.txt", camera_drive, "drive", times=15),
     Target("npy/000001.npy", drive, "npy"),
     Target("t.tum", read_trajectory),
     Target("t.csv", read_trajectory),
@@ -133,7 +143,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = DriveWriter(folder / "drive", "v", SENSORS["hdl32e"], start_ns=0).open()
     for i in range(3):
         writer.write_scan(i, POINTS.astype(np.float32))
-    writer.close(np.arange(3) * 10**8)
+    writer.close(np.arange(3) * 10**8, np.tile(np.eye(4), (3, 1, 1)))
+    (folder / "drive" / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    (folder / "drive" / "calib.txt").write_text("P0: 0 -1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
     (folder / "npy").mkdir()
     for i in range(3):
         np.save(folder / "npy" / f"{i:06d}.npy", POINTS.astype(np.float32))
@@ -193,20 +205,106 @@ def bounded() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("target", TARGETS, ids=[target.file for target in TARGETS])
-def test_a_damaged_file_is_a_value_or_one_clear_error(
-    tmp_path: Path, good: Path, bounded: None, target: Target
-) -> None:
+def read_damaged(folder: Path, good: Path, target: Target, times: int, seconds: int = 0) -> None:
+    """``seconds``: for each file; without a limit if 0."""
     what = Path(target.what or target.file)
-    shutil.copytree(good / what, tmp_path / what) if (good / what).is_dir() else shutil.copy(good / what, tmp_path)
+    shutil.copytree(good / what, folder / what) if (good / what).is_dir() else shutil.copy(good / what, folder)
     file = min(good.glob(target.file))
     content = file.read_bytes()
-    for seed in range(target.times):
-        (tmp_path / file.relative_to(good)).write_bytes(damaged(content, np.random.default_rng(seed)))
-        signal.alarm(SECONDS)
+    for seed in range(times):
+        (folder / file.relative_to(good)).write_bytes(damaged(content, np.random.default_rng(seed)))
+        signal.alarm(seconds)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy's and laspy's opinions on garbage
-            said = what_it_says(target, tmp_path / what)
+            said = what_it_says(target, folder / what)
         assert "\n" not in said, f"seed {seed}: {said}"
         signal.alarm(0)
+
+
+EVERY = pytest.mark.parametrize("target", TARGETS, ids=[target.file for target in TARGETS])
+
+
+@EVERY
+def test_a_damaged_file_is_a_value_or_one_clear_error(tmp_path: Path, good: Path, target: Target) -> None:
+    read_damaged(tmp_path, good, target, 3)
+
+
+@pytest.mark.slow
+@EVERY
+def test_five_hundred_damaged_files_cost_neither_time_nor_memory(
+    tmp_path: Path, good: Path, bounded: None, target: Target
+) -> None:
+    read_damaged(tmp_path, good, target, target.times, SECONDS)
+
+
+def put(at: int, kind: str, value: int) -> Callable[[bytearray], None]:
+    return lambda content: struct.pack_into(kind, content, at, value)
+
+
+def damage_count(content: bytearray) -> None:
+    """Four billion chunks where there is one."""
+    (table,) = struct.unpack_from("<q", content, LAZ_START)
+    struct.pack_into("<I", content, table + 4, 2**32 - 1)
+
+
+def damage_table(content: bytearray) -> None:
+    """Another length of the one chunk: random bytes where the compressed chunk table is."""
+    content[-6:] = b"\x5a\x13\xc7\x08\xee\x41"
+
+
+LASZIP = 429  # the LASzip record in a LAS 1.4 header without other records: compressor, ..., chunk size, items
+LAZ_START = 469
+DAMAGES: dict[str, Callable[[bytearray], None]] = {
+    "cut": lambda content: content.__delitem__(slice(-200, None)),
+    "flipped": lambda content: content.__setitem__(slice(900, 960), bytes(60)),
+    "panics: a chunk for every point": put(LASZIP + 12, "<I", 1),
+    "panics: no items": put(LASZIP + 32, "<H", 0),
+    "aborts: four billion chunks": lambda content: put(
+        struct.unpack_from("<q", content, LAZ_START)[0] + 4, "<I", 2**32 - 1
+    )(content),
+    "may abort: chunk table": damage_table,
+}
+
+
+@pytest.fixture(scope="module")
+def laz(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A LAZ file of 3,000 points."""
+    path = tmp_path_factory.mktemp("laz") / "good.laz"
+    write_las(path, Cloud(np.random.default_rng(0).uniform(-30, 30, (3000, 3))))
+    content = path.read_bytes()
+    assert struct.unpack_from("<I", content, 96)[0] == LAZ_START
+    return content
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
+def test_a_damaged_laz_file_is_one_clear_error(tmp_path: Path, laz: bytes, damage: Callable[[bytearray], None]) -> None:
+    """lazrs panics on some, and aborts the process that reads it on others: it reads apart."""
+    content = bytearray(laz)
+    damage(content)
+    path = tmp_path / "bad.laz"
+    path.write_bytes(content)
+    with pytest.raises(MapvoteError, match=r"bad\.laz: not a whole LAS or LAZ file .*copy"):
+        read_map(path)
+
+
+def test_the_command_line_says_one_line_about_a_damaged_laz_file(tmp_path: Path, laz: bytes) -> None:
+    content = bytearray(laz)
+    damage_count(content)
+    path = tmp_path / "bad.laz"
+    path.write_bytes(content)
+    done = subprocess.run(
+        mapvote("import", path, tmp_path / "out"), capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 1
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "bad.laz" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_may_not_be_read_or_is_gone(tmp_path: Path, good: Path) -> None:
+    shutil.copytree(good / "drive", tmp_path / "d")
+    for name in ("times.txt", "prior.txt", "drive.toml", "calib.txt"):
+        (tmp_path / "d" / name).unlink()
+        (tmp_path / "d" / name).mkdir()
+    with pytest.raises(MapvoteError):
+        open_drive(tmp_path / "d", rate_hz=None)

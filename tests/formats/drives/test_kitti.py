@@ -10,7 +10,7 @@ import pytest
 
 from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F32, F64, Drive, MapvoteError
+from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats import DriveWriter, open_drive, read_T_map_lidar
 
 # T_camera_lidar of KITTI odometry sequence 00 (Geiger et al.)
@@ -216,12 +216,3 @@ def test_camera_poses_of_kitti_odometry_are_recognised_and_converted(tmp_path: P
 def test_unknown_sensor_lists_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(MapvoteError, match="did you mean 'hdl32e'"):
         open_drive(make(tmp_path / "d"), sensor="hdl32")
-
-
-def drives_agree(a: Drive, b: Drive) -> bool:
-    return all(np.array_equal(x.points, y.points) for x, y in zip(a, b, strict=True))
-
-
-def test_reading_twice_gives_the_same(tmp_path: Path) -> None:
-    drive = open_drive(make(tmp_path / "d"))
-    assert drives_agree(drive, drive)
