@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mapvote.core.types import F64
 
+CLOUD = "sensor_msgs/msg/PointCloud2"
 START = 1_700_000_000 * 10**9
 """When the first message comes, nanoseconds."""
 
@@ -20,10 +21,10 @@ START = 1_700_000_000 * 10**9
 class Recorder:
     """Writes one bag."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, storage: StoragePlugin = StoragePlugin.MCAP) -> None:
         self.store = get_typestore(Stores.ROS2_HUMBLE)
         self.types: dict[str, Any] = dict(self.store.types)
-        self.bag = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self.bag = Writer(path, version=9, storage_plugin=storage)
         self.bag.open()
         self.topics: dict[str, Any] = {}
 
@@ -38,13 +39,26 @@ class Recorder:
         self.bag.write(self.topics[topic], ns, self.store.serialize_cdr(message, kind))
 
     def cloud(self, topic: str, frame: str, ns: int, points: NDArray[np.floating]) -> None:
-        kind, field = "sensor_msgs/msg/PointCloud2", self.types["sensor_msgs/msg/PointField"]
-        raw = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).ravel()
-        fields = [field(axis, 4 * i, 7, 1) for i, axis in enumerate("xyz")]
-        n = len(points)
-        self.write(
-            topic, kind, ns, self.types[kind](self.header(ns, frame), 1, n, fields, False, 12, 12 * n, raw, True)
-        )
+        rows = np.ascontiguousarray(points, dtype="<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+        self.write(topic, CLOUD, ns, self.cloud_of(rows, ns, frame))
+
+    def cloud_of(self, table: NDArray[np.void], ns: int, frame: str = "lidar", cut: int = 0) -> Any:
+        """The message of a structured array; the last ``cut`` bytes of its data are missing."""
+        types = {"<f4": 7, "<u4": 6}
+        fields = [
+            self.types["sensor_msgs/msg/PointField"](name, offset, types[kind.str], 1)
+            for name, (kind, offset, *_) in (table.dtype.fields or {}).items()
+        ]
+        data, step = np.frombuffer(table.tobytes(), dtype=np.uint8), table.dtype.itemsize
+        size = 1, len(table), fields, False, step, step * len(table)
+        return self.types[CLOUD](self.header(ns, frame), *size, data[: len(data) - cut], True)
+
+    def pose(self, topic: str, ns: int, T: F64, received_ns: int) -> None:
+        g = "geometry_msgs/msg/"
+        q = self.types[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
+        pose = self.types[g + "Pose"](self.types[g + "Point"](*T[:3, 3].tolist()), q)
+        kind = g + "PoseStamped"
+        self.write(topic, kind, received_ns, self.types[kind](self.header(ns, "map"), pose))
 
     def static(self, frames: dict[str, F64]) -> None:
         g = "geometry_msgs/msg/"

@@ -17,9 +17,10 @@ import numpy as np
 import pye57
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
+from bag_recorder import CLOUD, START, Recorder
 from hand_made import save_pcd
 from live_server import mapvote
 from mapvote.core.point_map import map_from_points
@@ -96,32 +97,21 @@ def test_there_are_five_hundred() -> None:
 
 
 def _bags(folder: Path) -> None:
-    store, cloud_type = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/PointCloud2"
-    kinds = store.types
-    head, time = kinds["std_msgs/msg/Header"], kinds["builtin_interfaces/msg/Time"]
-    field, cloud = kinds["sensor_msgs/msg/PointField"], kinds["sensor_msgs/msg/PointCloud2"]
-    fields = [field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
-    raw = np.ascontiguousarray(POINTS, dtype="<f4").view(np.uint8).ravel()
-
-    def message(i: int) -> object:
-        stamp = time(1_700_000_000, i * 100_000_000)
-        return cloud(head(stamp, "lidar"), 1, len(POINTS), fields, False, 12, raw.size, raw, True)
-
     for path, plugin in ((folder / "bag2", StoragePlugin.SQLITE3), (folder / "mcap", StoragePlugin.MCAP)):
-        with Writer(path, version=9, storage_plugin=plugin) as bag:
-            topic = bag.add_connection("/points", cloud_type, typestore=store)
-            for i in range(3):
-                bag.write(topic, 1_700_000_000 * 10**9 + i * 10**8, store.serialize_cdr(message(i), cloud_type))
+        bag = Recorder(path, plugin)
+        for i in range(3):
+            bag.cloud("/points", "lidar", START + i * 10**8, POINTS)
+        bag.bag.close()
     shutil.move(next((folder / "mcap").glob("*.mcap")), folder / "m.mcap")
-    old = get_typestore(Stores.ROS1_NOETIC)
-    head1, cloud1 = old.types["std_msgs/msg/Header"], old.types[cloud_type]
+    old, raw = get_typestore(Stores.ROS1_NOETIC), np.ascontiguousarray(POINTS, dtype="<f4").view(np.uint8).ravel()
+    head1, cloud1 = old.types["std_msgs/msg/Header"], old.types[CLOUD]
     field1 = [old.types["sensor_msgs/msg/PointField"](name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
     with Writer1(folder / "b.bag") as bag1:
-        topic1 = bag1.add_connection("/points", cloud_type, typestore=old)
+        topic1 = bag1.add_connection("/points", CLOUD, typestore=old)
         for i in range(3):
             stamp = old.types["builtin_interfaces/msg/Time"](1_700_000_000, i * 100_000_000)
             content = cloud1(head1(i, stamp, "lidar"), 1, len(POINTS), field1, False, 12, raw.size, raw, True)
-            bag1.write(topic1, 1_700_000_000 * 10**9 + i * 10**8, old.serialize_ros1(content, cloud_type))
+            bag1.write(topic1, 1_700_000_000 * 10**9 + i * 10**8, old.serialize_ros1(content, CLOUD))
 
 
 @pytest.fixture(scope="module")

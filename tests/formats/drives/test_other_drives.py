@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pypcd4 import Encoding, MetaData, PointCloud
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 
+from bag_recorder import CLOUD, Recorder
 from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, MapvoteError
@@ -22,8 +22,6 @@ from mapvote.formats.drives.point_fields import point_times_s
 from mapvote.formats.geo.frame import enu_frame, poses_from_gnss
 
 N, START = 5, 1_700_000_000_123_456_789
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-T = STORE.types
 
 
 def cloud(i: int, n: int = 300) -> F32:
@@ -45,51 +43,21 @@ def stamps() -> list[int]:
 def write_bag(
     path: Path, storage: StoragePlugin, *, topics: tuple[str, ...] = ("/points",), stamped: bool = True, cut: int = 0
 ) -> Path:
-    """A bag of PointCloud2 (x y z intensity, Ouster's t) with an Odometry at twice the rate."""
-    fields = [
-        T["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=kind, count=1)
-        for name, offset, kind in (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 16, 7), ("t", 20, 6))
-    ]
-
-    def header(ns: int) -> Any:
-        sec, nanosec = divmod(ns, 10**9) if stamped else (0, 0)
-        return T["std_msgs/msg/Header"](
-            stamp=T["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id="lidar"
-        )
-
-    with Writer(path, version=9, storage_plugin=storage) as bag:
-        clouds = [bag.add_connection(t, "sensor_msgs/msg/PointCloud2", typestore=STORE) for t in topics]
-        odometry = bag.add_connection("/odom", "geometry_msgs/msg/PoseStamped", typestore=STORE)
-        for i, ns in enumerate(stamps()):
-            table = np.zeros(300, dtype=[("xyz", "<f4", 3), ("pad", "<u4"), ("intensity", "<f4"), ("t", "<u4")])
-            table["xyz"], table["intensity"], table["t"] = cloud(i), 51.0, np.arange(300) * 300_000
-            table["xyz"][7] = np.nan  # a ray that hit nothing
-            data = np.frombuffer(table.tobytes(), dtype=np.uint8)
-            message = T["sensor_msgs/msg/PointCloud2"](
-                header=header(ns),
-                height=1,
-                width=300,
-                fields=fields,
-                is_bigendian=False,
-                point_step=24,
-                row_step=7200,
-                data=data[: len(data) - cut],
-                is_dense=False,
-            )
-            for connection in clouds:
-                bag.write(connection, ns + 5_000_000, STORE.serialize_cdr(message, message.__msgtype__))
-        for k in range(2 * N + 1):
-            pose = geometry.interpolate(trajectory()[0], trajectory()[1], k / 2 - 0.5)
-            message = T["geometry_msgs/msg/PoseStamped"](
-                header=header(START + 50_000_000 * (k - 1)),
-                pose=T["geometry_msgs/msg/Pose"](
-                    position=T["geometry_msgs/msg/Point"](*pose[:3, 3].tolist()),
-                    orientation=T["geometry_msgs/msg/Quaternion"](
-                        0.0, 0.0, float(np.sin(0.01 * (k / 2 - 0.5))), float(np.cos(0.01 * (k / 2 - 0.5)))
-                    ),
-                ),
-            )
-            bag.write(odometry, START + 50_000_000 * k, STORE.serialize_cdr(message, message.__msgtype__))
+    """A bag of PointCloud2 (x y z intensity, Ouster's t) with poses at twice the rate."""
+    bag = Recorder(path, storage)
+    for i, ns in enumerate(stamps()):
+        kinds = [*((axis, "<f4") for axis in "xyz"), ("pad", "<u4"), ("intensity", "<f4"), ("t", "<u4")]
+        table = np.zeros(300, dtype=kinds)
+        table["x"], table["y"], table["z"] = cloud(i).T
+        table["intensity"], table["t"] = 51.0, np.arange(300) * 300_000
+        table["x"][7] = np.nan  # a ray that hit nothing
+        for topic in topics:
+            bag.write(topic, CLOUD, ns + 5_000_000, bag.cloud_of(table, ns if stamped else 0, cut=cut))
+    for k in range(2 * N + 1):
+        pose = geometry.interpolate(trajectory()[0], trajectory()[1], k / 2 - 0.5)
+        ns = START + 50_000_000 * k
+        bag.pose("/odom", ns - 50_000_000 if stamped else 0, pose, ns)
+    bag.bag.close()
     return path
 
 
