@@ -254,7 +254,7 @@ def demo(
     f1 = evaluation.result.cases[CASE].strict.macro_f1
     console.print(
         f"  in all {story.deleted} points deleted, {story.added} added; "
-        f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}"
+        f"{story.found} changed objects found, {len(story.objects.false_m2)} false; F1 {f1:.3f}"
     )
     console.print("\n[bold]Where to look[/]")
     place = escape(str(out))

@@ -45,8 +45,10 @@ from mapvote_lab.simulation.processes import processes
 
 SCANS = 120
 """Of the drive, at most: the demo is to take a minute."""
-SEED, EACH = 1, 2
-"""Places of the new bodies, and how many there are of each kind."""
+EACH = 2
+"""New bodies of each kind."""
+SEED = 2
+"""Of the simulated street, and of the places of new bodies. Not the seed that the method was developed on (1)."""
 MISSED = "#f2c230"
 
 
@@ -175,8 +177,6 @@ def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tupl
 
 
 SCENARIO, FULL_SCENARIO = "corner", "street"
-SEED = 2
-"""Not the seed that the method was developed on (1)."""
 
 
 def demo(

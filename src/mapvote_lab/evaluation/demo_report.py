@@ -22,7 +22,7 @@ from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import MOVER, ChangedArea, areas_of
 from mapvote_lab.evaluation.reporting.tables import ReportSection, case_name, page, tables
 from mapvote_lab.evaluation.results import EvaluationResult
-from mapvote_lab.evaluation.scores import PAPER_F1, same_rows
+from mapvote_lab.evaluation.scores import PAPER_F1, ObjectScores, same_rows
 
 CASE = "surfaces"
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""
@@ -38,17 +38,17 @@ class Story:
     added: int
     areas: list[tuple[ChangedArea, int, int]]
     """Area, points deleted, points added there."""
-    found: int
-    objects: int
-    false_objects: int
-    version: int
-    """Of the map that the server published."""
-    held: str
-    """The server's reason to wait for an operator; "" if it had none."""
+    objects: ObjectScores
+    published: PublishedRound
     drives_bytes: int
     """Bytes of the drives, ballots and the server's store."""
     kept: bool
     """Whether they stay on disk."""
+
+    @property
+    def found(self) -> str:
+        """How many of the changed objects."""
+        return f"{sum(self.objects.found)} of {len(self.objects.found)}"
 
 
 def tell(evaluation: Evaluation, done: PublishedRound, *, drives_bytes: int, kept: bool) -> Story:
@@ -62,18 +62,7 @@ def tell(evaluation: Evaluation, done: PublishedRound, *, drives_bytes: int, kep
 
     areas = [(area, inside(deleted, area), inside(added, area)) for area in areas_of(evaluation)]
     objects = evaluation.result.cases[CASE].objects
-    return Story(
-        len(deleted),
-        len(added),
-        areas,
-        sum(objects.found),
-        len(objects.found),
-        len(objects.false_m2),
-        done.version,
-        done.held,
-        drives_bytes,
-        kept,
-    )
+    return Story(len(deleted), len(added), areas, objects, done, drives_bytes, kept)
 
 
 def report_page(
@@ -111,7 +100,7 @@ def report_page(
     built = sum(area.objects for area, _, _ in story.areas if area.kind == "built")
     lead = (
         f"{built} built and {sum(a.objects for a, _, _ in story.areas) - built} demolished buildings; "
-        f"the vote found {story.found} of the {story.objects} changed objects that its vehicles could see."
+        f"the vote found {story.found} changed objects that its vehicles could see."
     )
     return page(title, lead, _facts(evaluation.result, story), sections)
 
@@ -119,8 +108,8 @@ def report_page(
 def _facts(result: EvaluationResult, story: Story) -> list[tuple[str, str]]:
     error = np.median([place.median_m for place in result.localisation.values()])
     return [
-        (f"{story.found} of {story.objects}", "changed objects found"),
-        (str(story.false_objects), "changes of 1 m² or more where nothing changed"),
+        (story.found, "changed objects found"),
+        (str(len(story.objects.false_m2)), "changes of 1 m² or more where nothing changed"),
         (f"{story.deleted:,}", "points deleted from the map"),
         (f"{story.added:,}", "points added to it"),
         (f"{100 * error:.1f} cm", "median localisation error"),
@@ -145,13 +134,14 @@ def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSec
 
 
 def _what_the_server_decided(story: Story, pictures: list[Picture]) -> ReportSection:
+    held = story.published.held
     return ReportSection(
         "What the server decided",
         [
             "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
-            f"version {story.version} of the map, which the vehicles then download. Undetermined and never seen "
-            "cells keep what the map has.",
-            *([f"It held the version first, for an operator to look: {story.held}"] if story.held else []),
+            f"version {story.published.version} of the map, which the vehicles then download. Undetermined and never "
+            "seen cells keep what the map has.",
+            *([f"It held the version first, for an operator to look: {held}"] if held else []),
         ],
         pictures,
     )

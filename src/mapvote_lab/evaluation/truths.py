@@ -69,6 +69,11 @@ class Truth:
     objects: tuple[dict[str, Any], ...]
     """``kind`` "built" or "demolished", ``footprint`` [[x, y], ..], ``height_m``."""
 
+    @property
+    def grid(self) -> Grid:
+        """Its cells, on a lattice of their own."""
+        return Grid(Lattice(self.x0, self.y0), 0, 0, *self.strict.shape)
+
     def grid_on(self, lattice: Lattice) -> Grid:
         """The truth's window on a map's lattice; MapvoteError if the two do not fall on the same cells."""
         row, col = (self.y0 - lattice.y0) / CELL_SIZE, (self.x0 - lattice.x0) / CELL_SIZE
@@ -100,10 +105,8 @@ class Truth:
         x1, y1 = np.roll(corners, -1, axis=0).T
         area = 0.5 * float(np.sum(corners[:, 0] * y1 - corners[:, 1] * x1))
         outward = np.column_stack([turn[:, 1], -turn[:, 0]]) * np.sign(area) / np.linalg.norm(turn, axis=1)[:, None]
-        rows, cols = self.strict.shape
-        x = self.x0 + (np.arange(cols) + 0.5) * CELL_SIZE
-        y = self.y0 + (np.arange(rows) + 0.5) * CELL_SIZE
-        inside = np.ones((rows, cols), dtype=np.bool_)
+        x, y = self.grid.centres()
+        inside = np.ones(self.strict.shape, dtype=np.bool_)
         for (cx, cy), (nx, ny) in zip(corners, outward, strict=True):
             inside &= (x[None, :] - cx) * nx + (y[:, None] - cy) * ny <= _AROUND_M
         return inside
@@ -204,7 +207,9 @@ def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
     changed = np.isin(cells, (_OCCUPIED, _EMPTY))
     near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), NEIGHBOURS)
     beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
-    return kept[_at(truth, kept, beside)], added, removed
+    rows, cols, inside = truth.grid.indices_of(kept)
+    inside[inside] = beside[rows[inside], cols[inside]]
+    return kept[inside], added, removed
 
 
 def _rims(truth: Truth, samples: F64) -> tuple[Bool, Bool]:
@@ -219,26 +224,11 @@ def _rims(truth: Truth, samples: F64) -> tuple[Bool, Bool]:
     return firm, near
 
 
-def _at(truth: Truth, samples: F64, plane: Bool) -> Bool:
-    """(n,) what ``plane`` (rows, cols) says at samples (n, 3); False outside it."""
-    r, c, inside = _indices(truth, samples)
-    out = np.zeros(len(samples), dtype=np.bool_)
-    out[inside] = plane[r[inside], c[inside]]
-    return out
-
-
 def _count(truth: Truth, samples: F64) -> I32:
     """(rows, cols) samples in each cell."""
-    r, c, inside = _indices(truth, samples)
+    r, c, inside = truth.grid.indices_of(samples)
     rows, cols = truth.strict.shape
     return np.bincount(r[inside] * cols + c[inside], minlength=rows * cols).reshape(rows, cols).astype(np.int32)
-
-
-def _indices(truth: Truth, samples: F64) -> tuple[I32, I32, Bool]:
-    c = np.floor((samples[:, 0] - truth.x0) / CELL_SIZE).astype(np.int32)
-    r = np.floor((samples[:, 1] - truth.y0) / CELL_SIZE).astype(np.int32)
-    rows, cols = truth.strict.shape
-    return r, c, (r >= 0) & (r < rows) & (c >= 0) & (c < cols)
 
 
 def ceiling(truth: Truth, cells: U8) -> Scores:

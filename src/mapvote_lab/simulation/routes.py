@@ -18,6 +18,27 @@ _FIRST_DRIVE_NS = 1_756_720_800 * _SECOND_NS
 """2025-09-01 10:00 UTC: the first survey."""
 
 
+PRIOR_MEMORY_S = 10.0
+"""Correlation time of errors of priors, long against the passing of a house."""
+
+
+def ar1(step_s: F64, sigma: F64, rng: np.random.Generator) -> F64:
+    """(n, k) first-order autoregressive errors ``step_s`` (n - 1,) apart, stationary with deviations ``sigma`` (k,)."""
+    kicks = rng.normal(size=(len(step_s) + 1, len(sigma))) * sigma
+    out = kicks.copy()
+    for i, memory in enumerate(np.exp(-step_s / PRIOR_MEMORY_S), 1):
+        out[i] = memory * out[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
+    return out
+
+
+def erring(T: F64, error: F64) -> F64:
+    """T (4, 4) moved by ``error`` (6,): metres along the map's axes, and roll, pitch, yaw about its own."""
+    out = T.copy()
+    out[:3, :3] = T[:3, :3] @ from_xyz_rpy(0, 0, 0, *error[3:])[:3, :3]
+    out[:3, 3] += error[:3]
+    return out
+
+
 @dataclass(frozen=True)
 class Route:
     """One drive through the street: a lane at an almost constant speed, swaying as vehicles do."""
@@ -70,18 +91,10 @@ class Route:
 
     def priors(self, rng: np.random.Generator) -> F64:
         """What the vehicle believes at the stamps, (scans, 4, 4): the truth with a smooth AR(1) error."""
-        memory = np.exp(-1.0 / self.rate_hz / 10.0)
         tilt = self.prior_sigma_deg if self.vehicle is None else 0.3 * self.prior_sigma_deg
         sigma = np.array([*[self.prior_sigma_m] * 3, *np.radians([tilt, tilt, self.prior_sigma_deg])])
-        kicks = rng.normal(size=(self.scans, 6)) * sigma
-        error = kicks.copy()
-        for i in range(1, self.scans):
-            error[i] = memory * error[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
-        T = self.poses(self.time_s)
-        for i, e in enumerate(error):
-            T[i, :3, :3] = T[i, :3, :3] @ from_xyz_rpy(0, 0, 0, *e[3:])[:3, :3]
-            T[i, :3, 3] += e[:3]
-        return T
+        errors = ar1(np.full(self.scans - 1, 1.0 / self.rate_hz), sigma, rng)
+        return np.array([erring(T, error) for T, error in zip(self.poses(self.time_s), errors, strict=True)])
 
 
 def make_routes(scenario: Scenario, terrain: Terrain, seed: int) -> list[Route]:

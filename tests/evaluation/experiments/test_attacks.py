@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.ballot import MOST_OFF_M, Ballot, decode, encode, unpack_points, unpack_states, unpack_words
+from mapvote.codec.ballot import (
+    MOST_OFF_M,
+    Ballot,
+    BallotTile,
+    decode,
+    encode,
+    unpack_points,
+    unpack_states,
+    unpack_words,
+)
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import NO_VOTE, CellState
+from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.offline import update_map
-from mapvote_lab.evaluation.experiments.conditions import (
-    ATTACKS,
-    SHIFT_CELLS,
-    all_changed,
-    false_points,
-    invert,
-    replayed,
-    shift,
-    stale,
-)
+from mapvote_lab.evaluation.experiments.conditions import ATTACKS
 
 TILE = (0, 0)
 STANDS, FREE, BUILT, GONE = (10, 10), (40, 40), (50, 50), (10, 12)
@@ -38,68 +38,59 @@ def honest(point_map: PointMap, vehicle: str) -> Ballot:
     return make_ballot(point_map, {TILE: say}, vehicle=vehicle)
 
 
-def states_of(ballot: Ballot) -> np.ndarray:
-    assert ballot.tiles[0].states is not None
-    return unpack_states(ballot.tiles[0].states)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ATTACKS)
-def test_a_lie_is_a_ballot_like_any_other(name: str) -> None:
+def lie(name: str) -> BallotTile:
+    """What vehicle v sends of the tile instead of its honest ballot; w is honest."""
     point_map = two_walls()
-    lie = ATTACKS[name](honest(point_map, "v3"), point_map, honest(point_map, "v1"))
-    assert lie.vehicle == "v3"
-    assert decode(encode(lie)) == lie
-    update_map(point_map, [honest(point_map, "v1"), lie], FuseSettings(min_votes=1))
+    ballot = ATTACKS[name](honest(point_map, "v"), point_map, honest(point_map, "w"))
+    assert ballot.vehicle == "v"
+    assert decode(encode(ballot)) == ballot
+    return ballot.tiles[0]
 
 
-def test_inverting_says_the_opposite_of_what_was_determined_and_nothing_elsewhere() -> None:
-    point_map = two_walls()
-    states = states_of(invert(honest(point_map, "v"), point_map, honest(point_map, "w")))
-    assert [states[cell] for cell in HONEST] == [3, 2, 1, 0, 4]
+def states_of(tile: BallotTile) -> U8:
+    assert tile.states is not None
+    return unpack_states(tile.states)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("inverting", [3, 2, 1, 0, 4]), ("replaying the old street", [0, 1, 1, 0, 4])]
+)
+def test_other_states_are_said_of_what_was_determined_and_nothing_elsewhere(name: str, said: list[int]) -> None:
+    states = states_of(lie(name))
+    assert [states[cell] for cell in HONEST] == said
     assert states[0, 0] == NO_VOTE
 
 
 def test_everything_changed_is_every_cell_of_the_tile() -> None:
-    point_map = two_walls()
-    states = states_of(all_changed(honest(point_map, "v"), point_map, honest(point_map, "w")))
+    states = states_of(lie("everything changed"))
     assert np.count_nonzero(states == CellState.CHANGED_EMPTY) == 3  # the wall's cells
     assert np.count_nonzero(states == CellState.CHANGED_OCCUPIED) == SHAPE[0] * SHAPE[1] - 3
-
-
-def test_an_old_street_knows_no_change() -> None:
-    point_map = two_walls()
-    states = states_of(stale(honest(point_map, "v"), point_map, honest(point_map, "w")))
-    assert [states[cell] for cell in HONEST] == [0, 1, 1, 0, 4]
 
 
 def test_a_replayed_ballot_is_the_other_vehicles_under_ones_own_name() -> None:
     point_map = two_walls()
     mine = make_ballot(point_map, {TILE: Say(states_plane())}, vehicle="liar", drive="d9")
-    copy = replayed(mine, point_map, honest(point_map, "v1"))
+    copy = ATTACKS["replaying another vehicle"](mine, point_map, honest(point_map, "v1"))
     assert (copy.vehicle, copy.drive) == ("liar", "d9")
     assert copy.tiles == honest(point_map, "v1").tiles
 
 
-def test_shifting_moves_states_masks_and_points_together() -> None:
-    point_map = two_walls()
-    tile = shift(honest(point_map, "v"), point_map, honest(point_map, "w")).tiles[0]
-    assert tile.states is not None
+@pytest.mark.parametrize(("name", "k"), [("shifting by 3 cells", 3), ("replaying another vehicle, moved by a cell", 1)])
+def test_shifting_moves_states_masks_and_points_together(name: str, k: int) -> None:
+    tile = lie(name)
     assert tile.gone is not None
     assert tile.new_points is not None
-    k = SHIFT_CELLS
-    assert unpack_states(tile.states)[BUILT[0] + k, BUILT[1] + k] == CellState.CHANGED_OCCUPIED
+    assert states_of(tile)[BUILT[0] + k, BUILT[1] + k] == CellState.CHANGED_OCCUPIED
     assert unpack_words(tile.gone, "gone")[GONE[0] + k, GONE[1] + k] == 0b1110
     moved = unpack_points(tile.new_points) - wall([BUILT], [0.45, 0.75, 1.05])
     np.testing.assert_allclose(moved, np.tile([0.3 * k, 0.3 * k, 0.0], (3, 1)), atol=MOST_OFF_M + 1e-4)
 
 
 def test_false_points_leave_the_states_right_and_delete_whole_columns() -> None:
-    point_map = two_walls()
-    tile = false_points(honest(point_map, "v"), point_map, honest(point_map, "w")).tiles[0]
+    tile = lie("right states, false points")
     assert tile.gone is not None
     assert tile.new_points is not None
-    np.testing.assert_array_equal(states_of(honest(point_map, "v")), unpack_states(tile.states or b""))
+    np.testing.assert_array_equal(states_of(tile), states_of(honest(two_walls(), "v").tiles[0]))
     assert unpack_words(tile.gone, "gone")[GONE] == ~np.uint64(0)
     assert len(unpack_points(tile.new_points)) == 5
 

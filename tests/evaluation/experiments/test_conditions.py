@@ -12,25 +12,18 @@ from mapvote.core.types import Drive, Registration, Scan
 from mapvote.formats import open_drive
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
-from mapvote_lab.evaluation.experiments.conditions import (
-    NOISE_MEMORY_S,
-    Conditions,
-    Shaken,
-    TrueMovers,
-    ar1,
-    with_true_ground,
-)
+from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import read_truth
 from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.routes import PRIOR_MEMORY_S, ar1
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.world import make_world
 
 
 def test_ar1_noise_has_its_deviation_and_its_memory() -> None:
-    stamps_ns = np.arange(200_000, dtype=np.int64) * 100_000_000
-    errors = ar1(stamps_ns, np.array([0.1, 2.0]), np.random.default_rng(5))
+    errors = ar1(np.full(199_999, 0.1), np.array([0.1, 2.0]), np.random.default_rng(5))
     np.testing.assert_allclose(errors.std(axis=0), [0.1, 2.0], rtol=0.05)
-    later = round(NOISE_MEMORY_S / 0.1)
+    later = round(PRIOR_MEMORY_S / 0.1)
     correlation = np.corrcoef(errors[:-later, 0], errors[later:, 0])[0, 1]
     assert correlation == pytest.approx(np.exp(-1.0), abs=0.05)
 

@@ -20,15 +20,11 @@ from mapvote_lab.evaluation.scores import (
     PAPER_F1,
     PAPER_SCORES,
     UNSCORED,
-    ByClass,
     MapJudge,
-    Scores,
     classes_of,
     confusion,
     determined_share,
-    harmonic_mean,
     map_obstacles,
-    ratio,
     same_rows,
     score_cells,
     score_objects,
@@ -196,19 +192,6 @@ def test_the_obstacles_of_a_map_are_its_points_above_the_ground_tile_by_tile() -
     points = map_obstacles(make_map({(0, 1): a, (0, 0): b}))
     np.testing.assert_allclose(points, [[1.05, 1.05, 1.05], [77.85, 1.05, 0.75]], atol=1e-5)
     assert map_obstacles(make_map({})).shape == (0, 3)
-
-
-def test_a_ratio_of_nothing_is_zero() -> None:
-    assert (ratio(3, 4), ratio(1, 0), ratio(0, 5)) == (0.75, 0.0, 0.0)
-    assert harmonic_mean(0.5, 1.0) == pytest.approx(2 / 3)
-    assert harmonic_mean(0.0, 0.0) == harmonic_mean(0.0, 1.0) == 0.0
-
-
-def test_the_macro_f1_is_the_mean_of_the_three() -> None:
-    scores = Scores.of(ByClass(1.0, 0.5, 0.2), ByClass(1.0, 1.0, 0.3))
-    assert tuple(scores.f1) == pytest.approx((1.0, 2 / 3, 0.24))
-    assert scores.macro_f1 == pytest.approx((1.0 + 2 / 3 + 0.24) / 3)
-    assert scores.kim_f1 == pytest.approx(2 * (1.7 / 3) * (2.3 / 3) / (4.0 / 3))
 
 
 def test_an_invention_two_cells_from_the_truth_is_none_and_three_cells_off_is_one() -> None:

@@ -28,7 +28,6 @@ from mapvote.codec.ballot import (
     unpack_sureness,
     unpack_words,
 )
-from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -39,11 +38,9 @@ from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Movers
 from mapvote_lab.evaluation.truths import Truth
+from mapvote_lab.simulation.routes import ar1, erring
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.world import make_world
-
-NOISE_MEMORY_S = 10.0
-"""Correlation time of the pose noise: as that of the simulator's priors, long against the passing of a house."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +71,7 @@ class Shaken:
     def __init__(self, localise: Localise, stamps_ns: I64, conditions: Conditions, seed: tuple[int, ...]) -> None:
         self._localise, self._told = localise, conditions.noise_told
         self._sigma = np.repeat([conditions.noise_m, float(np.radians(conditions.noise_deg))], 3)
-        errors = ar1(stamps_ns, self._sigma, np.random.default_rng(seed))
+        errors = ar1(1e-9 * np.diff(stamps_ns), self._sigma, np.random.default_rng(seed))
         self._error_at = {int(stamp): error for stamp, error in zip(stamps_ns, errors, strict=True)}
 
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
@@ -85,21 +82,9 @@ class Shaken:
 
     def _shake(self, fix: Fix) -> Fix:
         error = self._error_at[fix.scan.stamp_ns]
-        T_map_lidar = fix.registration.T_map_lidar.copy()
-        T_map_lidar[:3, :3] = T_map_lidar[:3, :3] @ from_xyz_rpy(0, 0, 0, *error[3:])[:3, :3]
-        T_map_lidar[:3, 3] += error[:3]
+        T_map_lidar = erring(fix.registration.T_map_lidar, error)
         covariance = fix.registration.covariance + (np.diag(self._sigma**2) if self._told else 0.0)
         return replace(fix, registration=replace(fix.registration, T_map_lidar=T_map_lidar, covariance=covariance))
-
-
-def ar1(stamps_ns: I64, sigma: F64, rng: np.random.Generator) -> F64:
-    """(n, k) errors at ``stamps_ns`` (n,), first-order autoregressive, stationary with deviations ``sigma`` (k,)."""
-    kicks = rng.normal(size=(len(stamps_ns), len(sigma))) * sigma
-    out = kicks.copy()
-    for i in range(1, len(stamps_ns)):
-        memory = np.exp(-1e-9 * float(stamps_ns[i] - stamps_ns[i - 1]) / NOISE_MEMORY_S)
-        out[i] = memory * out[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
-    return out
 
 
 class TrueMovers(Movers):
@@ -141,54 +126,30 @@ _ALL = ~np.uint64(0)
 Plane = TypeVar("Plane", U8, U64)
 
 
-def invert(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """Says of every cell that it determined the opposite: what stands is gone, what is free is built on, and back."""
-    return _relabelled(ballot, point_map, (3, 2, 1, 0, 4))
+def _all_changed(states: U8, occupied: Bool) -> U8:
+    """The whole map is gone, and all free ground is built on."""
+    return np.where(occupied, CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED).astype(np.uint8)
 
 
-def all_changed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """Says of every cell of its tiles that it changed: the whole map is gone, and all free ground built on."""
-
-    def lie(states: U8, occupied: Bool) -> U8:
-        return np.where(occupied, CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED).astype(np.uint8)
-
-    return _claim(ballot, point_map, lie)
-
-
-def stale(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """Replays a drive from before the change: everything is as the map has it."""
-    return _relabelled(ballot, point_map, (0, 1, 1, 0, 4))
-
-
-def replayed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """Sends another vehicle's ballot under its own name: that vehicle's errors get more votes."""
+def _replayed(ballot: Ballot, other: Ballot) -> Ballot:
+    """Another vehicle's ballot under this one's name: that vehicle's errors get more votes."""
     return msgspec.structs.replace(other, vehicle=ballot.vehicle, drive=ballot.drive)
 
 
-def jitter(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """As :func:`replayed`, all of it moved by a cell to the north-east so that nothing is the same."""
-    return _moved(replayed(ballot, point_map, other), 1)
-
-
-def shift(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """Everything :data:`SHIFT_CELLS` cells to the north-east of where it is, states, masks and points."""
-    return _moved(ballot, SHIFT_CELLS)
-
-
-def false_points(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """The right states, but new points that nobody measured, and masks that delete whole columns."""
-    return _claim(ballot, point_map, lambda states, occupied: states)
-
-
 ATTACKS: Mapping[str, Attack] = {
-    "inverting": invert,
-    "everything changed": all_changed,
-    "replaying the old street": stale,
-    "replaying another vehicle": replayed,
-    "replaying another vehicle, moved by a cell": jitter,
-    "shifting by 3 cells": shift,
-    "right states, false points": false_points,
+    # The opposite of what it determined: what stands is gone, what is free is built on, and back.
+    "inverting": lambda mine, point_map, other: _relabelled(mine, point_map, (3, 2, 1, 0, 4)),
+    "everything changed": lambda mine, point_map, other: _claim(mine, point_map, _all_changed),
+    # A drive from before the change: everything is as the map has it.
+    "replaying the old street": lambda mine, point_map, other: _relabelled(mine, point_map, (0, 1, 1, 0, 4)),
+    "replaying another vehicle": lambda mine, point_map, other: _replayed(mine, other),
+    # So that nothing is the same to the bit.
+    "replaying another vehicle, moved by a cell": lambda mine, point_map, other: _moved(_replayed(mine, other), 1),
+    "shifting by 3 cells": lambda mine, point_map, other: _moved(mine, SHIFT_CELLS),
+    # New points that nobody measured, and masks that delete whole columns.
+    "right states, false points": lambda mine, point_map, other: _claim(mine, point_map, lambda states, _: states),
 }
+"""What liars do, to the north-east where something moves."""
 
 
 def _relabelled(ballot: Ballot, point_map: PointMap, instead: Sequence[int]) -> Ballot:

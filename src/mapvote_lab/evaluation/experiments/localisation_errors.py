@@ -18,10 +18,10 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.experiments.conditions import ar1
 from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene
 from mapvote_lab.evaluation.results import MapShift, PoseErrors
 from mapvote_lab.evaluation.truths import Truth, error_summary, rigid_between
+from mapvote_lab.simulation.routes import ar1
 
 
 def map_shift(scene: Scene) -> MapShift:
@@ -98,7 +98,7 @@ def _with_rtk(scene: Scene, name: str) -> Drive:
     """The drive with a survey vehicle's prior. Its error is smooth, as the first survey's: white noise averages out."""
     rng = np.random.default_rng([scene.seed, *name.encode()])
     drive, sigma = scene.drive(name), np.array([_RTK_M] * 3 + [np.radians(_RTK_DEG)] * 3)
-    errors = ar1(drive.stamps_ns, sigma, rng)
+    errors = ar1(1e-9 * np.diff(drive.stamps_ns), sigma, rng)
     T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
     return replace(drive, T_map_lidar_prior=T, prior_sigma_m=_RTK_M, prior_sigma_deg=_RTK_DEG)
 

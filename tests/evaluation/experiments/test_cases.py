@@ -1,4 +1,4 @@
-"""Many voters in one pass say what each would say alone."""
+"""Many voters in one pass say what each would alone; how the paper is read; what cached results are named by."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Drive, Scan
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
-from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.scene import SharedPass
+from mapvote_lab.evaluation.experiments.cases import as_paper, choose_cases
+from mapvote_lab.evaluation.experiments.scene import (
+    _DRIVES_FROM,
+    _MAP_FROM,
+    BALLOTS_FROM,
+    SharedPass,
+    sources_digest,
+)
 
 N = 8
 POSES = np.array([from_xyz_rpy(20.0 + 0.2 * i, 20.0, 1.8) for i in range(N)])
@@ -67,3 +73,36 @@ def test_each_case_says_what_a_vehicle_of_its_own_would_have_said(street: PointM
         assert together.settings_hash == alone.settings_hash
         said.add(encode(together))
     assert len(said) == len(cases)
+
+
+def test_an_occluded_scan_abstains_by_default_and_the_map_of_the_papers_street_keeps_whatever_stood_still() -> None:
+    settings = as_paper(Settings(), "as_published")
+    assert settings.paper.occluded == "abstains"
+    assert not settings.mapping.drop_strays
+
+
+def test_on_every_other_street_the_settings_stay_as_they_are() -> None:
+    assert as_paper(Settings(), "street570") == Settings()
+    assert as_paper(Settings(), "street570", reading="n_min=3").paper.n_min == 3
+
+
+def test_what_the_user_set_stays() -> None:
+    told = as_paper(Settings(), "as_published", ["paper.n_min", "mapping.drop_strays", "fuse.min_votes"])
+    assert told == Settings()
+    read = as_paper(Settings(), "as_published", ["paper.n_min"], "occluded=votes")
+    assert read.paper.occluded == "votes"
+
+
+def test_a_reading_there_is_not_is_refused() -> None:
+    with pytest.raises(MapvoteError, match="occluded=abstains"):
+        as_paper(Settings(), "as_published", reading="hidden=no")
+
+
+@pytest.mark.parametrize("parts", [_DRIVES_FROM, _MAP_FROM, BALLOTS_FROM])
+def test_the_sources_that_a_cached_result_depends_on_exist(parts: tuple[str, ...]) -> None:
+    assert len(sources_digest(parts)) == 64
+
+
+def test_a_source_that_is_not_there_is_an_error() -> None:
+    with pytest.raises(FileNotFoundError, match="no_such_room"):
+        sources_digest(("core", "no_such_room"))

@@ -1,4 +1,4 @@
-"""What the doctor found is drawn: scans as read and as mended, with a map and without, and where nothing is known."""
+"""What a survey and the doctor found is drawn: the same picture each time, and whatever is not known."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,17 +9,20 @@ import pytest
 from mapvote.core.point_map import map_from_points
 from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import Diagnosis
-from mapvote.plots import draw_diagnosis
+from mapvote.plots import draw_diagnosis, draw_survey
+from mapvote.slam.build import BuildReport
+from mapvote.slam.pose_graph import DriveTrack
 from streets import drive_along, path
+
+POSES = path(10)
+DRIVE = drive_along(POSES, 1, POSES.copy())
 
 
 @pytest.fixture(scope="module")
 def diagnosis() -> Diagnosis:
-    poses = path(10)
-    drive = drive_along(poses, 1, poses.copy())
-    moved = poses.copy()
+    moved = POSES.copy()
     moved[:, 0, 3] += 3.0
-    return Diagnosis([Finding("error", "the prior is 3 m off", "move it")], drive, moved, poses)
+    return Diagnosis([Finding("error", "the prior is 3 m off", "move it")], DRIVE, moved, POSES)
 
 
 @pytest.mark.slow
@@ -38,3 +41,18 @@ def test_what_is_not_known_is_said(tmp_path: Path, diagnosis: Diagnosis) -> None
     for less in (unmended, replace(unmended, T_read=None), replace(unmended, drive=None)):
         draw_diagnosis(less, None, tmp_path / "x.png")
         assert (tmp_path / "x.png").stat().st_size > 1000
+
+
+REPORT = BuildReport((DriveTrack(DRIVE, POSES, np.arange(10) != 4, (5,), np.full(10, 0.3)),), 1, 0.0, None)
+
+
+def test_the_picture_of_a_survey_with_a_break_and_a_lost_scan_is_the_same_each_time(tmp_path: Path) -> None:
+    for name in ("one.png", "two.png"):
+        draw_survey([DRIVE], REPORT, tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_drive_without_priors_is_drawn_too(tmp_path: Path) -> None:
+    draw_survey([replace(DRIVE, T_map_lidar_prior=None)], REPORT, tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 1000
