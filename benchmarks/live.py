@@ -44,7 +44,7 @@ from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import from_cdr
 from mapvote.live.dds import Network
-from mapvote.live.drive import LiveDrive, OneMap, Waiting
+from mapvote.live.drive import LiveDrive, OneMap, WaitingScan
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import cloud_message, opened
 from mapvote.vehicle import Vehicle
@@ -295,7 +295,7 @@ def hours(drive_path: str, map_path: str, length_h: float) -> None:
     print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
     for scan, prior in long_drive(scans, drive.T_map_lidar_prior[part], step_ns, length_h):
         live.on_pose(scan.stamp_ns, prior)
-        live.on_scan(Waiting(scan.stamp_ns, time.time_ns(), lambda scan=scan: scan))
+        live.on_scan(WaitingScan(scan.stamp_ns, time.time_ns(), lambda scan=scan: scan))
         while live.step():
             pass
         n += 1

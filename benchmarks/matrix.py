@@ -27,14 +27,14 @@ from mapvote_lab.evaluation.experiments.cases import Case, choose_cases, fuse_ca
 from mapvote_lab.evaluation.experiments.conditions import ATTACKS, Conditions
 from mapvote_lab.evaluation.experiments.scene import Pass, Scene, have_voted, passes
 from mapvote_lab.evaluation.reporting.tables import Sheet
-from mapvote_lab.evaluation.results import Judgement, to_json
+from mapvote_lab.evaluation.results import CaseResult, to_json
 from mapvote_lab.evaluation.truths import Jury
 
 Round = tuple[str, int, Sequence[Ballot]]
 """Name, quorum and ballots that the server is given."""
 Rounds = Callable[[Sequence[Pass], Sequence[Case], PointMap], Iterator[Round]]
 FALSE_OBJECT_M2 = 2.0
-FIGURES: Mapping[str, Callable[[Judgement], float]] = {
+FIGURES: Mapping[str, Callable[[CaseResult], float]] = {
     "macro strict": lambda e: e.strict.macro_f1,
     "macro prov.": lambda e: e.provenance.macro_f1,
     "macro border": lambda e: e.also["border"].macro_f1,
@@ -108,7 +108,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
 """The most important first."""
 
 
-def measured(asked: argparse.Namespace, name: str, seed: int) -> dict[str, Judgement]:
+def measured(asked: argparse.Namespace, name: str, seed: int) -> dict[str, CaseResult]:
     """By round what came of an experiment on one seed; kept in OUT."""
     file = asked.out / f"{name.replace(' ', '_')}-{seed}.json"
     if not file.is_file():
@@ -118,15 +118,15 @@ def measured(asked: argparse.Namespace, name: str, seed: int) -> dict[str, Judge
         if not have_voted(scene, cases):
             scene.prepare()
         drives, jury = passes(scene, cases, 1), Jury(scene.point_map, scene.truth)
-        found: dict[str, Judgement] = {}
+        found: dict[str, CaseResult] = {}
         for of_round, quorum, ballots in experiment.rounds(drives, cases, scene.point_map):
             found[of_round] = jury.of_update(fuse_case(scene.point_map, ballots, quorum, settings.fuse, jury.window))
         with whole_file(file) as partial:
             partial.write_text(to_json(found))
-    return msgspec.json.decode(file.read_bytes(), type=dict[str, Judgement])
+    return msgspec.json.decode(file.read_bytes(), type=dict[str, CaseResult])
 
 
-def table(title: str, by_seed: Sequence[Mapping[str, Judgement]]) -> Sheet:
+def table(title: str, by_seed: Sequence[Mapping[str, CaseResult]]) -> Sheet:
     """A line for each round, "mean ± deviation (worst)" for each figure."""
     rows = []
     for of_round in by_seed[0]:

@@ -51,6 +51,17 @@ def test_every_page_is_reached_from_the_index_by_links() -> None:
     assert sorted(set((ROOT / "docs").rglob("*.md")) - reached) == []
 
 
+def test_every_benchmark_is_named_by_a_page_or_used_by_another() -> None:
+    """What no page cites measures for nobody."""
+    scripts = sorted((ROOT / "benchmarks").glob("*.py"))
+    texts = [page.read_text() for page in [*PAGES, *scripts]]
+    assert [
+        script.name
+        for script in scripts
+        if not any(re.search(rf"benchmarks/{script.name}|^(import|from) {script.stem} ?", text, re.M) for text in texts)
+    ] == []
+
+
 @pytest.mark.parametrize("door", ["vehicles", "operators", "compare"])
 def test_a_door_has_commands_output_a_picture_and_at_most_four_links(door: str) -> None:
     text = (ROOT / f"docs/{door}.md").read_text()

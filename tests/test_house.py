@@ -14,6 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src"
 SOURCES = sorted(SRC.rglob("*.py"))
+BENCHMARKS = ROOT / "benchmarks"
 COSTS = ROOT / "docs/measurements/kernels.md"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -182,6 +183,46 @@ def test_what_is_too_crowded_or_circular_is_found() -> None:
     assert not crowded(kernel)
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [{"b", "c"}]
     assert circles({"a": {"b"}, "b": set()}) == []
+
+
+def test_benchmarks_import_names_that_are_there() -> None:
+    """Nobody runs them all: a name that moved would be noticed months later."""
+    roots = {
+        SRC: SOURCES,
+        ROOT / "tests": sorted((ROOT / "tests").glob("*.py")),
+        BENCHMARKS: sorted(BENCHMARKS.glob("*.py")),
+    }
+    modules = {
+        ".".join(s.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): s
+        for root, sources in roots.items()
+        for s in sources
+    }
+    lost = [
+        f"{source.name}:{node.lineno} {node.module}.{alias.name}"
+        for source in roots[BENCHMARKS]
+        for node in ast.walk(parsed(source))
+        if isinstance(node, ast.ImportFrom) and node.module in modules
+        for alias in node.names
+        if f"{node.module}.{alias.name}" not in modules and alias.name not in named_in(modules[node.module])
+    ]
+    assert lost == []
+
+
+def named_in(source: Path) -> set[str]:
+    """What a module defines or imports at its top level, and what the table of a lazy package lists."""
+    found: set[str] = set()
+    for top in parsed(source).body:
+        if isinstance(top, Function | ast.ClassDef):
+            found.add(top.name)
+            continue
+        for node in ast.walk(top):
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                found.add(node.id)
+            elif isinstance(node, ast.Import | ast.ImportFrom):
+                found |= {alias.asname or alias.name for alias in node.names}
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+    return found
 
 
 def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:

@@ -18,6 +18,7 @@ from mapvote_lab.simulation.scenario import Flaws, load_scenario
 SENSOR = SENSORS["hdl32e"]
 NONE = Flaws(reflection_share=0, mixed_share=0, wet_share=0, glass_share=0, dark_share=0)
 WALL_X = 20.0
+FAST = {"speed_kmh": 100.0}
 
 
 def yard() -> tuple[Caster, Sweep, Hits]:
@@ -125,13 +126,15 @@ def test_wet_places_are_the_same_in_every_scan_and_others_with_another_seed() ->
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flawed") / "corner"
-    simulate("corner", out, seed=4, overrides={"surveys": ["east inner"], "vehicles": 1, "changes": [], "speed_kmh": 100.0})
+    simulate(
+        "corner", out, seed=4, overrides={"surveys": ["east inner"], "vehicles": 1, "changes": [], "speed_kmh": 100.0}
+    )
     return out
 
 
 def test_a_simulated_drive_has_reflections_below_the_road_by_default(corner: Path) -> None:
     """As KITTI's drives: .07 % of the points."""
-    stage = _stage(load_scenario("corner", {"speed_kmh": 100.0}), 4)
+    stage = _stage(load_scenario("corner", FAST), 4)
     below, points = 0, 0
     for i in range(0, 13, 3):
         scan = np.fromfile(corner / f"survey_1/velodyne/{i:06d}.bin", "<f4").reshape(-1, 4)[:, :3].astype(np.float64)

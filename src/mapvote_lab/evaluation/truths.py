@@ -349,11 +349,11 @@ class Jury:
             bytes_per_vehicle=[],
         )
 
-    def of_update(self, outcome: CaseOutcome, sizes: list[int], state_sizes: list[int]) -> CaseResult:
+    def of_update(self, outcome: CaseOutcome, sizes: Sequence[int] = (), state_sizes: Sequence[int] = ()) -> CaseResult:
         """The same, what became of the map's points, and the bytes of each ballot and of its votes alone."""
         points = self.points.score(map_obstacles(outcome.updated))
         judged = self.of_states(outcome.states, outcome.vehicle_states, points)
-        return replace(judged, bytes_per_vehicle=sizes, state_bytes_per_vehicle=state_sizes)
+        return replace(judged, bytes_per_vehicle=list(sizes), state_bytes_per_vehicle=list(state_sizes))
 
     def ceilings(self) -> dict[str, Scores]:
         """By truth: what perfect labels on every measured point would score (evaluation/truths.py)."""
