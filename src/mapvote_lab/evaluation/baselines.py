@@ -29,11 +29,10 @@ from mapvote.core.voxels import voxel_downsample
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Observation
-from mapvote_lab.evaluation.experiments.cases import paper_cases
+from mapvote_lab.evaluation.experiments.cases import Progress, paper_cases, untold
 from mapvote_lab.evaluation.experiments.scene import (
     BALLOTS_FROM,
     Pass,
-    Progress,
     Scene,
     SharedPass,
     key_of,
@@ -293,15 +292,14 @@ class NearestNeighbour:
 
 
 def yardsticks(
-    scene: Scene, drives: Sequence[Pass], workers: int, progress: Progress | None = None
+    scene: Scene, drives: Sequence[Pass], workers: int, progress: Progress = untold
 ) -> tuple[dict[str, tuple[U8, list[U8]]], dict[str, Cost]]:
     """(by yardstick the states that it decides and those of each vehicle, over the truth's window; the cost of each
     method, the paper's own grid first). Passes are cached like ballots."""
     tasks = [
         (scene, drive.vehicle, drive.T_map_lidar) for drive in drives if not _folder(scene, drive.vehicle).exists()
     ]
-    if progress:
-        progress("yardsticks", 0, len(tasks))
+    progress("yardsticks", 0, len(tasks))
     with processes(workers) if workers > 1 and len(tasks) > 1 else nullcontext() as pool:
         list(pool.map(_measure, tasks) if pool else map(_measure, tasks))
     folders = [_folder(scene, drive.vehicle) for drive in drives]

@@ -32,9 +32,9 @@ from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, vote_by_http
 from mapvote_lab.evaluation.experiments import real_bench
-from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.cases import Progress, choose_cases, untold
 from mapvote_lab.evaluation.experiments.real_street import RealRun, Street, lay_street
-from mapvote_lab.evaluation.experiments.scene import Progress, Scene
+from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import gallery
 from mapvote_lab.evaluation.reporting.real_report import draw_things
@@ -184,7 +184,7 @@ def demo(
     *,
     full: bool = False,
     keep: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = untold,
     show: Callable[[Path], None] | None = None,
 ) -> tuple[Evaluation, Story]:
     """Simulate, build, let three vehicles vote, update, evaluate; everything into ``out``.
@@ -207,8 +207,7 @@ def demo(
             compiled.result()
     evaluation = evaluate(scene, cases, progress=progress)
     give_back_free_pages()
-    if progress:
-        progress("server and pictures", 0, 1)
+    progress("server and pictures", 0, 1)
     write_map(evaluation.first_map, out / "map_before")
     ballots = [drive.ballots[CASE] for drive in evaluation.drives]
     with ThreadPoolExecutor(1) as waiting:
@@ -228,8 +227,7 @@ def demo(
     write_text(report_page(evaluation, story, pictures, out, areas), out / "report.html")
     if not keep:
         shutil.rmtree(work)
-    if progress:
-        progress("server and pictures", 1, 1)
+    progress("server and pictures", 1, 1)
     return evaluation, story
 
 

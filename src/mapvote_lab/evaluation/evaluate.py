@@ -22,7 +22,7 @@ from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation.baselines import yardsticks
-from mapvote_lab.evaluation.experiments.cases import Case, fuse_case, read_kept, swept
+from mapvote_lab.evaluation.experiments.cases import Case, Progress, fuse_case, read_kept, swept, untold
 from mapvote_lab.evaluation.experiments.localisation_errors import (
     T_map_world_of,
     in_changed_areas,
@@ -30,7 +30,7 @@ from mapvote_lab.evaluation.experiments.localisation_errors import (
     map_shift,
     survey_anew,
 )
-from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene, pass_folder, passes
+from mapvote_lab.evaluation.experiments.scene import Pass, Scene, pass_folder, passes
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scores import Scores
 from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth
@@ -118,7 +118,7 @@ def evaluate(
     scene: Scene,
     cases: Sequence[Case],
     with_yardsticks: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = untold,
     readings: str | None = None,
 ) -> Evaluation:
     """Run what the cache lacks, decide and score every case. Two processes where there are two cores.
@@ -171,7 +171,7 @@ def evaluate(
 
 
 def _readings(
-    scene: Scene, cases: Sequence[Case], jury: Jury, only: str, progress: Progress | None
+    scene: Scene, cases: Sequence[Case], jury: Jury, only: str, progress: Progress
 ) -> dict[str, dict[str, dict[str, Scores]]]:
     """Scores by reading, case and truth, from what the scans of the vehicles' drives said."""
     kept = [read_kept(pass_folder(scene, cases, name, True)) for name in scene.drive_names("v")]
@@ -185,21 +185,19 @@ def _best(scene: Scene, cases: Sequence[Case]) -> str:
 
 
 def _scored(
-    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress | None
+    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress
 ) -> tuple[dict[str, CaseOutcome], dict[str, CaseResult]]:
     """By case: what the server makes of its ballots, and the scores."""
     outcomes: dict[str, CaseOutcome] = {}
     entries: dict[str, CaseResult] = {}
     for i, case in enumerate(cases):
-        if progress:
-            progress("scoring", i, len(cases))
+        progress("scoring", i, len(cases))
         ballots = [drive.ballots[case.name] for drive in drives]
         outcome = fuse_case(scene.point_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
         outcomes[case.name] = outcome
         sizes = [drive.sizes[case.name] for drive in drives]
         entries[case.name] = jury.of_update(outcome, sizes, [_state_bytes(ballot) for ballot in ballots])
-    if progress:
-        progress("scoring", len(cases), len(cases))
+    progress("scoring", len(cases), len(cases))
     return outcomes, entries
 
 

@@ -35,6 +35,14 @@ from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.scores import Scores, score_cells
 from mapvote_lab.evaluation.truths import CaseOutcome, lay_on
 
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being done, done, in all)."""
+
+
+def untold(what: str, done: int, total: int) -> None:
+    """A progress of which nobody wants to know."""
+
+
 OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
     "": {},
     " farthest_return": {"line_of_sight": "farthest"},
@@ -249,7 +257,7 @@ def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) ->
 
 def swept(
     drives: Sequence[KeptDrive], mapped: Bool, settings: Settings, truths: Mapping[str, U8],
-    only: str | None = None, progress: Callable[[str, int, int], None] | None = None,
+    only: str | None = None, progress: Progress = untold,
 ) -> dict[str, dict[str, dict[str, Scores]]]:  # fmt: skip
     """Scores by reading, case and truth: as ``settings`` read the paper, and one sentence at a time read otherwise.
 
@@ -258,14 +266,12 @@ def swept(
     readings = readings_of(settings.paper, only)
     out: dict[str, dict[str, dict[str, Scores]]] = {}
     for k, (name, paper) in enumerate(readings.items()):
-        if progress:
-            progress("reading the paper", k, len(readings))
+        progress("reading the paper", k, len(readings))
         every = paper_cases(settings.model_copy(update={"paper": paper}))
         states = decided(drives, mapped, [every[number] for number in "12345"])
         out[name] = {
             number: {truth: score_cells(server, cells) for truth, cells in truths.items()}
             for number, (server, _) in states.items()
         }
-    if progress:
-        progress("reading the paper", len(readings), len(readings))
+    progress("reading the paper", len(readings), len(readings))
     return out

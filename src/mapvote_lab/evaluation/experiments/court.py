@@ -10,7 +10,7 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -32,7 +32,7 @@ from mapvote.formats import read_map
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
-from mapvote_lab.evaluation.experiments.cases import Case
+from mapvote_lab.evaluation.experiments.cases import Case, Progress
 from mapvote_lab.evaluation.reporting.tables import Sheet
 from mapvote_lab.evaluation.scores import cells_with, map_obstacles, pieces
 
@@ -57,7 +57,6 @@ _MARGIN_M = 1.0
 _FAR_M = 0.6
 FALSE_M2 = 2.0
 _ENDED_NS = 1_700_000_000_000_000_000
-Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,7 @@ class Court:
         return cls(read_map(folder / "gtmap.pcd"), {name: read_map(folder / f"{name}.pcd") for name in SESSIONS})
 
 
-def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell: Tell) -> list[CourtScore]:
+def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell: Progress) -> list[CourtScore]:
     """Scores of every case on cast scans, of the sessions' clouds as ballots, of one of them alone, and of plain
     distances between clouds."""
     surfaces = choose_case(settings, "surfaces")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene
+from mapvote_lab.evaluation.experiments.cases import Progress, untold
+from mapvote_lab.evaluation.experiments.scene import Pass, Scene
 from mapvote_lab.evaluation.results import MapShift, PoseErrors
 from mapvote_lab.evaluation.truths import Truth, error_summary, rigid_between
 from mapvote_lab.simulation.routes import ar1
@@ -79,17 +81,17 @@ def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> 
     return out
 
 
-def survey_anew(scene: Scene, without: str, progress: Progress | None = None) -> tuple[PointMap, F64]:
+def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tuple[PointMap, F64]:
     """A map of today's street by our own SLAM from the drives of all vehicles but one, given a survey vehicle's RTK,
     and T_map_world: the truth's frame in its own."""
     folder = scene.work / f"surveyed-anew-without-{without}"
     names = [name for name in scene.drive_names("v") if name != without]
     if not folder.exists():
-        told = (lambda done, total: progress("surveying anew", done, total)) if progress else None
-        point_map, report = build_map([_with_rtk(scene, name) for name in names], scene.settings, progress=told)
-        with whole_folder(folder, sign="poses.npy") as partial:
-            write_map(point_map, partial / "map")
-            np.save(partial / "poses.npy", np.concatenate([track.T_map_lidar for track in report.tracks]))
+        drives, told = [_with_rtk(scene, name) for name in names], partial(progress, "surveying anew")
+        point_map, report = build_map(drives, scene.settings, progress=told)
+        with whole_folder(folder, sign="poses.npy") as made:
+            write_map(point_map, made / "map")
+            np.save(made / "poses.npy", np.concatenate([track.T_map_lidar for track in report.tracks]))
     truth = np.concatenate([scene.true_poses(name) for name in names])
     return read_map(folder / "map"), rigid_between(np.load(folder / "poses.npy"), truth)
 

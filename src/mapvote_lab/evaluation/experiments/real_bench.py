@@ -21,7 +21,7 @@ from mapvote.core.voxels import VoxelCloud
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
 from mapvote_lab.evaluation.experiments import sensing
-from mapvote_lab.evaluation.experiments.cases import Case
+from mapvote_lab.evaluation.experiments.cases import Case, Progress
 from mapvote_lab.evaluation.experiments.cast_things import Site, Thing, with_things
 from mapvote_lab.evaluation.experiments.real_street import (
     Edit,
@@ -210,8 +210,6 @@ PRIORS: Mapping[str, Edit] = {
     "drifting by 5 m": sensing.drifting(5.0),
     "of another street": sensing.of_another_street(),
 }
-Tell = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +273,7 @@ def bench(
     folder: Path,
     settings: Settings,
     cases: Sequence[Case],
-    tell: Tell,
+    tell: Progress,
     *,
     scans: str | None = None,
     seed: int = 1,

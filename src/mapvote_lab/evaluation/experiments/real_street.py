@@ -110,7 +110,6 @@ class RealRun:
     reports: Sequence[DriveReport]
     error_m: F64
     """Of every scan that was localised, against the reference in the map's frame."""
-    error_deg: F64
     prior_error_m: F64
     scans: int
 
@@ -177,7 +176,7 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
     """Three vehicles drive the street's other blocks; every case is decided."""
     recording, movers = edit(street.recording), street.movers.copy()
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
-    reports, metres, degrees, prior_metres = [], [], [], []
+    reports, metres, prior_metres = [], [], []
     for k, scans in enumerate(street.voting):
         drive = part_of(recording, scans, f"v{k + 1}")
         T_true = street.T_map_lidar[scans]
@@ -191,16 +190,14 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
         if len(there):  # who never found himself sends no ballot
             for case in cases:
                 ballots[case.name].append(vehicle.ballot(case))
-            off_m, off_rad = pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])
-            metres.append(off_m)
-            degrees.append(np.degrees(off_rad))
+            metres.append(pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])[0])
         if drive.T_map_lidar_prior is not None:
             prior_metres.append(pose_errors(drive.T_map_lidar_prior, T_true)[0])
     states = {case.name: _decided(street, ballots[case.name], case) for case in cases}
     near_movers = ndimage.binary_dilation(movers, NEIGHBOURS)
-    off_m, off_deg, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, degrees, prior_metres))
+    off_m, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, prior_metres))
     total = sum(report.scans for report in reports)
-    return RealRun(street, states, near_movers, reports, off_m, off_deg, prior_m, total)
+    return RealRun(street, states, near_movers, reports, off_m, prior_m, total)
 
 
 def _decided(street: Street, ballots: list[Ballot], case: Case) -> U8:

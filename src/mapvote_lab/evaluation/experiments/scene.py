@@ -14,11 +14,11 @@ import inspect
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -46,15 +46,12 @@ from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observati
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.experiments.cases import Case, Keeper, Rule, counting_rule
+from mapvote_lab.evaluation.experiments.cases import Case, Keeper, Progress, Rule, counting_rule, untold
 from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
 from mapvote_lab.simulation.scenario import load_scenario
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, done, in all)."""
 
 _DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/kitti.py")
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
@@ -95,8 +92,6 @@ class Scene:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     conditions: Conditions = field(default_factory=Conditions)
     """What the drives are put through besides; see there."""
-    map_name: str = "map"
-    """The folder in ``work`` of the map that is voted on: the first map, or one that was made of it."""
 
     @property
     def folder(self) -> Path:
@@ -113,23 +108,22 @@ class Scene:
         key = key_of(sources_digest(_MAP_FROM), *settings, c.scans, c.true_poses, c.true_ground)
         return self.folder.with_name(f"{self.folder.name}-made") / key
 
-    def simulate(self, progress: Progress | None = None) -> None:
+    def simulate(self, progress: Progress = untold) -> None:
         """Simulate the drives, unless the cache holds them."""
         if not self.folder.exists():
-            told = (lambda done, total: progress("simulating", done, total)) if progress else None
-            partial = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
-            simulate(self.scenario, partial, self.seed, progress=told, overrides=self.overrides)
-            os.replace(partial, self.folder) if not self.folder.exists() else shutil.rmtree(partial)
+            made = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
+            told = partial(progress, "simulating")
+            simulate(self.scenario, made, self.seed, progress=told, overrides=self.overrides)
+            os.replace(made, self.folder) if not self.folder.exists() else shutil.rmtree(made)
 
-    def prepare(self, progress: Progress | None = None) -> None:
+    def prepare(self, progress: Progress = untold) -> None:
         """Simulate the drives and build the first map, unless the cache holds them."""
         self.simulate(progress)
         if not (self.work / "map").exists():
-            told = (lambda done, total: progress("mapping", done, total)) if progress else None
             surveys = [self.drive(name) for name in self.drive_names("survey_")]
-            point_map, report = build_map(surveys, self.settings, progress=told)
+            point_map, report = build_map(surveys, self.settings, progress=partial(progress, "mapping"))
             for track in report.tracks:
-                with whole_file(self.work / f"{track.vehicle}.npy") as partial, partial.open("wb") as file:
+                with whole_file(self.work / f"{track.vehicle}.npy") as written, written.open("wb") as file:
                     np.save(file, track.T_map_lidar)
             if self.conditions.true_ground:
                 point_map = with_true_ground(point_map, self.scenario, self.seed, self.overrides)
@@ -161,7 +155,7 @@ class Scene:
     @property
     def point_map(self) -> PointMap:
         """The map that is voted on."""
-        return read_map(self.work / self.map_name)
+        return read_map(self.work / "map")
 
     def survey_poses(self, name: str) -> F64:
         """(n, 4, 4) where the SLAM believes the survey vehicle was."""
@@ -253,30 +247,27 @@ class Pass:
     """Median milliseconds a scan by stage."""
 
 
-def have_voted(scene: Scene, cases: Sequence[Case], who: str = "v") -> bool:
-    """Whether the cache holds the first map and every ballot of the drives called ``who``...: no scan is needed."""
+def have_voted(scene: Scene, cases: Sequence[Case]) -> bool:
+    """Whether the cache holds the first map and every ballot: no scan is needed."""
     if not (scene.work / "map").exists():
         return False
-    return all(pass_folder(scene, cases, name).exists() for name in scene.drive_names(who))
+    return all(pass_folder(scene, cases, name).exists() for name in scene.drive_names("v"))
 
 
 def passes(
-    scene: Scene, cases: Sequence[Case], workers: int, progress: Progress | None = None, who: str = "v",
-    keep: bool = False,
+    scene: Scene, cases: Sequence[Case], workers: int, progress: Progress = untold, keep: bool = False
 ) -> list[Pass]:  # fmt: skip
-    """The passes of all drives called ``who``..., in order of their numbers; those that the cache lacks are driven.
+    """The passes of all voting vehicles, in order of their numbers; those that the cache lacks are driven.
 
     The first is driven in this process, the others in ``workers`` - 1 further ones. ``keep``: what each scan says is
     kept too.
     """
-    names = scene.drive_names(who)
+    names = scene.drive_names("v")
     missing = [name for name in names if not pass_folder(scene, cases, name, keep).exists()]
     done = count(len(names) - len(missing))
 
     def tell() -> None:
-        finished = next(done)
-        if progress:
-            progress("voting", finished, len(names))
+        progress("voting", next(done), len(names))
 
     tell()
     shared = workers > 1 and len(missing) > 1
@@ -293,7 +284,7 @@ def passes(
 
 def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str, keep: bool = False) -> Path:
     """Where a vehicle's ballots lie in the cache."""
-    made_by = sources_digest(BALLOTS_FROM), scene.conditions, scene.map_name
+    made_by = sources_digest(BALLOTS_FROM), scene.conditions
     votes_by = ((c.name, c.voting.model_dump_json(), c.paper.model_dump_json()) for c in cases)
     key = key_of(*made_by, *votes_by)
     return scene.work / f"{'kept' if keep else 'votes'}-{key}" / vehicle
