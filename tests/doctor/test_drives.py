@@ -164,7 +164,11 @@ def test_healthy_simulated_drives_and_those_of_kitti_raise_no_alarm(tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("numbers", "name"),
-    [(1 / 0.3048, "in feet"), (1 / 0.0254, "in inches"), (0.3048, "converted as if they were feet")],
+    [
+        (1 / 0.3048, "in feet"),
+        pytest.param(1 / 0.0254, "in inches", marks=pytest.mark.slow),
+        pytest.param(0.3048, "converted as if they were feet", marks=pytest.mark.slow),
+    ],
 )
 def test_of_a_map_that_is_not_in_metres_the_unit_is_named(sound: Recording, numbers: float, name: str) -> None:
     points = world()

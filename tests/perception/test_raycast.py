@@ -17,12 +17,13 @@ SIDE = 61
 """Cells of the small window: 18.3 m."""
 
 
-def flat_reference(ground: np.ndarray | None = None) -> Reference:
+def flat_reference(
+    ground: np.ndarray | None = None, side: int = SIDE, corner: tuple[float, float] = (0.05, -0.1)
+) -> Reference:
     """An empty map over a window of its own, with ground at ``ground`` (rows, cols) metres, 0 by default."""
-    grid = Grid(Lattice(0.05, -0.1), -30, -30, SIDE, SIDE)
+    grid = Grid(Lattice(*corner), -(side // 2), -(side // 2), side, side)
     ground_z = np.zeros(grid.shape, np.float32) if ground is None else ground.astype(np.float32)
-    empty = np.zeros(grid.shape, np.uint64)
-    none = np.full(grid.shape, np.inf, np.float32)
+    empty, none = np.zeros(grid.shape, np.uint64), np.full(grid.shape, np.inf, np.float32)
     base = np.floor(ground_z / CELL_SIZE).astype(np.int32)
     return Reference(grid, ground_z, base, empty, np.zeros(grid.shape, np.int32), none, -none, None)
 
@@ -130,12 +131,9 @@ def test_every_cell_of_the_window_up_to_its_rim_has_a_number_and_those_around_it
     assert (cell == -1).sum() == 4 * SIDE + 4
 
 
-def wide_reference(side: int = 301) -> Reference:
+def wide_reference() -> Reference:
     """Flat ground at 0 over a window of 45 m to each side."""
-    grid = Grid(Lattice(), -(side // 2), -(side // 2), side, side)
-    zero, empty = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.uint64)
-    none = np.full(grid.shape, np.inf, np.float32)
-    return Reference(grid, zero, zero.astype(np.int32), empty, np.zeros(grid.shape, np.int32), none, -none, None)
+    return flat_reference(side=301, corner=(0.0, 0.0))
 
 
 def along(fan: int, distance: np.ndarray) -> np.ndarray:
