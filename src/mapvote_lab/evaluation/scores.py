@@ -315,24 +315,13 @@ def _decided(
     return rows, cols, votes, against, odds
 
 
-PAPER_PRECISION: dict[str, tuple[float, float, float]] = {
-    "1": (0.996, 0.748, 0.550),
-    "2": (0.996, 0.787, 0.536),
-    "3": (0.996, 0.663, 0.556),
-    "4": (0.995, 0.768, 0.499),
-    "5": (0.996, 0.748, 0.645),
+PAPER_SCORES = {
+    "1": Scores.of(ByClass(0.996, 0.748, 0.550), ByClass(0.994, 0.998, 0.767)),
+    "2": Scores.of(ByClass(0.996, 0.787, 0.536), ByClass(0.994, 0.954, 0.767)),
+    "3": Scores.of(ByClass(0.996, 0.663, 0.556), ByClass(0.994, 0.987, 0.767)),
+    "4": Scores.of(ByClass(0.995, 0.768, 0.499), ByClass(0.993, 0.882, 0.767)),
+    "5": Scores.of(ByClass(0.996, 0.748, 0.645), ByClass(0.996, 0.998, 0.767)),
 }
-"""Table II: unchanged, changed (occupied), changed (empty)."""
-PAPER_RECALL: dict[str, tuple[float, float, float]] = {
-    "1": (0.994, 0.998, 0.767),
-    "2": (0.994, 0.954, 0.767),
-    "3": (0.994, 0.987, 0.767),
-    "4": (0.993, 0.882, 0.767),
-    "5": (0.996, 0.998, 0.767),
-}
-"""Table III."""
+"""By case: precision (Table II) and recall (Table III) as printed, and what follows from them."""
 PAPER_F1 = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
 """Table IV: the unweighted mean of the three classes' F1 (docs/method.md)."""
-PAPER_SCORES = {
-    case: Scores.of(ByClass(*PAPER_PRECISION[case]), ByClass(*PAPER_RECALL[case])) for case in PAPER_PRECISION
-}

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -18,7 +18,10 @@ from rich.text import Text
 
 from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.results import CaseResult, EvaluationResult
-from mapvote_lab.evaluation.scores import CLASSES, PAPER_F1, PAPER_PRECISION, PAPER_RECALL, ByClass, Scores, ratio
+from mapvote_lab.evaluation.scores import CLASSES, PAPER_F1, PAPER_SCORES, ByClass, Scores, ratio
+
+PAPER = "paper"
+"""Heading of a column of the paper's own figures, which is drawn faintly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +31,12 @@ class Sheet:
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
-    faint: str = ""
-    """Columns with this heading hold figures of others, such as the paper's, and are drawn faintly."""
 
     def to_rich(self) -> Table:
         """For the terminal."""
         table = Table(title=Text(self.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
         for i, heading in enumerate(self.headings):
-            style = "dim" if self.faint and heading == self.faint else None
+            style = "dim" if heading == PAPER else None
             table.add_column(Text(heading), justify="right" if i else "left", style=style, overflow="fold")
         for row in self.rows:
             table.add_row(*map(Text, row))
@@ -49,7 +50,7 @@ class Sheet:
 
     def to_html(self) -> str:
         """A table element that scrolls where it is too wide."""
-        kinds = [' class="dim"' if self.faint and heading == self.faint else "" for heading in self.headings]
+        kinds = [' class="dim"' if heading == PAPER else "" for heading in self.headings]
 
         def line(tag: str, cells: Iterable[str]) -> str:
             row = zip(kinds, cells, strict=True)
@@ -152,13 +153,15 @@ def _by_truth(entry: CaseResult) -> dict[str, Scores]:
     return {"strict": entry.strict, "provenance": entry.provenance, **entry.also}
 
 
-def _class_table(title: str, ours: Mapping[str, ByClass], printed: Mapping[str, tuple[float, ...]]) -> Sheet:
-    """A line a case, our figure and the paper's for each class."""
+def _class_table(title: str, scores: Mapping[str, Scores], of: Callable[[Scores], ByClass]) -> Sheet:
+    """A line a case, our figure and the paper's for each class; ``of``: which figures."""
     rows = []
-    for case, values in ours.items():
-        pairs = zip(values, printed.get(case, (None,) * len(CLASSES)), strict=True)
-        rows.append([case_name(case), *(_share(value) for pair in pairs for value in pair)])
-    return Sheet(title, ["", *(h for name in CLASSES for h in (HEADINGS[name], "paper"))], rows, faint="paper")
+    for case, ours in scores.items():
+        printed = of(PAPER_SCORES[case]) if case in PAPER_SCORES else (None,) * len(CLASSES)
+        rows.append(
+            [case_name(case), *(_share(value) for pair in zip(of(ours), printed, strict=True) for value in pair)]
+        )
+    return Sheet(title, ["", *(h for name in CLASSES for h in (HEADINGS[name], PAPER))], rows)
 
 
 def tables(result: EvaluationResult) -> Iterator[Sheet]:
@@ -166,9 +169,8 @@ def tables(result: EvaluationResult) -> Iterator[Sheet]:
     for, the map, the poses and the yardsticks' cost."""
     for truth in ("strict", "provenance"):
         scores = {case: _by_truth(entry)[truth] for case, entry in result.cases.items()}
-        precision, recall = ({c: s.precision for c, s in scores.items()}, {c: s.recall for c, s in scores.items()})
-        yield _class_table(f"Table II: precision ({truth} truth)", precision, PAPER_PRECISION)
-        yield _class_table(f"Table III: recall ({truth} truth)", recall, PAPER_RECALL)
+        yield _class_table(f"Table II: precision ({truth} truth)", scores, lambda s: s.precision)
+        yield _class_table(f"Table III: recall ({truth} truth)", scores, lambda s: s.recall)
     yield _f1_table(result)
     if result.readings:
         for truth in next(iter(next(iter(result.readings.values())).values())):
@@ -194,8 +196,8 @@ def _f1_table(result: EvaluationResult) -> Sheet:
         )
     perfect = [_share(scores.macro_f1) for scores in result.ceilings.values()]
     rows.append(["perfect labels", *perfect, "", "", "", ""])
-    headings = ["", *result.ceilings, "paper", "Kim's F1, strict", "coverage", "kB a ballot"]
-    return Sheet("Table IV: F1, mean of the three classes; coverage; upload", headings, rows, faint="paper")
+    headings = ["", *result.ceilings, PAPER, "Kim's F1, strict", "coverage", "kB a ballot"]
+    return Sheet("Table IV: F1, mean of the three classes; coverage; upload", headings, rows)
 
 
 def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str, occluded: str) -> Sheet:
