@@ -22,6 +22,7 @@ from types import FrameType
 
 import httpx2
 import numpy as np
+from msgspec.structs import replace as replaced
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -29,7 +30,7 @@ import mapvote
 from fusion import said
 from fusion import street as two_facades
 from hand_made import make_ballot, unpack_all
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import encode, pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import CellState
@@ -117,8 +118,9 @@ def tile(walk: Walk) -> None:
 def ask(walk: Walk, act: Callable[[httpx2.Client, bytes], httpx2.Response]) -> None:
     """A request to a store with two ballots, and a third at hand."""
     rng, point_map = np.random.default_rng(1), two_facades([(0, 0)])
+    way = pack_path([np.array([x, 3.0]) for x in range(0, 60, 6)], point_map.lattice)
     first, second, third = (
-        encode(make_ballot(point_map, {(0, 0): said(rng)}, vehicle, "d", end_ns=10**18 + i))
+        encode(replaced(make_ballot(point_map, {(0, 0): said(rng)}, vehicle, "d", end_ns=10**18 + i), path=way))
         for i, vehicle in enumerate("abc")
     )
     with tempfile.TemporaryDirectory() as folder:

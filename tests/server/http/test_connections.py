@@ -19,7 +19,7 @@ from mapvote.server.store.store import Store
 CONFIG = """
 [server]
 header_timeout_s = 1.0
-body_timeout_s = 2.0
+body_timeout_s = 8.0
 answer_timeout_s = 2.0
 connections = 12
 """
@@ -94,6 +94,7 @@ def test_a_lone_line_end_after_an_answer_does_not_hold_the_connection(line: sock
     assert time.monotonic() - start < PATIENT_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["PUT /v1/ballots/a/d1", "POST /v1/publish"])
 def test_a_stalled_body_is_cut(line: socket.socket, target: str) -> None:
     head = f"{target} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 100000\r\n\r\n{{"

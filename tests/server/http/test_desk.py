@@ -192,7 +192,7 @@ def test_a_publish_tells_how_far_it_is_and_can_be_cancelled(server: Server) -> N
                 while not running or not running[0]["of"]:
                     running = client.get("/v1/publish", headers=who["anna"]).json()["running"]
                     sleep(0.01)
-                assert running == [{"by": "boss", "dry_run": False, "done": 0, "of": 2}]
+                assert running == [{"by": "boss", "dry_run": False, "done": 0, "of": 2, "cancelled_by": None}]
                 assert client.delete("/v1/publish", headers=who["anna"]).status_code == 403, "reviewers only look"
                 assert client.delete("/v1/publish", headers=who["boss"]).json() == {"cancelled": 1}
             finally:

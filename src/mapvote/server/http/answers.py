@@ -13,6 +13,7 @@ import msgspec
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
+from mapvote.server.http.services import Progress
 from mapvote.server.store.integrity import Damage
 from mapvote.server.views.change_objects import Kind, Size
 from mapvote.server.views.consensus import VehicleStanding
@@ -86,19 +87,10 @@ class Published(Answer):
     held: list[str]
 
 
-class Running(Answer):
-    """The result of a publish or of a dry run."""
-
-    by: str
-    dry_run: bool
-    done: int = Field(description="tiles fused")
-    of: int
-
-
 class Publishes(Answer):
     """Those under way, oldest first."""
 
-    running: list[Running]
+    running: list[Progress]
 
 
 class Cancelled(Answer):
@@ -264,15 +256,6 @@ class Vehicles(Answer):
     """By name."""
 
     vehicles: list[VehicleStanding]
-
-
-class PolicyAnswer(Answer):
-    """The policy that holds."""
-
-    policy: dict[str, Any]
-    at_ns: int
-    by: str
-    reason: str
 
 
 class Info(Answer):

@@ -10,8 +10,7 @@ from mapvote.codec.arrays import compress
 from mapvote.codec.manifest import TileHashes
 from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.schemas import AS_CSV, Digest, From, Places, To, VersionQuery, as_json, as_table, problems
-from mapvote.server.http.security import reviewer
-from mapvote.server.http.services import services
+from mapvote.server.http.services import reviewer, services
 from mapvote.server.views.coverage import paths
 from mapvote.server.views.explain import evidence
 from mapvote.server.views.point_lod import N_LEVELS

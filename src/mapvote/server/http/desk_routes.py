@@ -6,18 +6,16 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
 from mapvote.server.http.answers import DeskAnswer, Pending, VerdictGiven
 from mapvote.server.http.cloud_routes import AS_BYTES, packed
-from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
-from mapvote.server.http.security import reviewer
-from mapvote.server.http.services import services
+from mapvote.server.http.schemas import AS_CSV, PLAIN, Ask, Places, as_json, as_table, problems
+from mapvote.server.http.services import reviewer, services
 from mapvote.server.store.reviews import undo
 from mapvote.server.views.desk import Desk, desk, review, verdict_of
 from mapvote.server.views.geojson import feature_rows
@@ -25,10 +23,9 @@ from mapvote.server.views.geojson import feature_rows
 router = APIRouter()
 
 
-class ReviewAsk(BaseModel):
+class ReviewAsk(Ask):
     """A verdict on one change."""
 
-    model_config = ConfigDict(extra="forbid")
     change: str = Field(max_length=100, pattern=PLAIN, description="id of a change on the desk")
     verdict: Literal["accepted", "held", "rejected"]
     comment: str = Field(default="", max_length=300, pattern=PLAIN)
@@ -78,8 +75,7 @@ async def _look(request: Request) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
     reviewer(request)
     parts = services(request)
-    look = partial(desk, parts.store, parts.fusing, parts.gate)
-    found = await to_thread.run_sync(look, limiter=parts.threads.deciding)
+    found = await parts.decide(desk, parts.store, parts.fusing, parts.gate)
     parts.clouds.propose(found.edited.values())
     return found
 
@@ -97,9 +93,9 @@ async def decide(request: Request, ask: ReviewAsk) -> VerdictGiven:
     409 if another reviewer decided meanwhile.
     """
     by, parts = reviewer(request), services(request)
-    said = partial(review, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
-    work = partial(said, parts.store, ask.change, ask.verdict)
-    return VerdictGiven(seq=await to_thread.run_sync(work, limiter=parts.threads.deciding))
+    given = parts.store, ask.change, ask.verdict
+    said = partial(review, *given, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
+    return VerdictGiven(seq=await parts.decide(said))
 
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")

@@ -20,8 +20,7 @@ from standardwebhooks import Webhook
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.schemas import problems
-from mapvote.server.http.security import sees_names
-from mapvote.server.http.services import Services, services
+from mapvote.server.http.services import Services, sees_names, services
 from mapvote.server.views.events import Event, newest_event, take, taken_up_to, without_names
 
 _EVERY_S = 1.0

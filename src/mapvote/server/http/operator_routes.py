@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Annotated, Literal, cast
 
 import structlog
-from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
 from prometheus_client import generate_latest
 
@@ -28,13 +26,11 @@ from mapvote.server.http.answers import (
     KeysAnswer,
     KeysRevoked,
     Log,
-    PolicyAnswer,
     Published,
     Publishes,
     Ready,
     Restored,
     RolledBack,
-    Running,
     Vehicles,
     Withdrawn,
 )
@@ -57,10 +53,10 @@ from mapvote.server.http.schemas import (
     as_table,
     problems,
 )
-from mapvote.server.http.security import operator, reviewer, sees_names
-from mapvote.server.http.services import Services, services
+from mapvote.server.http.services import Services, operator, reviewer, sees_names, services
 from mapvote.server.store import keys
 from mapvote.server.store.integrity import check, restore_plane, set_aside
+from mapvote.server.store.policy import PolicyChange
 from mapvote.server.store.publish import Outcome, preview, publish, rollback
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.replay import replay
@@ -81,15 +77,14 @@ router = APIRouter()
 async def publish_now(request: Request, ask: PublishAsk) -> Published:
     """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
     by, parts = operator(request), services(request)
-    return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.deciding)
+    return await parts.decide(_publish, parts, ask, by)
 
 
 @router.get("/v1/publish", responses=problems(403), summary="How far a publish is")
 async def publishing_now(request: Request) -> Publishes:
     """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
     reviewer(request)
-    rounds = services(request).publishing.now()
-    return Publishes(running=[Running(by=r.by, dry_run=r.dry_run, done=r.done, of=r.of) for r in rounds])
+    return Publishes(running=services(request).publishing.now())
 
 
 @router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
@@ -137,8 +132,8 @@ def _as_answer(done: Outcome) -> Published:
 async def roll_back(request: Request, ask: RollbackAsk) -> RolledBack:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
     by, parts = operator(request), services(request)
-    back = partial(rollback, parts.store, ask.to, by=by, reason=ask.reason)
-    return RolledBack(version=(await to_thread.run_sync(back, limiter=parts.threads.deciding)).number)
+    version = await parts.decide(rollback, parts.store, ask.to, by=by, reason=ask.reason)
+    return RolledBack(version=version.number)
 
 
 @router.get(
@@ -255,18 +250,18 @@ def _unless_stopping(parts: Services) -> Iterator[None]:
         raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
 
 
-@router.get("/v1/policy", response_model=PolicyAnswer, responses=problems(), summary="The policy")
+@router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
 def policy(request: Request) -> Response:
     """The policy in force, who set it and why."""
-    return as_json(services(request).store.policy_changes()[-1].as_json())
+    return as_json(services(request).store.policy_changes()[-1])
 
 
-@router.patch("/v1/policy", response_model=PolicyAnswer, responses=problems(403), summary="Change the policy")
+@router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
 def change_policy(request: Request, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
     by, store = operator(request), services(request).store
     store.change_policy(ask.values, by=by, reason=ask.reason)
-    return as_json(store.policy_changes()[-1].as_json())
+    return as_json(store.policy_changes()[-1])
 
 
 @router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
@@ -287,7 +282,7 @@ async def whole(request: Request) -> Response:
     """Reads the whole store and names what is damaged. Nothing is changed."""
     operator(request)
     parts = services(request)
-    found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.deciding)
+    found = await parts.decide(check, parts.store)
     return as_json({"damage": found})
 
 
@@ -295,7 +290,7 @@ async def whole(request: Request) -> Response:
 async def mend(request: Request) -> Response:
     """As GET; damaged items are also quarantined."""
     by, parts = operator(request), services(request)
-    found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
+    found = await parts.decide(check, parts.store, mend=True, by=by)
     return as_json({"damage": found})
 
 
@@ -304,8 +299,7 @@ async def restore(request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
     by, parts = operator(request), services(request)
     raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
-    work = partial(restore_plane, parts.store, digest, raw, by=by)
-    return Restored(restored=await to_thread.run_sync(work, limiter=parts.threads.deciding))
+    return Restored(restored=await parts.decide(restore_plane, parts.store, digest, raw, by=by))
 
 
 @router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
@@ -314,15 +308,14 @@ async def begin_anew(request: Request, everybody: bool) -> Withdrawn:
     by, parts = operator(request), services(request)
     if not everybody:
         raise MapvoteError("name a vehicle in the path, or say everybody=true")
-    work = partial(withdraw, parts.store, None, by=by)
-    return Withdrawn(withdrawn=await to_thread.run_sync(work, limiter=parts.threads.deciding))
+    return Withdrawn(withdrawn=await parts.decide(withdraw, parts.store, None, by=by))
 
 
 @router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
 async def replay_without(request: Request, ask: ReplayAsk) -> Published:
     """Every version again without its votes; the difference to the newest is one new version."""
     by, parts = operator(request), services(request)
-    return await to_thread.run_sync(_replay, parts, ask, by, limiter=parts.threads.deciding)
+    return await parts.decide(_replay, parts, ask, by)
 
 
 def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
@@ -334,17 +327,15 @@ def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
 async def clearable(request: Request) -> Response:
     """Old versions and ballots that POST would delete."""
     operator(request)
-    return await _cleared(services(request), partial(clear, dry_run=True))
+    parts = services(request)
+    return as_json(await parts.decide(clear, parts.store, dry_run=True))
 
 
 @router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
 async def clear_now(request: Request) -> Response:
     """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
-    return await _cleared(services(request), partial(clear, dry_run=False, by=operator(request)))
-
-
-async def _cleared(parts: Services, work: Callable[[Store], Cleared]) -> Response:
-    return as_json(await to_thread.run_sync(work, parts.store, limiter=parts.threads.deciding))
+    by, parts = operator(request), services(request)
+    return as_json(await parts.decide(clear, parts.store, dry_run=False, by=by))
 
 
 @router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")

@@ -47,63 +47,65 @@ Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
 MinCells = Annotated[int, Query(ge=1, le=100_000)]
 
 
-class PublishAsk(BaseModel):
-    """How to publish; an empty object publishes the standing ballots."""
+class Ask(BaseModel):
+    """A body; members that it does not name are refused."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+Reason = Annotated[str, Field(max_length=200, pattern=PLAIN)]
+
+
+class PublishAsk(Ask):
+    """How to publish; an empty object publishes the standing ballots."""
+
     dry_run: bool = False
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
     parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
-    reason: str = Field(default="", max_length=200, pattern=PLAIN)
+    reason: Reason = ""
 
 
-class ReplayAsk(BaseModel):
+class ReplayAsk(Ask):
     """Whose votes to take out of every version."""
 
-    model_config = ConfigDict(extra="forbid")
     vehicle: str = Field(max_length=64, pattern=PLAIN)
     dry_run: bool = Field(default=True, description="only say what would change; false publishes it")
 
 
-class PolicyAsk(BaseModel):
+class PolicyAsk(Ask):
     """Changes of the policy."""
 
-    model_config = ConfigDict(extra="forbid")
     values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
-    reason: str = Field(default="", max_length=200, pattern=PLAIN)
+    reason: Reason = ""
 
 
-class IssueAsk(BaseModel):
+class IssueAsk(Ask):
     """Whose key, and what it opens."""
 
-    model_config = ConfigDict(extra="forbid")
     name: str = Field(max_length=200, pattern=PLAIN, description="1-64 of letters, digits, dot, underscore, dash")
     role: str = Field(default="vehicle", max_length=20, description="vehicle, reader, reviewer or operator")
     days: float | None = Field(default=None, description="the key expires after so many days; null: never")
 
 
-class RotateAsk(BaseModel):
+class RotateAsk(Ask):
     """Whose key is replaced."""
 
-    model_config = ConfigDict(extra="forbid")
     name: str = Field(max_length=200, pattern=PLAIN)
     overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
 
 
-class RevokeAsk(BaseModel):
+class RevokeAsk(Ask):
     """Whose keys are revoked."""
 
-    model_config = ConfigDict(extra="forbid")
     name: str = Field(max_length=200, pattern=PLAIN)
     keep_votes: bool = Field(default=False, description="whether its standing ballots still count")
 
 
-class RollbackAsk(BaseModel):
+class RollbackAsk(Ask):
     """The version to go back to."""
 
-    model_config = ConfigDict(extra="forbid")
     to: int = Field(ge=LEAST, le=MOST)
-    reason: str = Field(default="", max_length=200, pattern=PLAIN)
+    reason: Reason = ""
 
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
@@ -117,7 +119,11 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
 def as_json(content: object) -> Response:
     """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
     all others."""
-    return Response(msgspec.json.encode(content), media_type="application/json")
+    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type="application/json")
+
+
+def _plain(model: Any) -> Any:
+    return model.model_dump(mode="json")
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> Response:

@@ -1,5 +1,4 @@
-"""The outermost layer of every request: host and origin, key, security headers, metrics, one log line; and what a key
-permits.
+"""The outermost layer of every request: host and origin, key, security headers, metrics, one log line.
 
 A page on the Internet can give its own name the address 127.0.0.1 (DNS rebinding) and so speak to a server on the
 visitor's machine as if it were its own. The browser still says in ``Host`` and ``Origin`` whose page it was.
@@ -18,14 +17,13 @@ from concurrent.futures import Executor
 from functools import lru_cache, partial
 
 import structlog
-from fastapi import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Forbidden, TooMany, Unauthorised, Unavailable
 from mapvote.server.http.schemas import refuse
-from mapvote.server.http.services import Batcher, Metrics, RateLimit, services
+from mapvote.server.http.services import Batcher, Metrics, RateLimit
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 
@@ -95,44 +93,6 @@ class Guard:
         except Unauthorised:
             self._wrong.take(peer)
             raise
-
-
-def own(request: Request, vehicle: str) -> str:
-    """The name on a key that may change this vehicle's ballots: the vehicle within its rate, or an operator. Else
-    Forbidden."""
-    key: keys.Key | None = request.state.key
-    if key is None:
-        return vehicle
-    if key.role != "operator":
-        if key.role != "vehicle" or key.name != vehicle:
-            raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
-        services(request).limit.take(key.name)
-    return key.name
-
-
-def operator(request: Request) -> str:
-    """The operator's name; Forbidden for other roles."""
-    return _one_of(request, "operator")
-
-
-def reviewer(request: Request) -> str:
-    """The name of a reviewer or an operator; Forbidden for other roles."""
-    return _one_of(request, "reviewer", "operator")
-
-
-def sees_names(request: Request) -> bool:
-    """Whether the key permits the names of vehicles and exact times; others get pseudonyms and days."""
-    key: keys.Key | None = request.state.key
-    return key is None or key.role in ("reviewer", "operator")
-
-
-def _one_of(request: Request, *roles: keys.Role) -> str:
-    key: keys.Key | None = request.state.key
-    if key is None:
-        return "operator"
-    if key.role not in roles:
-        raise Forbidden(f"only an {roles[-1]} can do this" if len(roles) == 1 else f"only a {' or '.join(roles)} can")
-    return key.name
 
 
 def _secret_of(authorization: str | None) -> str | None:

@@ -1,5 +1,5 @@
 """The parts of one running app, which its routes use: threads for each kind of work, what a client may send at a time,
-counters, manifests as JSON, publishes under way.
+counters, manifests as JSON, publishes under way; and what a key permits.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from threading import Event, Lock
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, ParamSpec, TypeVar
 
 import msgspec
-from anyio import CapacityLimiter
+from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.requests import ClientDisconnect
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote.server.errors import Conflict, NotFound, TooLarge, TooMany, Unavailable
+from mapvote.server.errors import Conflict, Forbidden, NotFound, TooLarge, TooMany, Unavailable
+from mapvote.server.store import keys
 from mapvote.server.store.admission import Incoming, Intake, Quota, Receipt
 from mapvote.server.store.fusion_jobs import Watched
 from mapvote.server.store.integrity import KINDS
@@ -36,6 +37,7 @@ from mapvote.server.views.point_lod import Clouds
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
+Given = ParamSpec("Given")
 READING = 1
 """Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
 that answer vehicles."""
@@ -382,6 +384,10 @@ class Services:
         """The result of a short question to the store, in the threads for lookups."""
         return await asyncio.get_running_loop().run_in_executor(self.threads.lookups, ask, self.store)
 
+    async def decide(self, work: Callable[Given, Answer], *given: Given.args, **more: Given.kwargs) -> Answer:
+        """The result of slow work, in the threads for it."""
+        return await to_thread.run_sync(partial(work, *given, **more), limiter=self.threads.deciding)
+
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
         self.stopping.set()
@@ -432,3 +438,41 @@ def services(request: Request) -> Services:
     """The parts of the app of a request."""
     found: Services = request.app.state.services
     return found
+
+
+def own(request: Request, vehicle: str) -> str:
+    """The name on a key that may change this vehicle's ballots: the vehicle within its rate, or an operator. Else
+    Forbidden."""
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return vehicle
+    if key.role != "operator":
+        if key.role != "vehicle" or key.name != vehicle:
+            raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
+        services(request).limit.take(key.name)
+    return key.name
+
+
+def operator(request: Request) -> str:
+    """The operator's name; Forbidden for other roles."""
+    return _one_of(request, "operator")
+
+
+def reviewer(request: Request) -> str:
+    """The name of a reviewer or an operator; Forbidden for other roles."""
+    return _one_of(request, "reviewer", "operator")
+
+
+def sees_names(request: Request) -> bool:
+    """Whether the key permits the names of vehicles and exact times; others get pseudonyms and days."""
+    key: keys.Key | None = request.state.key
+    return key is None or key.role in ("reviewer", "operator")
+
+
+def _one_of(request: Request, *roles: keys.Role) -> str:
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return "operator"
+    if key.role not in roles:
+        raise Forbidden(f"only an {roles[-1]} can do this" if len(roles) == 1 else f"only a {' or '.join(roles)} can")
+    return key.name

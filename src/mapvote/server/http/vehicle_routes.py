@@ -29,8 +29,7 @@ from mapvote.server.http.schemas import (
     as_table,
     problems,
 )
-from mapvote.server.http.security import own
-from mapvote.server.http.services import services
+from mapvote.server.http.services import own, services
 from mapvote.server.store.admission import Receipt, examine
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.geojson import utc

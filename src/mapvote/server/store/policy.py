@@ -83,11 +83,6 @@ class PolicyChange:
     reason: str
     policy: Policy
 
-    def as_json(self) -> dict[str, Any]:
-        """The policy, who set it, when and why."""
-        entry = {"by": self.by, "at_ns": self.at_ns, "reason": self.reason}
-        return entry | {"policy": self.policy.model_dump(mode="json")}
-
 
 def policy_in(connection: sa.Connection) -> Policy:
     """The newest policy."""
