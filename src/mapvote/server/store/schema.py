@@ -178,7 +178,7 @@ paths = sa.Table(
     sa.Column("path", sa.LargeBinary, nullable=False),
     sum_over("ballot", "path"),
 )
-"""Paths of vehicles, for ballots that contain one (codec/path.py)."""
+"""Paths of vehicles, for ballots that contain one (:func:`mapvote.codec.ballot.pack_path`)."""
 
 decisions = sa.Table(
     "decisions",
