@@ -112,3 +112,16 @@ def test_what_a_ray_proves_up_to_the_edge_of_a_cell_is_nothing_of_the_cell_behin
     passed = np.zeros(5, np.uint64)
     mark_passed(gather_rays(rays), np.array([0.0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 5), np.int32), passed)
     assert passed.tolist() == [0b100, 0b100, 0, 0, 0]
+
+
+def test_a_ray_counts_from_the_length_of_a_cell_on_and_marks_if_it_ends_beyond_where_its_fan_begins_to() -> None:
+    def passed(reach_m: float, stop_m: float, fan: int) -> int:
+        reach, x, y, slope, stop = (np.array([v], np.float32) for v in (reach_m, 1.0, 0.0, 0.0, stop_m))
+        words = np.zeros(100, np.uint64)
+        rays = gather_rays(Rays(reach, x, y, slope, stop, np.full(1, fan, np.int32)))
+        mark_passed(rays, np.array([0.05, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 100), np.int32), words)
+        return int((words != 0).sum())
+
+    side = float(np.float32(CELL_SIZE))
+    assert (passed(side, side, 0), passed(side - 1e-4, side, 0)) == (2, 0)
+    assert (passed(29.0, FULL_RANGE_M, 1), passed(29.0, FULL_RANGE_M + 0.01, 1)) == (0, 1)
