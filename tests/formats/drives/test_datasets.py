@@ -16,6 +16,7 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats import export_map, open_drive, read_map
 from mapvote.formats.drives.datasets import BOREAS_COLUMNS, MULRAN_MOUNT, NEWER_COLLEGE_MOUNT
+from mapvote.formats.drives.trajectory import read_trajectory
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.ply import write_ply
@@ -258,3 +259,31 @@ def test_autowares_default_folder_is_a_map(tmp_path: Path) -> None:
     assert sum(len(t.points) for t in found.tiles.values()) == len(HALL)
     assert found.georeference["crs"] == "EPSG:32654"
     assert found.georeference["offset"] == "300000.0,3900000.0,0.0"
+
+
+FIRST = "1600000000,0,0,0,0,0,0,1"
+
+
+@pytest.mark.parametrize(
+    ("names", "second", "said"),
+    [
+        ("sec,x,y,z,qx,qy,qz,qw", "1600000001,,0,0,0,0,0,1", "row 2 has no number in column x; leave it out"),
+        ("sec,x,y,z,qx,qy,qz,qw", "1600000001,0,0,0,0,0,0,0.5", "row 2 has no unit quaternion"),
+        ("sec,x,y,z,qx,qy,qz,qw", "1600000001,0,0", "csv:3: 3 values, but the header names 8"),
+        ("sec,x,y,z,qx,qy,qz,qw", "never,0,0,0,0,0,0,1", "row 2 has no time"),
+        ("sec,x,y,a,qx,qy,qz,qw", FIRST, "no column z"),
+        ("sec,x,y,z,a,b,c,d", FIRST, "no orientation"),
+        ("when,x,y,z,qx,qy,qz,qw", FIRST, "no column of times"),
+    ],
+)
+def test_a_table_of_poses_that_is_not_whole_is_named(tmp_path: Path, names: str, second: str, said: str) -> None:
+    (tmp_path / "t.csv").write_text(f"{names}\n{FIRST}\n{second}\n")
+    with pytest.raises(MapvoteError, match=said):
+        read_trajectory(tmp_path / "t.csv")
+
+
+def test_seconds_as_numpy_writes_them_and_nanoseconds_beside_them_are_added(tmp_path: Path) -> None:
+    rows = "1.600000000000000000e+09, 2.5e+08, 0,0,0,0,0,0,1\n1.6e9, 3.5e8, 1,0,0,0,0,0,1\n"
+    (tmp_path / "t.csv").write_text(f"# sec,nsec,x,y,z,qx,qy,qz,qw\n{rows}")
+    times_ns = read_trajectory(tmp_path / "t.csv").times_ns
+    assert times_ns.tolist() == [1_600_000_000_250_000_000, 1_600_000_000_350_000_000]
