@@ -37,9 +37,7 @@ TESTS = {
     "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/persistence": "fusion/test_persistence.py fusion/test_rules_of_fusion.py",
-    "detection/evidence": "detection",
-    "detection/packed_tiles": "detection",
-    "detection/confidence": "detection",
+    **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/confidence"), "detection"),
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
     "server/store/round": "server/store/test_publish_limits.py server/views/test_rounds.py",
 }
@@ -54,12 +52,13 @@ NAMES = {"min": "max", "max": "min", "any": "all", "all": "any"}
 
 
 def left_out(tree: ast.Module) -> set[int]:
-    """Nodes that stay: annotations, decorators, texts, what is raised or asserted, and constants of the module."""
+    """Nodes that stay: annotations, decorators, texts, errors, constants of the module, sizes (any negative is alike)."""
     parts: list[ast.AST | None] = [s for s in tree.body if isinstance(s, ast.Assign | ast.AnnAssign)]
     for node in ast.walk(tree):
         named = getattr(node, "annotation", None), getattr(node, "returns", None)
         parts += [*named, *getattr(node, "decorator_list", [])]
-        if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr) or getattr(node, "arg", "") == "strict":
+        reshapes = isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "reshape"
+        if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr) or reshapes or getattr(node, "arg", "") == "strict":
             parts.append(node)
     return {id(inner) for part in parts if part is not None for inner in ast.walk(part)}
 
@@ -80,10 +79,9 @@ def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str, object]]:
             yield node, "value", not node.value
         elif isinstance(node, ast.Constant) and type(node.value) is int:
             yield node, "value", node.value + 1
-        elif isinstance(node, ast.Name) and node.id in NAMES:
-            yield node, "id", NAMES[node.id]
-        elif isinstance(node, ast.Attribute) and node.attr in NAMES:
-            yield node, "attr", NAMES[node.attr]
+        for name in ("id", "attr"):
+            if getattr(node, name, "") in NAMES:
+                yield node, name, NAMES[getattr(node, name)]
 
 
 def mutant(source: str, place: int) -> tuple[str, str]:
@@ -102,9 +100,9 @@ def run(house: Path, tests: str, cache: Path, limit_s: float) -> str:
     words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
     words += [f"tests/{test}" for test in tests.split()]
     paths = {"PYTHONPATH": str(house / "src"), "NUMBA_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        done = subprocess.run(words, cwd=house, env={**os.environ, **paths}, capture_output=True, timeout=limit_s)
-        return "survived" if done.returncode == 0 else "killed"
+    with contextlib.suppress(subprocess.TimeoutExpired, subprocess.CalledProcessError):
+        subprocess.run(words, cwd=house, env={**os.environ, **paths}, capture_output=True, timeout=limit_s, check=True)
+        return "survived"
     return "killed"
 
 
@@ -130,13 +128,13 @@ def try_module(house: Path, module: str, tests: str, share: int, seed: int, equa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mutants", type=int, default=8, help="of each module")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=DECIDING, default=DECIDING, metavar="MODULE")
     asked = parser.parse_args()
-    rows = csv.DictReader((ROOT / "benchmarks/equal_mutants.csv").read_text().splitlines())
-    equal = {(row["module"], row["change"]) for row in rows}
+    lines = (ROOT / "benchmarks/equal_mutants.csv").read_text().splitlines()
+    equal = {(row["module"], row["change"]) for row in csv.DictReader(lines)}
     with tempfile.TemporaryDirectory() as folder:
         house = Path(folder)
         for part in ("src", "tests", "pyproject.toml"):

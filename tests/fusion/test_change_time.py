@@ -66,3 +66,13 @@ def test_a_vehicle_that_never_spoke_of_a_cell_does_not_stand_for_another() -> No
     said = np.array([[CE], [UO], [NO_VOTE], [CE]], dtype=np.uint8)
     ends_ns, whose = np.arange(4, dtype=np.int64), np.array([2, 0, 1, 0], dtype=np.int64)
     assert _turn(said, ends_ns, whose, UO, CE).all(), "both that spoke say so in the end"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "ends_ns"),
+    [(CE, UO, [0, 1]), (UO, CE, [5, 5]), (CO, CE, [0, 1])],
+    ids=["after", "tie", "other"],
+)
+def test_the_first_drive_counts_as_any_other(first: int, second: int, ends_ns: list[int]) -> None:
+    said, whose = np.array([[first], [second]], dtype=np.uint8), np.arange(2, dtype=np.int64)
+    assert not _turn(said, np.array(ends_ns, dtype=np.int64), whose, UO, CE).any()
