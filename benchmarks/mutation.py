@@ -52,7 +52,7 @@ NAMES = {"min": "max", "max": "min", "any": "all", "all": "any"}
 
 
 def left_out(tree: ast.Module) -> set[int]:
-    """Nodes that stay: annotations, decorators, texts, errors, constants of the module, sizes (any negative will do)."""
+    """Nodes that stay: annotations, decorators, texts, errors, constants of the module, sizes (any negative is one)."""
     parts: list[ast.AST | None] = [s for s in tree.body if isinstance(s, ast.Assign | ast.AnnAssign)]
     for node in ast.walk(tree):
         named = getattr(node, "annotation", None), getattr(node, "returns", None)
