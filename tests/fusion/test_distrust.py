@@ -69,16 +69,6 @@ def test_vehicles_that_disagree_with_each_other_silence_nobody() -> None:
     assert not_heard(named([rng.integers(0, 5, SHAPE, dtype=np.uint8) for _ in range(5)])) == set()
 
 
-def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
-    def only(states: U8) -> U8:
-        few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
-        few[:20, :20] = states[:20, :20]
-        return few
-
-    planes = [honest(1), honest(2), only(OPPOSITE[honest(3)])]
-    assert not_heard(named(planes)) == set()
-
-
 @pytest.mark.parametrize(
     ("asked", "agreed", "opposed", "named_so"),
     [
@@ -294,12 +284,6 @@ def test_a_vehicle_that_copies_one_drive_is_heard_by_its_other() -> None:
     assert {drive.digest for drive in kept} == {"ballot of honest", "ballot of w", "own"}
 
 
-def test_little_says_nothing() -> None:
-    few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
-    few[100:110, 100:120] = UE
-    assert copied(by_name({"a": few, "b": few, "c": few})) == {}
-
-
 @pytest.mark.parametrize(("rows", "cols", "changed", "judged"), [(103, 97, 200, True), (106, 93, 199, False)])
 def test_masks_are_judged_from_200_cells_on_that_three_cells_change(
     rows: int, cols: int, changed: int, judged: bool
@@ -365,10 +349,3 @@ def test_masks_with_more_holes_than_ground_say_nothing() -> None:
     """Within a cell of every cell there is a hole and none: any two such masks are alike."""
     speckled = [np.where(np.random.default_rng(i).random(SHAPE) < 0.5, UE, UN).astype(np.uint8) for i in range(3)]
     assert copied(by_name({f"v{i}": states for i, states in enumerate(speckled)})) == {}
-
-
-def test_a_mask_is_the_determined_cells_the_first_column_in_the_lowest_bit() -> None:
-    rng = np.random.default_rng(1)
-    planes = rng.choice([0, 1, 2, 3, 4, NO_VOTE], (3, *SHAPE)).astype(np.uint8)
-    bits = np.packbits(planes < CellState.UNDETERMINED, axis=-1, bitorder="little")
-    np.testing.assert_array_equal(masks_of(planes), bits.view("<u8"))

@@ -80,18 +80,6 @@ def test_right_state_with_false_points_injects_nothing() -> None:
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
 
 
-def test_one_stage_is_the_sum_of_the_tallies() -> None:
-    """Paper IV: the server aggregates the vote counts; one loud vehicle outvotes two quiet ones."""
-    loud, quiet = np.zeros((*SHAPE, 5), np.uint16), np.zeros((*SHAPE, 5), np.uint16)
-    loud[CELL] = [0, 0, 100 * VOTE_UNIT, 0, 0]
-    quiet[CELL] = [30 * VOTE_UNIT, 0, 0, 0, 5 * VOTE_UNIT]
-    votes = [TileVote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([loud, quiet, quiet])]
-    states, tally = count(votes, "paper", 1)
-    assert states[CELL] == OCCUPIED
-    assert tally[CELL].tolist() == [60 * VOTE_UNIT, 0, 100 * VOTE_UNIT, 0, 10 * VOTE_UNIT]
-    assert count(votes, "paper", 2)[0][CELL] == CellState.UNDETERMINED
-
-
 def test_where_points_are_added_the_map_no_longer_knows_free_space_though_no_vehicle_tells_of_rays() -> None:
     tile = replace(make_tile(wall([], [])), free=words_plane({CELL: 0b1111, (50, 50): 0b1111}))
     new = vote("a", states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.75]))

@@ -220,13 +220,13 @@ def test_what_stands_beside_raises_the_risk_and_sureness_lowers_it() -> None:
 
 def test_waypoints_lie_in_the_middle_of_what_waits_the_largest_first() -> None:
     lattice = Lattice(x0=100.0, y0=50.0)
-    near = PendingDeletions(np.array([5 * 256 + 5, 5 * 256 + 6, 5 * 256 + 7]), np.array([0.1, 0.3, 0.2]))
+    near = PendingDeletions(np.array([r * 256 + c for r in (5, 6) for c in (5, 6)]), np.array([0.1, 0.3, 0.2, 0.1]))
     found = waypoints(
         {(0, 1): PendingDeletions(np.array([0]), np.array([0.9])), (0, 0): near, (1, 0): PendingDeletions.none()},
         lattice,
     )
-    assert [(place.cells, place.probability) for place in found] == [(3, 0.3), (1, 0.9)]
-    assert (found[0].x, found[0].y) == pytest.approx((100.0 + 6.5 * 0.3, 50.0 + 5.5 * 0.3))
+    assert [(place.cells, place.probability) for place in found] == [(4, 0.3), (1, 0.9)]
+    assert (found[0].x, found[0].y) == pytest.approx((100.0 + 6 * 0.3, 50.0 + 6 * 0.3))
     assert (found[1].x, found[1].y) == pytest.approx((100.0 + 256.5 * 0.3, 50.0 + 0.5 * 0.3))
     assert waypoints({(1, 0): PendingDeletions.none()}, lattice) == []
 
