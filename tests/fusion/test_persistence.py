@@ -87,6 +87,9 @@ def test_a_time_that_32_bits_cannot_hold_is_the_nearest_that_they_can(end_ns: in
     """0 would say that nothing was ever put there."""
     vote = TileVote("a", end_ns, "a", states=states_plane({CELL: CO}))
     assert remembered(Memory.none(), BARE, STANDS, [vote], NEW).came_s[CELL] == came_s
+    assert remembered(Memory.none(), BARE, STANDS, [vote], NEW, (lambda: [vote], 2)).came_s[CELL] == came_s
+    gone = drive(0, {CELL: CE})
+    assert remembered(memory(came_s=came_s), STANDS, BARE, [gone], states_plane({CELL: CE})).stays[CELL] == 1
 
 
 def fused(tile: Tile, day: float, state: int, version: int, history: list[TileVote]) -> Tile:
