@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import make_map, make_tile, wall
+from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE, Lattice
@@ -156,7 +156,8 @@ def test_of_a_map_from_elsewhere_a_point_alone_in_the_air_is_dropped_and_a_wall_
     pole = wall([(20, 20)], [0.45 + 0.3 * k for k in range(8)])
     lone = np.array([[9.1, 9.1, 3.1]])
     at_the_edge = np.array([[0.1, 9.1, 3.1]])
-    tile = make_tile(np.concatenate([ground, pole, lone, at_the_edge]).astype(np.float32))
+    points = np.concatenate([ground, pole, lone, at_the_edge]) - [0.0, 0.0, 20.0]  # below zero as anywhere else
+    tile = make_tile(points.astype(np.float32), ground=-20.0)
     assert np.flatnonzero(lone_points(tile)).tolist() == [len(ground) + len(pole)]
     cleaned, dropped = without_lone_points(make_map({(0, 0): tile}))
     assert (dropped, cleaned.n_points) == (1, len(tile.points) - 1)
@@ -303,6 +304,14 @@ def mapped(seen: Callable[[int], F64], x: F64, draft: F64, **mapping: object) ->
     for _ in mapper.enter(DriveTrack(drive, poses, np.ones(len(x), np.bool_), (), np.full(len(x), np.nan))):
         pass
     return all_points(mapper.finish())
+
+
+def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart() -> None:
+    street = make_map({(0, 0): make_tile(wall([(r, c) for r in range(40) for c in range(40)], [0.05]))})
+    one, other = np.array([[3.15, 3.15, 1.65]]), np.array([[9.15, 9.15, 1.65]])
+    mapper = Mapper(street, Settings())
+    mapper._add([one_scan(street, one), one_scan(street, one), one_scan(street, other)])
+    assert mapper._counts(np.concatenate([one, other]))[:, :2].tolist() == [[2, 1], [1, 2]]
 
 
 def test_a_van_that_is_never_nearer_than_60_m_leaves_no_trail_and_a_wall_never_nearer_than_70_m_stays() -> None:

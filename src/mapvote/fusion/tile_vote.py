@@ -138,9 +138,10 @@ class TileVote:
     def mark_passed(self, reached: U64) -> None:
         """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of the voxels that rays
         passed through, in cells with a vote."""
-        if self.states is not None and self.free is not None:
+        assert self.free is not None
+        if self.states is not None:
             mark_spoken(reached, self.free.cells, self.free.words, self.states.reshape(-1))
-        elif self.free is not None:
+        else:
             passed = self.free.within(self.spoken())
             mark(reached, passed.cells, passed.words)
 
@@ -225,6 +226,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     if len(drives) == 1:
         return drives[0]
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
+    newest = ordered[-1]
     spoken = [drive.spoken().reshape(-1) for drive in ordered]
     last = _last_words(spoken)
     states = tally = unrestricted = None
@@ -246,9 +248,9 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             intensity.append(drive.measured()[here])
     free = [drive.free.within(said) for drive, said in zip(ordered, spoken, strict=True) if drive.free is not None]
     return TileVote(
-        vehicle=ordered[-1].vehicle,
-        end_ns=ordered[-1].end_ns,
-        digest=ordered[-1].digest,
+        vehicle=newest.vehicle,
+        end_ns=newest.end_ns,
+        digest=newest.digest,
         states=states,
         unrestricted=unrestricted,
         tally=tally,
