@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
 from mapvote.core.ground import _sorted_by_cell, base_layers
-from mapvote.core.ground_growing import SEED, UNREACHED, WIDEST, _bounds, _continued, _like, grow, tiles_around
+from mapvote.core.ground_growing import (
+    SEED,
+    UNREACHED,
+    WIDEST,
+    _bounds,
+    _continued,
+    _like,
+    _raise_at_kerbs,
+    grow,
+    tiles_around,
+)
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
@@ -113,6 +123,28 @@ def test_a_point_may_lie_as_far_off_the_ground_beside_it_as_slopes_and_noise_all
     assert low == pytest.approx(-0.15 * 0.3 - 0.06)
     assert steep == pytest.approx(-0.5 * 0.3 - 0.06)
     assert high == pytest.approx(0.15 * 0.3 + 0.06)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(5, 0), (-5, 0), (0, 5), (0, -5), (5, 5), (6, 0), (-6, 0), (0, 6), (0, -6)])
+def test_ground_that_is_five_cells_away_bounds_a_point_and_farther_ground_does_not(rows: int, cols: int) -> None:
+    ground, gap = np.zeros(CELLS, np.float32), np.full(CELLS, UNREACHED, np.uint8)
+    gap[(20 + rows) * TILE_CELLS + 20 + cols] = 0
+    low, _, high = _bounds(20 * TILE_CELLS + 20, ground, gap, tiles_around([(0, 0)]))
+    assert np.isfinite(low) == np.isfinite(high) == (max(abs(rows), abs(cols)) == 5)
+
+
+@pytest.mark.parametrize(("higher", "raised_m"), [(3, 0.0), (4, 0.075), (8, 0.15)])
+def test_a_lone_low_point_is_raised_to_the_mean_around_it_if_half_of_the_cells_there_are_a_kerb_higher(
+    higher: int, raised_m: float
+) -> None:
+    middle = 10 * TILE_CELLS + 10
+    beside = [middle + i * TILE_CELLS + j for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    start = (np.arange(CELLS + 1) > middle).astype(np.int32)
+    ground, gap = np.zeros(CELLS, np.float32), np.ones(CELLS, np.uint8)
+    gap[middle], around, out = 0, ground.copy(), ground.copy()
+    around[beside[:higher]] = 0.15
+    _raise_at_kerbs(start, np.zeros(1, np.float32), tiles_around([(0, 0)]), ground, gap, around, out)
+    assert out[middle] == pytest.approx(raised_m)
 
 
 @pytest.mark.parametrize(("z", "continues"), [(-1.51, False), (-1.5, True), (0.0, True), (1.5, True), (1.51, False)])
