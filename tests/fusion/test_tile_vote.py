@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import at_least, states_plane, wall, words_plane
+from hand_made import Say, at_least, make_ballot, states_plane, two_walls, unpack_all, wall, words_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
@@ -93,6 +93,18 @@ def test_points_of_a_cell_come_from_the_drive_that_speaks_there() -> None:
     assert points is not None
     assert sorted(points[:, 2].tolist()) == pytest.approx([0.45, 1.05])
     assert len(points) == 2
+
+
+def test_the_vote_of_a_ballot_has_the_planes_that_were_sent_and_no_others() -> None:
+    states = states_plane({HERE: CE, THERE: UO})
+    say = Say(states, gone=words_plane({HERE: 5}), free=words_plane({THERE: 6}), odds=np.array([7], np.int8))
+    full, bare = (unpack_all(make_ballot(two_walls(), {(0, 0): sent}))[0] for sent in (say, Say(states)))
+    assert full.gone is not None
+    assert full.free is not None
+    assert full.odds is not None
+    words = full.gone.words.tolist(), full.free.words.tolist()
+    assert (*words, full.odds.at(FLAT[:1]).tolist()) == ([5], [6], [7])
+    assert (bare.gone, bare.free, bare.odds, bare.new_points) == (None, None, None, None)
 
 
 def test_a_silenced_cell_says_nothing_and_the_others_all_they_said() -> None:

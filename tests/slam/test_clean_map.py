@@ -25,6 +25,7 @@ from mapvote.slam.clean_map import (
     SEEN_THROUGH,
     TALL_M,
     Mapper,
+    _no_map,
     lone_points,
     mirrored,
     seen_through,
@@ -304,6 +305,15 @@ def mapped(seen: Callable[[int], F64], x: F64, draft: F64, **mapping: object) ->
     for _ in mapper.enter(DriveTrack(drive, poses, np.ones(len(x), np.bool_), (), np.full(len(x), np.nan))):
         pass
     return all_points(mapper.finish())
+
+
+def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_the_road_itself() -> None:
+    cells = [(1, 2), (1, 2), (1, 3), (0, 1), (2, 3), (1, 0), (3, 2), (1, 3)]
+    z, moving = np.array([0.8, 0.05, 0.2, 0.2, 0.2, 0.2, 0.2, 0.8]), np.arange(8) == 0
+    points, flat = np.column_stack([np.ones((8, 2)), z]), np.array([4 * r + c for r, c in cells], np.int32)
+    out, ground_z = np.zeros(8, np.bool_), np.zeros((4, 4), np.float32)
+    _no_map(points, np.zeros(3), 1e4, moving, z >= 0.3, flat, ground_z, np.zeros(16, np.bool_), out)
+    assert out.tolist() == [True, False, True, True, True, False, False, False]
 
 
 def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart() -> None:
