@@ -8,8 +8,8 @@
 DRIVE is one that ``mapvote simulate`` wrote, MAP what ``mapvote build`` made of its surveys. For kills the drive goes
 round and round with stamps that go on; at the end of a lap the vehicle leaps back to the start, where some scans are
 lost. For hours three columns of the map's tiles, and the part of the drive through them, are laid end to end as often
-as it takes; where two copies meet, the scan shows another street than the map, and some scans are lost. So that eight
-hours can be run, every second beam is fed, and 2 scans a second.
+as it takes; where two copies meet, the scan shows another street than the map, and some scans are lost. 2 scans a
+second are fed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -36,17 +35,17 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.point_map import PointMap
-from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, Scan
+from mapvote.core.types import Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import from_cdr
 from mapvote.live.dds import Network
 from mapvote.live.drive import LiveDrive, OneMap, WaitingScan
+from mapvote.live.messages import CLOUD, cloud_message
 from mapvote.live.outbox import Outbox
-from mapvote.live.play import cloud_message, opened
+from mapvote.live.play import opened
 from mapvote.vehicle import Vehicle
 from mapvote.warmup import warm_vehicle
 
@@ -54,72 +53,41 @@ sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder
 from live.loopback_dds import LOOPBACK, own_domain  # noqa: E402
 from live_server import mapvote  # noqa: E402
 
-TILES = 3
-"""Columns of tiles that are repeated."""
-EVERY = 5
-"""Of so many scans one is fed: 2 a second."""
+TILES, POINTS = 3, 70_000
+"""Columns of tiles that are repeated; points of a cloud."""
 PERIOD_M = TILES * TILE_CELLS * CELL_SIZE
-CLOUD, POINTS = "sensor_msgs/msg/PointCloud2", 70_000
-
-
-def cloud(n: int = POINTS) -> bytes:
-    """A PointCloud2 as Velodyne's driver sends it: 22 bytes a point, times among them."""
-    rng, azimuth = np.random.default_rng(3), np.linspace(0, 2 * np.pi, n)
-    far, height = rng.uniform(4, 60, n), rng.uniform(-2, 8, n)
-    points = np.column_stack([far * np.cos(azimuth), far * np.sin(azimuth), height]).astype(np.float32)
-    time_s, ring = np.linspace(-0.1, 0, n, dtype=np.float32), np.arange(n).astype(np.uint16) % 32
-    return cloud_message(Scan(time.time_ns(), points, time_s, rng.uniform(0, 1, n).astype(np.float32), ring))
 
 
 def send_clouds(domain: int, seconds: float) -> None:
-    """The other process: clouds at 10 Hz."""
-    out, data = Network(domain).publish("/points", CLOUD), cloud()
-    start, k = time.monotonic(), 0
-    while time.monotonic() < start + seconds:
-        out.send(data)
-        k += 1
+    """The other process: clouds at 10 Hz, with 22 bytes a point as Velodyne's driver sends them."""
+    rng, azimuth = np.random.default_rng(3), np.linspace(0, 2 * np.pi, POINTS)
+    far, height = rng.uniform(4, 60, POINTS), rng.uniform(-2, 8, POINTS)
+    points = np.column_stack([far * np.cos(azimuth), far * np.sin(azimuth), height]).astype(np.float32)
+    time_s, ring = np.linspace(-0.1, 0, POINTS, dtype=np.float32), np.arange(POINTS).astype(np.uint16) % 32
+    intensity = rng.uniform(0, 1, POINTS).astype(np.float32)
+    out, data = Network(domain).publish("/points", CLOUD), cloud_message(Scan(0, points, time_s, intensity, ring))
+    start = time.monotonic()
+    for k in range(int(10 * seconds)):
         time.sleep(max(0.0, start + 0.1 * k - time.monotonic()))
+        out.send(data)
 
 
-def cpu_by_thread() -> dict[str, float]:
-    """CPU milliseconds of each thread of this process, by name."""
-    out: dict[str, float] = {}
-    for task in Path("/proc/self/task").iterdir():
-        name, _, rest = (task / "stat").read_text().partition("(")[2].rpartition(")")
-        runtime = (task / "schedstat").read_text().split()[0]
-        out[name] = out.get(name, 0.0) + int(runtime) / 1e6
-        del rest
-    return out
-
-
-def read_clouds(seconds: float = 20.0) -> None:
+def read_clouds(seconds: float) -> None:
     """CPU of this process for each cloud, received and made a scan; what an idle reader costs is in it."""
     os.environ["CYCLONEDDS_URI"] = LOOPBACK
     domain = own_domain()
-    sender = subprocess.Popen(
-        [sys.executable, __file__, "send-clouds", "--domain", str(domain), "--seconds", str(seconds + 5)]
-    )
-    network = Network(domain)
+    options = ["--domain", str(domain), "--seconds", str(seconds)]
+    sender = subprocess.Popen([sys.executable, __file__, "send-clouds", *options])
+    network, n, before, after = Network(domain), 0, (0.0, 0.0), (0.0, 0.0)
     incoming = network.subscribe("/points", CLOUD, reliable=True)
-    end, n, before, ours = None, 0, {}, 0.0
-    while end is None or time.monotonic() < end:
+    while sender.poll() is None:
         network.wait(0.2)
-        t = time.thread_time()
-        for data in incoming.take():
+        for _, data in incoming.take():
             scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
-            n += 1
-            if n == 20:
-                end, before, ours, n, t = time.monotonic() + seconds, cpu_by_thread(), 0.0, 20, time.thread_time()
-        ours += time.thread_time() - t
-    after = cpu_by_thread()
-    n -= 20
-    each = {name: (ms - before.get(name, 0.0)) / n for name, ms in after.items()}
-    print(f"{n} clouds in {seconds:.0f} s: {sum(each.values()):.2f} ms of CPU each, {1e3 * ours / n:.2f} in our code")
-    print("| thread | ms a cloud |\n|---|---|")
-    for name, ms in sorted(each.items(), key=lambda pair: -pair[1]):
-        if ms > 0.005:
-            print(f"| {name} | {ms:.2f} |")
-    sender.wait()
+            n, after = n + 1, (time.process_time(), time.thread_time())
+            before = after if n == 20 else before
+    process, ours = (1e3 * (b - a) / (n - 20) for a, b in zip(before, after, strict=True))
+    print(f"{n - 20} clouds: {process:.2f} ms of CPU each, {process - ours:.2f} of it in the threads of DDS")
 
 
 def laps(domain: int, drive: str, shown: Path) -> None:
@@ -240,75 +208,55 @@ def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: st
     print(f"CPU of drive: {after.children_user - before.children_user:.1f} s user, start and kernels included")
 
 
-def endless(point_map: PointMap, length_m: float) -> PointMap:
-    """The columns 0 to 2 of the map's tiles, again and again along x; a tile is made when it is asked for."""
-    ours = {index: tile for index, tile in point_map.tiles.items() if 0 <= index[1] < TILES}
-    copies = 2 + int(length_m / PERIOD_M)
-    points = {(r, c + TILES * k): len(tile.points) for (r, c), tile in ours.items() for k in range(-1, copies)}
-
-    def made(index: TileIndex) -> Tile:
-        return replace(ours[index[0], index[1] % TILES], window=point_map.lattice.tile(index))
-
-    return replace(point_map, tiles=LazyTiles(made, points), driven=())
-
-
-def every_other_beam(scan: Scan, sensor: Sensor) -> Scan:
-    """Of every second beam, by elevation, the points."""
-    x, y, z = scan.points.astype(np.float64).T
-    beam = np.abs(np.degrees(np.arctan2(z, np.hypot(x, y)))[:, None] - np.array(sensor.elevations_deg)).argmin(axis=1)
-    mine = beam % 2 == 0
-    time_s = None if scan.time_s is None else scan.time_s[mine]
-    return Scan(scan.stamp_ns, scan.points[mine], time_s, None if scan.intensity is None else scan.intensity[mine])
-
-
-def long_drive(scans: list[Scan], priors: F64, step_ns: int, length_h: float) -> Iterator[tuple[Scan, F64]]:
-    """Scans and their priors (n, 4, 4), again and again, each time later and farther along the road."""
-    for n in range(int(3.6e12 * length_h / step_ns)):
-        k, i = divmod(n, len(scans))
-        prior = priors[i].copy()
-        prior[0, 3] += k * PERIOD_M
-        yield replace(scans[i], stamp_ns=scans[0].stamp_ns + step_ns * n), prior
-
-
-def resident_mb() -> float:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
-
-
 def hours(drive_path: str, map_path: str, length_h: float) -> None:
     """A LiveDrive fed in one process; resident memory beside the map and interpreter, and ballots."""
     drive, street = open_drive(Path(drive_path)), read_map(Path(map_path))
-    assert drive.T_map_lidar_prior is not None
-    xs = drive.T_map_lidar_prior[:, 0, 3]
-    x0 = 0.5 * (xs.min() + xs.max()) - 0.5 * PERIOD_M
-    part = np.flatnonzero((xs >= x0) & (xs < x0 + PERIOD_M))[::EVERY]
-    step_ns = int(np.median(np.diff(drive.stamps_ns[part])))
-    sensor = replace(drive.sensor, name="half of the beams", elevations_deg=drive.sensor.elevations_deg[::2])
-    scans = [every_other_beam(drive.read_scan(int(i)), drive.sensor) for i in part]
+    priors = drive.T_map_lidar_prior
+    assert priors is not None
+    x0 = 0.5 * (np.ptp(priors[:, 0, 3]) - PERIOD_M) + priors[:, 0, 3].min()
+    part = np.flatnonzero((priors[:, 0, 3] >= x0) & (priors[:, 0, 3] < x0 + PERIOD_M))
+    step_ns = 500_000_000
+    part = part[:: max(1, round(step_ns / float(np.median(np.diff(drive.stamps_ns)))))]
+    scans, total = [drive.read_scan(int(i)) for i in part], int(3.6e12 * length_h / step_ns)
+    ours = {index: tile for index, tile in street.tiles.items() if 0 <= index[1] < TILES}
+    copies = range(-1, 2 + total // len(scans))
+    points = {(r, c + TILES * k): len(tile.points) for (r, c), tile in ours.items() for k in copies}
+
+    def made(index: TileIndex) -> Tile:
+        return replace(ours[index[0], index[1] % TILES], window=street.lattice.tile(index))
+
+    maps = OneMap(replace(street, tiles=LazyTiles(made, points), driven=()))
     home = Path(tempfile.mkdtemp())
     (home / "out").mkdir()
     outbox = Outbox(home / "state", "car", folder=home / "out", say=lambda _: None)
-    maps = OneMap(endless(street, 3600 * length_h * PERIOD_M / (1e-9 * step_ns * len(scans))))
     warm_vehicle(Settings())
-    live = LiveDrive(lambda m: Vehicle("car", sensor, m), maps, outbox, name="day", with_poses=True)
-    base, n, report = resident_mb(), 0, int(min(1800e9, 900e9 * length_h) / step_ns)
-    print(f"base {base:.0f} MB with the scans that are fed; a scan every {1e-9 * step_ns:.1f} s, {sensor.beams} beams")
+    live = LiveDrive(lambda m: Vehicle("car", drive.sensor, m), maps, outbox, name="day")
+
+    def resident_mb() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+    base = resident_mb()
+    print(f"base {base:.0f} MB with the scans that are fed")
     print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
-    for scan, prior in long_drive(scans, drive.T_map_lidar_prior[part], step_ns, length_h):
-        live.on_pose(scan.stamp_ns, prior)
-        live.on_scan(WaitingScan(scan.stamp_ns, time.time_ns(), lambda scan=scan: scan))
+    for n in range(1, total + 1):
+        k, i = divmod(n - 1, len(scans))
+        stamp_ns, prior = scans[0].stamp_ns + step_ns * n, priors[part[i]].copy()
+        prior[0, 3] += k * PERIOD_M
+        live.on_pose(stamp_ns, prior)
+        scan = replace(scans[i], stamp_ns=stamp_ns)
+        live.on_scan(WaitingScan(stamp_ns, time.time_ns(), lambda scan=scan: scan))
         while live.step():
             pass
-        n += 1
-        if n % report == 0:
-            c, km, mb = live.counts, 1e-3 * n / len(scans) * PERIOD_M, resident_mb() - base
+        if n % max(1, total // 16) == 0:
+            c, km = live.counts, 1e-3 * n / len(scans) * PERIOD_M
+            mb = resident_mb() - base
             print(
                 f"| {n * step_ns / 3.6e12:.2f} | {km:.1f} | {c.localised} of {n} | {c.ballots} | {mb:.0f} |", flush=True
             )
     live.finish()
     outbox.close()
     left = [f.name for f in (home / "state/car").iterdir() if not f.name.startswith(".")]
-    ballots = len(list((home / "out").iterdir()))
-    print(f"{n} scans, {live.counts.localised} voted, {ballots} ballots; files left behind: {left}")
+    print(f"{total} scans, {live.counts.localised} voted, {live.counts.ballots} ballots; files left behind: {left}")
 
 
 def main() -> None:
@@ -323,16 +271,16 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--longest", type=float, default=25.0, help="seconds before a kill")
     parser.add_argument("--hours", type=float, default=8.0)
-    options = parser.parse_args()
-    runs: dict[str, Callable[[], None]] = {
-        "send-clouds": lambda: send_clouds(options.domain, options.seconds),
-        "cloud": lambda: read_clouds(options.seconds),
-        "drive": lambda: play_and_drive(options.paths[0], options.paths[1], options.rate, options.sensor, options.core),
-        "kills": lambda: kills(options.paths[0], options.paths[1], options.kills, options.longest),
-        "laps": lambda: laps(options.domain, options.paths[0], Path(options.paths[1])),
-        "hours": lambda: hours(options.paths[0], options.paths[1], options.hours),
+    o = parser.parse_args()
+    runs = {
+        "send-clouds": lambda: send_clouds(o.domain, o.seconds),
+        "cloud": lambda: read_clouds(o.seconds),
+        "drive": lambda: play_and_drive(*o.paths, o.rate, o.sensor, o.core),
+        "kills": lambda: kills(*o.paths, o.kills, o.longest),
+        "laps": lambda: laps(o.domain, o.paths[0], Path(o.paths[1])),
+        "hours": lambda: hours(*o.paths, o.hours),
     }
-    runs[options.what]()
+    runs[o.what]()
 
 
 if __name__ == "__main__":

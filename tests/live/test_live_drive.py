@@ -18,7 +18,7 @@ from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.live import drive as drive_module
-from mapvote.live.drive import LiveDrive, OneMap, Thinning, WaitingScan
+from mapvote.live.drive import Counts, LiveDrive, OneMap, Thinning, WaitingScan
 from mapvote.live.outbox import Outbox, ballot_of
 from mapvote.vehicle import Cuts, Vehicle
 from streets import drive_along, path, street
@@ -60,6 +60,11 @@ class Live:
         while self.live.step():
             pass
 
+    def finish(self) -> Counts:
+        self.live.finish()
+        self.outbox.close()
+        return self.live.counts
+
 
 def test_of_scans_that_come_twice_as_fast_as_they_are_voted_on_every_other_one_is_left_out_evenly() -> None:
     thinning, waiting, admitted = Thinning(), 0.0, []
@@ -88,9 +93,7 @@ def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_o
     for shift_ns in (-hour, 2 * hour):
         for i in range(SCANS):
             live.give(i, shift_ns)
-    live.live.finish()
-    live.outbox.close()
-    counts = live.live.counts
+    counts = live.finish()
     assert (counts.clock_jumps, counts.late, counts.ballots, counts.scans) == (2, 4, 3, 3 * SCANS)
     assert said(tmp_path / "out") == {"day-001": SCANS, "day-002": SCANS - 2, "day-003": SCANS - 2}
     assert counts.localised + counts.lost == 3 * SCANS - 4
@@ -101,9 +104,8 @@ def test_one_stamp_that_is_an_hour_off_is_one_scan_less_and_no_jump(tmp_path: Pa
     live = Live(tmp_path)
     for i in range(SCANS):
         live.give(i, 3600 * 10**9 if i == 9 else 0)
-    live.live.finish()
-    live.outbox.close()
-    assert (live.live.counts.clock_jumps, live.live.counts.late, live.live.counts.ballots) == (0, 1, 1)
+    counts = live.finish()
+    assert (counts.clock_jumps, counts.late, counts.ballots) == (0, 1, 1)
 
 
 def test_what_a_kill_leaves_in_the_journal_is_what_the_vehicle_had_said_of_each_tile(
@@ -130,9 +132,8 @@ def test_a_scan_that_cannot_be_read_is_counted_and_the_drive_goes_on(tmp_path: P
     live = Live(tmp_path)
     for i in range(SCANS):
         live.give(i, read=damaged if i in (5, 6) else None)
-    live.live.finish()
-    live.outbox.close()
-    assert (live.live.counts.unusable, live.live.counts.observed) == (2, SCANS - 2)
+    counts = live.finish()
+    assert (counts.unusable, counts.observed) == (2, SCANS - 2)
     assert live.live.latencies_s
 
 
@@ -144,9 +145,8 @@ def test_of_scans_that_wait_each_finds_its_pose_in_odometry_of_500_hz(tmp_path: 
         live.give(i)
         for k in range(1, 50):
             live.live.on_pose(first_ns + i * 100_000_000 + k * period_ns, live.poses[i])
-    live.live.finish()
-    live.outbox.close()
-    assert (live.live.counts.without_pose, live.live.counts.observed) == (0, SCANS)
+    counts = live.finish()
+    assert (counts.without_pose, counts.observed) == (0, SCANS)
 
 
 def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) -> None:
@@ -166,13 +166,11 @@ def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) 
         maps.version = 1 + (i > 4)
         live.give(i)
         live.drain()
-    live.live.finish()
-    live.outbox.close()
-
+    counts = live.finish()
     versions = [decode(f.read_bytes()).version for f in sorted((tmp_path / "out").iterdir())]
     assert versions[0] == 1
     assert set(versions[1:]) == {2}
-    assert live.live.counts.localised == SCANS
+    assert counts.localised == SCANS
 
 
 def test_what_a_tile_has_worked_out_is_let_go_300_m_away_and_its_points_stay_where_they_are() -> None:

@@ -38,6 +38,11 @@ def open_outbox(tmp_path: Path, **more: Any) -> Outbox:
     return Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=lambda _: None, retry_s=0.05, **more)
 
 
+def leave(box: Outbox, n: int, *, last: bool = False) -> None:
+    """The n-th ballot of the day is closed."""
+    box.leave(f"day-{n:03d}", lambda: ballot(f"day-{n:03d}"), None if last else f"day-{n + 1:03d}")
+
+
 def left_files(tmp_path: Path) -> list[str]:
     return sorted(f.name for f in (tmp_path / "state/car").iterdir() if f.name not in (".lock", ".last"))
 
@@ -154,30 +159,16 @@ def test_killed_between_any_two_file_operations_every_closed_ballot_comes_once_a
     raise AssertionError("the drive never came to its end")
 
 
-def test_two_processes_cannot_drive_as_one_vehicle(tmp_path: Path) -> None:
-    first = open_outbox(tmp_path)
-    with pytest.raises(MapvoteError, match="another process drives as car"):
-        open_outbox(tmp_path)
-    first.begin("a")
-    first.close()
-    open_outbox(tmp_path).begin("a")
-
-
-def test_an_outbox_that_never_began_closes_and_another_process_may_drive_as_its_vehicle(tmp_path: Path) -> None:
-    open_outbox(tmp_path).close()
-    again = open_outbox(tmp_path)
-    again.begin("day")
-    again.close()
-
-
-def test_no_number_is_given_twice_to_a_drive_of_one_name(tmp_path: Path) -> None:
+def test_one_process_at_a_time_drives_as_a_vehicle_and_no_number_is_given_twice(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
+    open_outbox(tmp_path).close()  # one that never began
     numbers = []
     for _ in range(3):
         box = open_outbox(tmp_path)
+        with pytest.raises(MapvoteError, match="another process drives as car"):
+            open_outbox(tmp_path)
         numbers.append(box.begin("day"))
-        name = f"day-{numbers[-1]:03d}"
-        box.leave(name, lambda name=name: ballot(name))  # type: ignore[misc]
+        leave(box, numbers[-1], last=True)
         box.close()
     assert numbers == [1, 2, 3]
     assert set(said(tmp_path / "out")) == {"day-001", "day-002", "day-003"}
@@ -199,8 +190,7 @@ def test_a_full_disk_is_said_once_and_nothing_is_lost_that_it_takes_later(
     box.begin("day")
     full[0] = True
     for n in range(1, 4):
-        name = f"day-{n:03d}"
-        box.leave(name, lambda name=name: ballot(name), f"day-{n + 1:03d}")  # type: ignore[misc]
+        leave(box, n)
     while box.report.failed_writes < 4:
         pass
     assert said(tmp_path / "out") == {}
@@ -216,8 +206,7 @@ def test_while_the_server_is_away_ballots_wait_in_the_spool_and_the_scan_loop_do
     box = Outbox(tmp_path / "home/live", "car", client=away, say=lambda _: None, retry_s=0.02)
     box.begin("day")
     for n in range(1, 21):
-        name = f"day-{n:03d}"
-        box.leave(name, lambda name=name: ballot(name), f"day-{n + 1:03d}")  # type: ignore[misc]
+        leave(box, n)
     box.close()
     assert away.waiting("car") == box.report.spooled == 20
     assert box.report.sent == 0

@@ -201,7 +201,9 @@ class LiveDrive:
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
         self._period_ns = 0
         """Between scans: the shortest recent step."""
-        self._first, self._held = first, list[tuple[str, Callable[[], Ballot], str | None]]()
+        self.first = first
+        """None once :meth:`first_findings` was asked."""
+        self._held = list[tuple[str, Callable[[], Ballot], str | None]]()
         self.checked_now = False
         """Whether the first seconds are over and their findings were not asked for."""
 
@@ -209,11 +211,6 @@ class LiveDrive:
     def drive_id(self) -> str:
         """Of the ballot that is open."""
         return stretch_name(self.name, self.number)
-
-    @property
-    def unchecked(self) -> bool:
-        """Whether :meth:`first_findings` was not asked yet."""
-        return self._first is not None
 
     @property
     def waiting(self) -> int:
@@ -299,7 +296,7 @@ class LiveDrive:
     def first_findings(self) -> list[Finding]:
         """The findings of the first seconds. Ballots that waited for them leave, unless one is an error. Empty if it
         was asked before, or nothing was observed."""
-        first, self._first, self.checked_now = self._first, None, False
+        first, self.first, self.checked_now = self.first, None, False
         if first is None or self.vehicle is None:
             return []
         found = first.findings(self.vehicle, self.vehicle.point_map)
@@ -351,8 +348,8 @@ class LiveDrive:
             self.vehicle = self._make_vehicle(self._maps.current())
             self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(), 0
         vehicle = self.vehicle
-        if self._first is not None:
-            self.checked_now = self._first.add(scan, prior, vehicle)
+        if self.first is not None:
+            self.checked_now = self.first.add(scan, prior, vehicle)
         self._observed.append((waiting.stamp_ns, waiting.sent_ns))
         self.counts.observed += 1
         vehicle.observe(scan, prior)
@@ -398,7 +395,7 @@ class LiveDrive:
         self.counts.ballots += 1
         self._touched.clear()
         self._held.append((closed, written, self.drive_id))
-        if self._first is None:
+        if self.first is None:
             self._release()
 
     def _prior(self, time_ns: int) -> F64 | None:

@@ -192,7 +192,7 @@ class Outbox:
 
     def discard(self, drive: str) -> None:
         """Delete the journal of this ballot. Returns at once."""
-        self._work.put(lambda: self._drop(drive))
+        self._work.put(lambda: self._end_journal(drive))
 
     def _raise_if_broken(self) -> None:
         if self._broken is not None:
@@ -248,7 +248,7 @@ class Outbox:
         except MapvoteError as error:
             self.report.empty += 1
             self._say(f"{drive}: no ballot ({error})")
-            self._drop(drive)
+            self._end_journal(drive)
             return
         self._say(f"{drive}: {ballot.scans_localised} of {ballot.scans} scans voted")
         self._unwritten[drive] = encode(ballot)
@@ -266,6 +266,7 @@ class Outbox:
                 self._put_down(drive, data)
                 del self._unwritten[drive]
                 self.report.closed += 1
+            if drive not in self._unwritten:
                 self._end_journal(drive)
         self._pass_on()
 
@@ -273,13 +274,10 @@ class Outbox:
         with whole_file(self._path(drive, "ballot"), private=True) as part:
             part.write_bytes(data)
 
-    def _drop(self, drive: str) -> None:
-        with self._disk_may_fail():
-            self._end_journal(drive)
-
     def _end_journal(self, drive: str) -> None:
-        self._journals.pop(drive, None)
-        self._path(drive, "journal").unlink(missing_ok=True)
+        with self._disk_may_fail():
+            self._journals.pop(drive, None)
+            self._path(drive, "journal").unlink(missing_ok=True)
 
     def _pass_on(self) -> None:
         """Move whole ballots to the folder and the spool. Each is in a file at every moment; twice is harmless."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mapvote.client import Manifest, MapClient, Refused, Unreachable
+from mapvote.codec.ballot import tile_index
 from mapvote.core.grid import Lattice, TileIndex, window_around
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
@@ -34,7 +35,7 @@ class Version:
         """``shared``: tiles of other versions by the hashes of their planes; those that stayed the same are shared."""
         self._client, self._shared = client, shared
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
-        self.planes = {_index(key): planes for key, planes in manifest.tiles.items()}
+        self.planes = {tile_index(key): planes for key, planes in manifest.tiles.items()}
         self.tiles = LazyTiles(self._load, {})
         georeference, number = manifest.georeference, manifest.version
         self.point_map = PointMap(manifest.map_id, lattice, self.tiles, georeference, version=number)
@@ -50,18 +51,12 @@ class Version:
         """Those of :meth:`around` that are not here."""
         return [tile for tile in self.around(position, half_m) if tile not in self.tiles]
 
-    def get(self, tile: TileIndex, client: MapClient) -> None:
-        """Have a tile here. Raises as :meth:`MapClient.fetch`."""
-        planes = self.planes[tile]
-        client.download(planes)
-        self.tiles.add(tile, client.points_of(planes))
-
     def _load(self, index: TileIndex) -> Tile:
-        planes = self.planes[index]
-        name = " ".join(planes.planes().values())
+        name = " ".join(self.planes[index].planes().values())
         tile = self._shared.get(name)
         if tile is None:
-            tile = self._shared[name] = self._client.tile(self.point_map.lattice.tile(index), planes)
+            window = self.point_map.lattice.tile(index)
+            tile = self._shared[name] = self._client.tile(window, self.planes[index])
         return tile
 
 
@@ -169,11 +164,12 @@ class RoadMap:
                 if self._ended.is_set():
                     return
                 try:
-                    version.get(tile, self._fetcher)
+                    self._fetcher.download(version.planes[tile])
                 except Refused:
                     if version is self._coming:
                         raise
                     break  # the server has dropped what this version alone had: the next one is coming
+                version.tiles.add(tile, self._fetcher.points_of(version.planes[tile]))
         if self._current is not self._coming:
             self._current = self._coming
             log.info("version %d of the map is here", self._coming.point_map.version)
@@ -198,8 +194,3 @@ def _closing(work: Callable[[], None], client: MapClient) -> None:
     """``work``, then close its client: closed by another thread, a request would fail or leave its socket open."""
     with client:
         work()
-
-
-def _index(key: str) -> TileIndex:
-    row, _, col = key.partition(",")
-    return int(row), int(col)

@@ -143,7 +143,7 @@ def run(
 
 def _check(live: LiveDrive, topics: Subscriptions) -> None:
     """Log the findings of the first seconds. MapvoteError if one is an error: the drive is useless, nothing leaves."""
-    wrong = topics.clocks.trouble() if live.unchecked else ""
+    wrong = topics.clocks.trouble() if live.first is not None else ""
     for finding in [] if wrong else live.first_findings():
         if finding.severity == "error":
             wrong = f"{finding.what}. {finding.mend}"
