@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mapvote.comparison.patches import Patches
 from mapvote.comparison.register import Registered, register_maps, with_free_space_of
-from mapvote.core.geometry import inverse, transform
+from mapvote.core.geometry import inverse, poses_at, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
@@ -124,14 +124,12 @@ def _refuse_contradictions(pairs: dict[tuple[int, int], Registered], apart_m: di
 def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
     first = maps[0]
     cloud = VoxelCloud(first.lattice)
-    driven = []
     moved = [transform(T_first, points) for T_first, points in zip(T, clouds, strict=True)]
     for points in moved:
         cloud.enter(points)
-    for one, T_first in zip(maps, T, strict=True):
-        driven += [transform(T_first, path) for path in one.driven]
+    driven = [transform(T_first, path) for one, T_first in zip(maps, T, strict=True) for path in one.driven]
     points = cloud.points()[0]
-    roads = [road_under(_poses(path), np.ones(len(path), dtype=np.bool_), points).points_map for path in driven]
+    roads = [road_under(poses_at(path), np.ones(len(path), dtype=np.bool_), points).points_map for path in driven]
     merged = map_from_points(
         points,
         lattice=first.lattice,
@@ -189,9 +187,3 @@ def _without_strays(merged: PointMap, maps: Sequence[PointMap], T: F64) -> Point
     ends = np.cumsum([len(merged.tiles[index].points) for index in indices])
     parts = zip(indices, np.split(dropped, ends[:-1]), strict=True)
     return replace(merged, tiles={index: merged.tiles[index].without(part) for index, part in parts})
-
-
-def _poses(path: F64) -> F64:
-    T = np.tile(np.eye(4), (len(path), 1, 1))
-    T[:, :3, 3] = path
-    return T

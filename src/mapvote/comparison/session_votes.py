@@ -20,7 +20,7 @@ from mapvote.comparison.cloud_changes import BAND, CellComparison, CloudChange, 
 from mapvote.comparison.register import Registered, register_maps
 from mapvote.config import Settings
 from mapvote.core.columns import dilated, rebased
-from mapvote.core.geometry import rows_from, transform
+from mapvote.core.geometry import poses_at, rows_from, transform
 from mapvote.core.grid import Grid, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
@@ -92,19 +92,14 @@ def vote_of_session(
 
 
 def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveReport:
-    """The session as a drive: its "scans" are the patches that were compared, those that do not agree are lost."""
-    shown = np.flatnonzero(registered.patches.compared)
-    poses = [registered.patches.T_a_patch[k] for k in shown]
-    lost = [i for i, k in enumerate(shown) if not registered.fit.agree[k]]
+    """The session as a drive: its "scans" are the patches that were compared, those that do not agree are lost. With a
+    trajectory they are its positions."""
+    shown = registered.patches.compared
+    poses, lost = registered.patches.T_a_patch[shown], np.flatnonzero(~registered.fit.agree[shown]).tolist()
     if driven is not None:
-        poses, lost = [], []
-        for position in driven:
-            T = np.eye(4)
-            T[:3, 3] = position
-            poses.append(T)
-    sigma_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
-    stamps_ns = [end_ns] * len(poses)
-    return DriveReport(stamps_ns, lost, sigma_m, poses, priors=[None] * len(poses))
+        poses, lost = poses_at(driven), []
+    sigmas_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
+    return DriveReport([end_ns] * len(poses), lost, sigmas_m, list(poses), priors=[None] * len(poses))
 
 
 class _SessionVoter:

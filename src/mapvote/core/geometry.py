@@ -122,6 +122,13 @@ def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float =
     return T
 
 
+def poses_at(positions: F64) -> F64:
+    """(n, 4, 4) of positions (n, 3), turned by nothing."""
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    T[:, :3, 3] = positions
+    return T
+
+
 def rotation_angle(T: F64) -> float:
     """Magnitude of the rotation of T, radians in [0, pi]."""
     return float(np.linalg.norm(log(T)[3:]))
