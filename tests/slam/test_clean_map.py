@@ -307,13 +307,37 @@ def mapped(seen: Callable[[int], F64], x: F64, draft: F64, **mapping: object) ->
     return all_points(mapper.finish())
 
 
-def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_the_road_itself() -> None:
-    cells = [(1, 2), (1, 2), (1, 3), (0, 1), (2, 3), (1, 0), (3, 2), (1, 3)]
-    z, moving = np.array([0.8, 0.05, 0.2, 0.2, 0.2, 0.2, 0.2, 0.8]), np.arange(8) == 0
-    points, flat = np.column_stack([np.ones((8, 2)), z]), np.array([4 * r + c for r, c in cells], np.int32)
-    out, ground_z = np.zeros(8, np.bool_), np.zeros((4, 4), np.float32)
-    _no_map(points, np.zeros(3), 1e4, moving, z >= 0.3, flat, ground_z, np.zeros(16, np.bool_), out)
-    assert out.tolist() == [True, False, True, True, True, False, False, False]
+@pytest.mark.parametrize(("passed", "stays"), [(3, False), (0, True)])
+def test_a_row_that_more_scans_passed_than_hit_stays_out_of_the_map(passed: int, stays: bool) -> None:
+    road = wall([(r, c) for r in range(40) for c in range(40)], [0.05]).astype(np.float64)
+    street, row = make_map({(0, 0): make_tile(road.astype(np.float32))}), row_of(8) + np.array([3.0, 3.0, -0.45])
+    mapper = Mapper(street, Settings())
+    hit = one_scan(street, np.concatenate([road, row]))
+    mapper._add([hit, *[one_scan(street, road)] * passed])
+    assert (all_points(mapper.finish())[:, 2] > 1.0).any() == stays
+
+
+@pytest.mark.parametrize(
+    ("cells", "z", "out"),
+    [
+        (
+            [(1, 2), (1, 2), (1, 3), (0, 1), (2, 3), (1, 0), (3, 2), (1, 3)],
+            [0.8, 0.05, 0.2, 0.2, 0.2, 0.2, 0.2, 0.8],
+            [True, False, True, True, True, False, False, False],
+        ),
+        ([(0, 0), (0, 0), (0, 1), (2, 0)], [0.8, 0.2, 0.2, 0.2], [True, True, True, False]),
+    ],
+)
+def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_the_road_itself(
+    cells: list[tuple[int, int]], z: list[float], out: list[bool]
+) -> None:
+    """The first of the points moves."""
+    n, flat = len(z), np.array([4 * r + c for r, c in cells], np.int32)
+    points, found = np.column_stack([np.ones((n, 2)), z]), np.zeros(n, np.bool_)
+    obstacle, scratch = points[:, 2] >= 0.3, np.zeros(16, np.bool_)
+    ground_z = np.zeros((4, 4), np.float32)
+    _no_map(points, np.zeros(3), 1e4, np.arange(n) == 0, obstacle, flat, ground_z, scratch, found)
+    assert found.tolist() == out
 
 
 def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart() -> None:
