@@ -278,6 +278,14 @@ def test_where_a_vehicle_drove_below_a_bridge_nothing_is_left_out() -> None:
     assert left_out(np.vstack([street, bridge]), over, kerb) == [True], "one level a cell: the street was not driven"
 
 
+def test_a_bridge_that_is_far_away_protects_no_reflection() -> None:
+    street, bridge = sheet((0, 120), (12, 18), 0.0), sheet((6, 9), (12, 18), 6.0)
+    under = np.column_stack([np.arange(0.0, 120.0, 0.15), np.full(800, 15.0), np.zeros(800)])
+    over = np.column_stack([np.full(40, 7.5), np.arange(12.0, 18.0, 0.15), np.full(40, 6.0)])
+    below = np.array([[20.0, 15.0, -3.0], [110.0, 15.0, -3.0]])
+    assert left_out(np.vstack([street, bridge]), np.vstack([under, over]), below) == [False, True]
+
+
 AHEAD_M = 60.0
 WALL_X = 100.0
 
@@ -326,6 +334,7 @@ def test_a_row_that_more_scans_passed_than_hit_stays_out_of_the_map(passed: int,
             [True, False, True, True, True, False, False, False],
         ),
         ([(0, 0), (0, 0), (0, 1), (2, 0)], [0.8, 0.2, 0.2, 0.2], [True, True, True, False]),
+        ([(2, 2), (0, 2), (3, 3), (2, 0)], [0.8, 0.2, 0.2, 0.2], [True, False, True, False]),
     ],
 )
 def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_the_road_itself(
