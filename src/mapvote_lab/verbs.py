@@ -73,7 +73,7 @@ def evaluate(
         Path | None, typer.Option(metavar="FOLDER", help="where drives, maps and ballots are kept")
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
+        str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e, hdl64e or beams128; else the scenario's")
     ] = None,
     cars: Annotated[
         int | None, typer.Option(metavar="N", min=0, help="cars that park during one vehicle's pass only, for each")

@@ -85,5 +85,6 @@ def test_a_cell_goes_along_that_touches_what_went_if_rays_passed_half_of_it_and_
         for k, said in enumerate(cells, 1):
             facts.passed[0, k] = 0b110001111 if said == "N" else 0b111000000
             facts.stands[0, k] = 0b10000 * (said == "S")
-        states = judge_window(facts, occupied, np.where(occupied != 0, np.float32(3.0), np.float32(np.nan)), 0.5)[0]
+        rise_m = np.where(occupied != 0, np.float32(3.0), np.float32(np.nan))
+        states = judge_window(facts, occupied, rise_m, 0.5)[0]
         assert np.flatnonzero(states == CellState.CHANGED_EMPTY).tolist() == list(range(len(along) + 1))

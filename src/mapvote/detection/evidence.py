@@ -57,8 +57,7 @@ NEW_RAYS = 0.5
 SUPPORT = 6
 """Voxels of a change: a pole of 1.8 m, half a square metre."""
 NEW_A_CELL, NEW_ENOUGH = 2, 40
-"""Voxels more that something new needs for each further cell, because what is thinner is noise; and at most, for large
-low objects."""
+"""Voxels more for each further cell of a new object, as thinner ones are noise; the most, for large low objects."""
 REACH_CELLS = 3
 """How far behind a surface that is gone another may have been hidden: .9 m."""
 
@@ -68,34 +67,25 @@ WORDS = PASSED + 1
 NOTHING = np.uint64(0)
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 _NEAR_GROUND = np.uint64(0b1111)
-"""A column that has one of these voxels begins within 1.2 m of the ground."""
 _AROUND = np.ones((3, 3))
 
 
 def count_scan(evidence: PackedTiles, seen: Observation) -> U64:
     """Count one scan in the ``evidence`` of a drive, a vehicle's or a survey's: WORDS words a cell. Returns (rows,
     cols) words of the voxels that hold a return which the map does not explain."""
-    view, here = seen.view, seen.reference
-    near, apart = near_hits(seen)
-    for planes, part in evidence.under(view.grid):
-        _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
-    evidence.leave(view.grid)
-    return apart
-
-
-def near_hits(seen: Observation) -> tuple[U64, U64]:
-    """(near, apart), (rows, cols) words each: the voxels within HIT_REACH_M of a return of a still obstacle; and those
-    that hold such a return which has no mapped voxel so near."""
-    here, scan, grid = seen.reference, seen.scan, seen.view.grid
+    view, here, scan, grid = seen.view, seen.reference, seen.scan, seen.view.grid
     near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
     cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
     still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
-    _mark_near(scan.points_map, cell, still, here.base, here.occupied, corner, HIT_REACH_M / CELL_SIZE, near, apart)
-    return near, apart
+    mark_near(scan.points_map, cell, still, here.base, here.occupied, corner, HIT_REACH_M / CELL_SIZE, near, apart)
+    for planes, part in evidence.under(grid):
+        _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
+    evidence.leave(grid)
+    return apart
 
 
 @kernel
-def _mark_near(
+def mark_near(
     points: F64, cell: I32, chosen: Bool, base: I32, occupied: U64, corner: tuple[float, float], reach: float,
     near: U64, apart: U64,
 ) -> None:  # fmt: skip
@@ -140,8 +130,7 @@ def _enter_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
 
 @kernel
 def least_passed(cell: U64, bit: int) -> int:
-    """min(p, a, b) of voxel ``bit`` of a cell (WORDS,): all scans together crossed it at most so often. Its ends are
-    bounded as in one scan."""
+    """min(p, a, b) of voxel ``bit`` of a cell (WORDS,); the ends of the word are bounded as in one scan."""
     least = count_of(cell, PASSES, bit)
     if bit + 1 < TOP_BIT:
         least = min(least, count_of(cell, PASSES, bit + 1))
@@ -205,8 +194,8 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
 
 def judge_window(drive: Facts, occupied: U64, height_m: F32, min_height_m: float) -> tuple[U8, U64, U64]:
     """(states, gone, new), (rows, cols) each, of a window of which the map knows the ``occupied`` voxels and how high
-    they rise over the ground, not finite where there are none: ``gone`` the voxels that went, of changed-empty cells
-    and of cells that stand; ``new`` those that came."""
+    they rise over the ground, not finite where there are none. ``gone`` are the voxels that went, of changed-empty
+    cells and of cells that stand, ``new`` those that came."""
     mapped, stands, passed = occupied != 0, drive.stands != 0, drive.passed != 0
     high = mapped & (height_m >= min_height_m)
     gone: U64 = np.where(high, drive.gone, NOTHING)
@@ -219,9 +208,7 @@ def judge_window(drive: Facts, occupied: U64, height_m: F32, min_height_m: float
     empty: Bool = (gone != 0) & ~stands
     firm = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty, np.zeros_like(drive.balance))
     seen_through = 2 * np.bitwise_count(occupied & drive.passed) >= np.bitwise_count(occupied)
-    # Hysteresis (Canny 1986): few rays cross the far wall of a demolished house.
-    along = firm | (high & ~stands & seen_through)
-    went = along & (over_groups(along, firm)[0] > 0)
+    went = grown(firm, high & ~stands & seen_through)
     states[went] = CellState.CHANGED_EMPTY
     gone = np.where(went, occupied, gone)
 
@@ -235,13 +222,20 @@ def judge_window(drive: Facts, occupied: U64, height_m: F32, min_height_m: float
 def enough(voxels: U64, a_cell: int, others: Bool, balance: I32) -> Bool:
     """(rows, cols) cells whose 8-connected group has enough ``voxels`` (rows, cols), ``a_cell`` more for each further
     cell, and no negative ``balance``. Of a separate small object on the ground (a bollard) any two voxels on top of
-    each other are enough: it touches none of the ``others``, and each of its columns begins near the ground."""
+    each other are enough: it touches none of the ``others``, and its columns begin within 1.2 m of the ground."""
     cells = voxels != 0
     tall = voxels & (voxels >> np.uint64(1)) != 0
     tied = ndimage.binary_dilation(others, _AROUND) | (voxels & _NEAR_GROUND == 0)
     size, count, talls, ties, left = over_groups(cells, np.bitwise_count(voxels), cells, tall, tied, balance)
     large = size >= np.minimum(SUPPORT + a_cell * (count - 1), NEW_ENOUGH)
     return np.asarray(cells & (left >= 0) & (large | ((talls > 0) & (ties == 0))))
+
+
+def grown(strong: Bool, weak: Bool) -> Bool:
+    """(rows, cols) ``strong`` cells, and ``weak`` ones connected to them (8): hysteresis (Canny 1986).
+    Few rays cross the far wall of a demolished house."""
+    both = strong | weak
+    return np.asarray(both & (over_groups(both, strong)[0] > 0))
 
 
 def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:

@@ -5,7 +5,7 @@ Every ratio is 0.0 where nothing is counted (0/0 = 0), so that no score is ever 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -179,6 +179,9 @@ class MapScores(msgspec.Struct, frozen=True, kw_only=True):
     """Samples of reachable new surface with a point of the updated map within reach."""
     added_false: float
     """Added points that lie on no surface of the new world."""
+    added_false_scored: float
+    """Those of them in cells that the truth scores: a car that was parked in some passes only is neither right nor
+    wrong."""
     stale_points: int
     valid_points: int
     new_samples: int
@@ -191,11 +194,21 @@ class MapJudge:
     ``old_points`` (n, 3) are the obstacle points of the map before the update. ``kept``, ``added`` and ``removed``
     (m, 3) are surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old
     point is stale if a removed sample lies within ``reach_m`` and no kept or added one nearer; valid if the nearest
-    sample within reach is a kept one. Points near no surface (trails, noise) are neither.
+    sample within reach is a kept one. Points near no surface (trails, noise) are neither. ``scored``: which of points
+    (n, 3) lie in cells that the truth scores; None: all.
     """
 
-    def __init__(self, old_points: F64, kept: F64, added: F64, removed: F64, *, reach_m: float = 0.3) -> None:
-        self._old, self._added, self._reach_m = old_points, added, reach_m
+    def __init__(
+        self,
+        old_points: F64,
+        kept: F64,
+        added: F64,
+        removed: F64,
+        scored: Callable[[F64], Bool] | None = None,
+        *,
+        reach_m: float = 0.3,
+    ) -> None:
+        self._old, self._added, self._scored, self._reach_m = old_points, added, scored, reach_m
         self._now = cKDTree(np.concatenate([kept, added]))
         to_removed = _distance(old_points, cKDTree(removed))
         to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
@@ -206,11 +219,14 @@ class MapJudge:
         """``new_points`` (n, 3): the obstacle points of the updated map; an old one survives if found bit for bit."""
         survived, fresh = same_rows(self._old, new_points)
         reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
+        false = fresh[_distance(fresh, self._now) > self._reach_m]
+        scored = len(false) if self._scored is None else np.count_nonzero(self._scored(false))
         return MapScores(
             stale_deleted=ratio(np.count_nonzero(self.stale & ~survived), np.count_nonzero(self.stale)),
             valid_deleted=ratio(np.count_nonzero(self.valid & ~survived), np.count_nonzero(self.valid)),
             new_added=ratio(np.count_nonzero(reached), len(self._added)),
-            added_false=ratio(np.count_nonzero(_distance(fresh, self._now) > self._reach_m), len(fresh)),
+            added_false=ratio(len(false), len(fresh)),
+            added_false_scored=ratio(scored, len(fresh)),
             stale_points=int(np.count_nonzero(self.stale)),
             valid_points=int(np.count_nonzero(self.valid)),
             new_samples=len(self._added),

@@ -163,10 +163,11 @@ def test_what_stands_nearer_than_what_went_is_no_stale_point() -> None:
 def test_added_points_are_counted_and_judged_by_what_stands_now() -> None:
     kept, added = np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0], [6.0, 0, 0]])
     new = np.array([[0.0, 0, 0], [5.29, 0, 0], [0.2, 0, 0], [5.6, 0, 0], [9.0, 0, 0]])
-    scores = MapJudge(kept, kept, added, np.zeros((0, 3))).score(new)
+    scores = MapJudge(kept, kept, added, np.zeros((0, 3)), lambda points: points[:, 0] < 7).score(new)
     assert (scores.added_points, scores.new_samples) == (4, 2)
     assert scores.new_added == 0.5, "one sample has a point within reach, the other not"
     assert scores.added_false == 0.5, "two of four lie on nothing"
+    assert scores.added_false_scored == 0.25, "one of them in a cell that the truth scores"
 
 
 def test_a_point_just_within_reach_of_a_surface_lies_on_it() -> None:

@@ -224,13 +224,14 @@ def _map_table(result: EvaluationResult) -> Iterator[Sheet]:
                     _percent(scores.valid_deleted, 3),
                     _percent(scores.new_added, 2),
                     _percent(scores.added_false, 2),
+                    _percent(scores.added_false_scored, 2),
                     f"{sum(objects.found)} of {len(objects.found)}",
                     f"{len(false)}, largest {false[0]:.1f} m²" if false else "none",
                 ]
             )
     headings = [
-        "", "stale deleted", "valid deleted", "new surface added", "added on no surface", "objects found",
-        "false objects",
+        "", "stale deleted", "valid deleted", "new surface added", "added on no surface", "in scored cells",
+        "objects found", "false objects",
     ]  # fmt: skip
     if rows:
         yield Sheet("The updated map", headings, rows)

@@ -1,4 +1,4 @@
-"""What a scan adds to the evidence of each voxel: hit, passed, held against a reference bit by bit."""
+"""What a scan adds to the counts of each voxel, against a plain reference; what a hit speaks for, box by box."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.core.columns import TOP_BIT
-from mapvote.core.grid import TILE_CELLS, Grid, Lattice
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64
+from mapvote.core.types import F64, Reference
 from mapvote.detection.evidence import (
     CROSSED,
     HIT,
+    HIT_REACH_M,
     PASSED,
     PASSES,
     WORDS,
     count_scan,
     free_words,
     least_passed,
-    near_hits,
+    mark_near,
 )
 from mapvote.detection.packed_tiles import PLANES, PackedTiles, count_of
-from mapvote.perception.frontend import Observation
-from mapvote.perception.raycast import ScanView
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import ScanView, find_obstacles
 
 ROWS, COLS = range(100, 104), range(100, 105)
 FULL = 2**PLANES - 1
@@ -47,6 +48,16 @@ def seen_from(point_map: PointMap, points: F64, seed: int) -> Observation:
     some |= rng.integers(0, 2**63, seen.view.passed.shape, dtype=np.uint64)
     seen.view.passed[:] = np.where(rng.random(some.shape) < 0.3, np.uint64(0), some)
     return seen
+
+
+def near_hits(seen: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """(near, apart) of a scan: (rows, cols) words each."""
+    here, scan, grid = seen.reference, seen.scan, seen.view.grid
+    near, apart = np.zeros((2, *grid.shape), np.uint64)
+    still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
+    reach = HIT_REACH_M / CELL_SIZE
+    mark_near(scan.points_map, scan.cell, still, here.base, here.occupied, corner, reach, near, apart)
+    return near, apart
 
 
 def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool, bool]:
@@ -151,3 +162,86 @@ def test_cells_of_unknown_ground_gather_nothing() -> None:
     evidence = PackedTiles(point_map.lattice, WORDS)
     count_scan(evidence, replace(seen, reference=unknown))
     assert not any(planes.any() for planes in evidence.values())
+
+
+SIDE = 7
+
+
+def bare_scan(
+    points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied: np.ndarray | None = None
+) -> Observation:
+    """A scan over a window of SIDE by SIDE cells whose columns begin at the layers ``base``; no ray is followed."""
+    grid = Grid(Lattice(0.05, -0.1), 3, -4, SIDE, SIDE)
+    none = np.full(grid.shape, np.inf, np.float32)
+    words, counts = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.int32)
+    ground_z = (base * CELL_SIZE).astype(np.float32)
+    mapped = words if occupied is None else occupied
+    reference = Reference(grid, ground_z, base, mapped, counts, none, -none, None)
+    obstacle, cell = find_obstacles(points, reference)
+    up = np.array([0.0, 0.0, 1.0])
+    scan = PlacedScan(0, points, np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
+    view = ScanView(grid, counts, words, words, np.zeros((0, 0), np.uint8))
+    return Observation(scan, moving, view, reference)
+
+
+def by_boxes(here: Observation) -> np.ndarray:
+    """(rows, cols) words: every voxel whose box, widened by the reach, holds a point that counts."""
+    grid, base = here.view.grid, here.reference.base
+    near, (x, y) = np.zeros(grid.shape, np.uint64), grid.centres()
+    stands = here.scan.points_map[here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)]
+    for r, c in np.ndindex(*grid.shape):
+        off_x, off_y = stands[:, 0] - x[c], stands[:, 1] - y[r]
+        for z in stands[np.maximum(np.abs(off_x), np.abs(off_y)) <= CELL_SIZE / 2 + HIT_REACH_M, 2]:
+            for layer in range(int(np.floor((z - HIT_REACH_M) / CELL_SIZE)), int((z + HIT_REACH_M) // CELL_SIZE) + 1):
+                near[r, c] |= np.uint64(1) << np.uint64(np.clip(layer - base[r, c], 0, TOP_BIT))
+    return near
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.integers(0, 40))
+def test_a_hit_speaks_for_every_voxel_whose_box_it_comes_within_reach_of(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
+    low, high = np.array([-1.3, 0.7, -2.0]), np.array([1.1, 3.1, 24.0])
+    here = bare_scan(rng.uniform(low, high, (n, 3)), base, rng.random(n) < 0.2)
+    assert np.array_equal(near_hits(here)[0], by_boxes(here))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.integers(0, 40))
+def test_a_hit_that_speaks_for_a_mapped_voxel_strikes_no_other(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
+    mapped = rng.integers(0, 2**63, (SIDE, SIDE), np.uint64) & rng.integers(0, 2**63, (SIDE, SIDE), np.uint64)
+    points = rng.uniform([-1.3, 0.7, -2.0], [1.1, 3.1, 12.0], (n, 3))
+    here = bare_scan(points, base, rng.random(n) < 0.2, mapped)
+    struck = np.zeros_like(mapped)
+    for k in np.flatnonzero(here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)):
+        alone = bare_scan(points[k : k + 1], base, np.array([False]), mapped)
+        if not (by_boxes(alone) & mapped).any():
+            row, col = divmod(int(here.scan.cell[k]), SIDE)
+            layer = int(points[k, 2] // CELL_SIZE) - base[row, col]
+            struck[row, col] |= np.uint64(1) << np.uint64(np.clip(layer, 0, TOP_BIT))
+    assert np.array_equal(near_hits(here)[1], struck)
+
+
+def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
+    flat = np.zeros((SIDE, SIDE), np.int32)
+    points = np.array([[0.0, 1.9, 0.1], [0.0, 1.9, 1.0]])
+    assert not any(words.any() for words in near_hits(bare_scan(points, flat, np.array([False, True]))))
+
+
+def test_no_hit_speaks_beyond_the_window() -> None:
+    """Hits at all four borders of planes that lie in larger ones, which nobody may touch."""
+    around, inner = np.zeros((2, SIDE + 2, SIDE + 2), np.uint64), np.s_[:, 1:-1, 1:-1]
+    near, apart = around[inner]
+    low, high = 0.01, SIDE * CELL_SIZE - 0.01
+    points = np.array([[x, y, 1.0] for x in (low, 1.0, high) for y in (low, 1.0, high)])
+    cell = (points[:, :2] // CELL_SIZE).astype(np.int32) @ np.array([1, SIDE], dtype=np.int32)
+    chosen, reach = np.ones(len(points), np.bool_), HIT_REACH_M / CELL_SIZE
+    mapped, base = np.zeros((SIDE, SIDE), np.uint64), np.zeros((SIDE, SIDE), np.int32)
+    mark_near(points, cell, chosen, base, mapped, (0.0, 0.0), reach, near, apart)
+    assert set(cell) <= set(np.flatnonzero(near))
+    assert set(cell) == set(np.flatnonzero(apart))
+    around[inner] = 0
+    assert not around.any()
