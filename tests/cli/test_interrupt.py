@@ -145,7 +145,7 @@ def what_is_in(path: Path) -> tuple[list[int], list[str]]:
 WRITERS = {
     "map": ("import city.pcd out", "import mapvote.formats.maps.mapvote_folder as m; m.pack_tile = wait"),
     "points": ("export my_map out.pcd", "import mapvote.formats.maps.pcd as m; m.table_of = wait"),
-    "tiles": ("export my_map out", "import pypcd4 as m; m.PointCloud.save = wait"),
+    "tiles": ("export my_map out", "import mapvote.formats.maps.pcd as m; m.table_of = wait"),
     "the disk's own time": ("export my_map out.pcd", "import os as m; m.fsync = wait"),
     "a map in the place of another": ("update my_map car_1.ballot --out out", "import os as m; m.fsync = wait"),
     "between the two renames of a map": (
