@@ -55,6 +55,9 @@ SENSORS: dict[str, Sensor] = {
         Sensor("vlp16", _even(15.0, -15.0, 16), 0.2),
         Sensor("hdl32e", _even(10.67, -30.67, 32), 0.16),
         Sensor("hdl64e", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 0.1728, max_range_m=120.0),
-        Sensor("beams128", _even(15.0, -25.0, 128), 0.2),  # the field of view of several makes of 128 beams
     )
 }
+"""Models by name: those that scans are recognised as."""
+NAMED = SENSORS | {"beams128": Sensor("beams128", _even(15.0, -25.0, 128), 0.2)}
+"""What a drive or a scenario may name: these, and 128 beams over the field of view that several makes have. No scan is
+recognised as that one: it is nobody's, and so dense that the rings of others lie on its beams."""

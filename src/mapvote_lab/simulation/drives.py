@@ -15,7 +15,7 @@ import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
@@ -99,7 +99,7 @@ class Stage:
 @lru_cache(maxsize=1)
 def _stage(scenario: Scenario, seed: int) -> Stage:
     world = make_world(scenario, seed)
-    model = SENSORS[scenario.sensor]
+    model = NAMED[scenario.sensor]
     noise = scenario.flaws.range_sigma_m
     sigma_m = model.range_sigma_m if noise is None else noise
     sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz), range_sigma_m=sigma_m)

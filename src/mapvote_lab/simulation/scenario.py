@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mapvote.core.sensors import SENSORS
+from mapvote.core.sensors import NAMED
 from mapvote.core.types import MapvoteError
 
 
@@ -137,8 +137,8 @@ def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = No
             f"scenario {scenario}: {'.'.join(str(part) for part in first['loc'])}: {first['msg']} "
             f"(known keys: {', '.join(Scenario.model_fields)})"
         ) from error
-    if found.sensor not in SENSORS:
-        raise MapvoteError(f"scenario {scenario}: sensor '{found.sensor}' unknown; choose one of {', '.join(SENSORS)}")
+    if found.sensor not in NAMED:
+        raise MapvoteError(f"scenario {scenario}: sensor '{found.sensor}' unknown; choose one of {', '.join(NAMED)}")
     for lane in (*found.surveys, *found.vehicle_lanes):
         if lane not in LANES:
             raise MapvoteError(f"scenario {scenario}: lane '{lane}' unknown; choose one of {', '.join(LANES)}")

@@ -15,7 +15,7 @@ from msgspec import structs
 
 from mapvote.config import did_you_mean
 from mapvote.core import geometry
-from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
@@ -46,7 +46,7 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
     vehicle: str | None = None
     drive: str | None = None
     sensor: str | dict[str, Any] | None = None
-    """A name of ``core.sensors.SENSORS``, or a table of Sensor's fields; a table wins over what the scans say."""
+    """A name of ``core.sensors.NAMED``, or a table of Sensor's fields; a table wins over what the scans say."""
     rate_hz: float | None = None
     start_ns: int = 0
     prior: str | None = None
@@ -115,12 +115,12 @@ def read_mount(numbers: list[float] | str, where: str) -> F64:
 def read_sensor(sensor: str | dict[str, Any], where: str) -> Sensor:
     """A sensor by name, or by a table of its fields. MapvoteError lists what is known."""
     if isinstance(sensor, str):
-        if sensor not in SENSORS:
+        if sensor not in NAMED:
             raise MapvoteError(
-                f"{where}: no sensor named {sensor!r}{did_you_mean(sensor, SENSORS)}; known: {', '.join(SENSORS)}; "
+                f"{where}: no sensor named {sensor!r}{did_you_mean(sensor, NAMED)}; known: {', '.join(NAMED)}; "
                 f"others as a table [sensor] in drive.toml (name, elevations_deg, azimuth_step_deg)"
             )
-        return SENSORS[sensor]
+        return NAMED[sensor]
     known = [f.name for f in fields(Sensor)]
     for key in sensor:
         if key not in known:
