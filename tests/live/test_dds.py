@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import time
 
 import numpy as np
 import pytest
@@ -81,6 +82,12 @@ def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(domain: int) -> Non
     ((_, data),) = until(incoming.take)
     scan = scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
     assert (scan.stamp_ns, len(scan.points)) == (START, 1000)
+
+
+def test_a_network_that_subscribes_to_nothing_yet_waits_as_long_as_it_is_told(domain: int) -> None:
+    start_s = time.monotonic()
+    Network(domain).wait(0.1)
+    assert time.monotonic() - start_s >= 0.1
 
 
 def test_joining_a_domain_leaves_the_users_configuration_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
