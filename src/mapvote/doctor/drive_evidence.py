@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
-from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration
+from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress, Severity
 from mapvote.doctor.scans import Looking, Looks, in_map_frame
 from mapvote.localisation.ndt import NdtMap, fitness, likeliest, refine, thin_for_levels
@@ -152,20 +152,24 @@ class DriveEvidence:
         return points @ _TURNED_OVER if self.road.up == "-z" else points
 
     @cached_property
+    def _scans(self) -> list[Scan]:
+        """``some``, as they are read."""
+        return [self.drive.read_scan(int(i)) for i in self.some]
+
+    @cached_property
     def road(self) -> Road:
         """As the points are read."""
-        return find_road([self.drive.read_scan(int(i)).points for i in self.some])
+        return find_road([scan.points for scan in self._scans])
 
     @cached_property
     def road_below(self) -> Road:
         """Of points turned over where the sensor is upside down."""
-        return find_road([self._points(i) for i in self.some]) if self.road.up == "-z" else self.road
+        return find_road([scan.points @ _TURNED_OVER for scan in self._scans]) if self.road.up == "-z" else self.road
 
     @cached_property
     def scatter_m(self) -> float:
         """Of ranges, of the first LiDAR: rays of another one begin elsewhere, and end on other things."""
-        scans = [self.drive.read_scan(int(i)) for i in self.some]
-        return float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in scans]))
+        return float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in self._scans]))
 
     @property
     def can_be_registered(self) -> bool:
