@@ -25,10 +25,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DECIDING = [
-    "core/voting", "core/ground_growing", "fusion/fuse", "fusion/tile_vote", "fusion/edit", "fusion/persistence",
+    "core/voting", "core/ground_growing", "fusion/fuse", "fusion/tile_vote", "fusion/edit",
     "fusion/distrust", "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper",
     "detection/evidence", "detection/packed_tiles", "detection/confidence", "perception/fans", "perception/raycast",
-    "slam/clean_map", "server/store/votes", "server/store/round", "localisation/odometry", "localisation/pose_check",
+    "slam/clean_map", "server/store/votes", "server/store/publish", "localisation/odometry", "localisation/pose_check",
 ]  # fmt: skip
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
@@ -36,10 +36,10 @@ TESTS = {
     "fusion/fuse": "fusion/test_fuse.py fusion/test_spent.py fusion/test_distrust.py fusion/test_rules_of_fusion.py",
     "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
-    "fusion/persistence": "fusion/test_persistence.py fusion/test_rules_of_fusion.py",
+    "fusion/change_time": "fusion/test_change_time.py fusion/test_rules_of_fusion.py",
     **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/confidence"), "detection"),
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
-    "server/store/round": "server/store/test_publish_limits.py server/views/test_rounds.py",
+    "server/store/publish": "server/store/test_publish_limits.py server/views/test_rounds.py",
 }
 """The tests that must notice; of the other modules those of the same name."""
 SWAPS = {

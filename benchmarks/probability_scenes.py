@@ -27,9 +27,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I8, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.confidence import depths_m
-from mapvote.fusion.fuse import Decision
+from mapvote.fusion.fuse import Decision, update_map
 from mapvote.fusion.loss_budget import alike_beside, standing_beside
-from mapvote.fusion.offline import update_map
 from mapvote.vehicle import NOTHING, Vehicle, offered
 from mapvote_lab.evaluation.experiments.conditions import Conditions
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest

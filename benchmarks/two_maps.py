@@ -20,8 +20,7 @@ from mapvote.comparison.register import brought_into
 from mapvote.config import Settings, choose_case
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.formats import open_drive, read_map, write_map
-from mapvote.fusion.fuse import states_over
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import states_over, update_map
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.scores import score_cells

@@ -19,9 +19,9 @@ from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish, rollback
-from mapvote.server.store.replay import replay
+from mapvote.server.store.publish import publish
 from mapvote.server.store.reviews import decide, undo
+from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken

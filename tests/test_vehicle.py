@@ -28,7 +28,7 @@ from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_po
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, NO_VOTE, CellState, Drive, MapvoteError, Registration, Scan
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import DriveReport

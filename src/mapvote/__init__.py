@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mapvote.formats import read_map as read_map
     from mapvote.formats import write_map as write_map
     from mapvote.formats.drives.point_fields import scan_from_point_cloud2 as scan_from_point_cloud2
-    from mapvote.fusion.offline import update_map as update_map
+    from mapvote.fusion.fuse import update_map as update_map
     from mapvote.slam.build import build_map as build_map
     from mapvote.vehicle import Vehicle as Vehicle
     from mapvote.vehicle import vote_drive as vote_drive

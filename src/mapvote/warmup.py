@@ -29,7 +29,7 @@ from mapvote.doctor.maps import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
 from mapvote.formats.drives.point_fields import BadPoints, scan_from_fields, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive

@@ -15,7 +15,7 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import read_map
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 
 NEW = (-2.0, -8.0, 2.0, -6.2, 1.5)
 SURFACES = choose_case(Settings(), "surfaces")

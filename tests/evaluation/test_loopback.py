@@ -13,7 +13,7 @@ from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats import write_map
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.evaluate import running_server, vote_by_http

@@ -16,6 +16,7 @@ from mapvote.config import FuseSettings, load_settings
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.fusion.fuse import update_map
 from mapvote.fusion.loss_budget import (
     PendingDeletions,
     agreed_odds,
@@ -28,7 +29,6 @@ from mapvote.fusion.loss_budget import (
     unpack_agreed,
     waypoints,
 )
-from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import Odds, TileVote, fold, silenced
 
 CELL, FLAT = (10, 10), 10 * 256 + 10

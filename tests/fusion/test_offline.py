@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, CellState, MapvoteError
 from mapvote.formats import read_map, write_map
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 
 KEEP = FuseSettings(min_votes=1)
 

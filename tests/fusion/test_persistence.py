@@ -14,13 +14,13 @@ from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
 from mapvote.core.types import CellState
-from mapvote.fusion.fuse import fuse_tile, unspent
-from mapvote.fusion.persistence import (
+from mapvote.fusion.change_time import (
     DAY_S,
     history_days,
     remembered,
     temporary,
 )
+from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)

@@ -361,8 +361,7 @@ def update(
     from mapvote.codec.ballot import decode
     from mapvote.config import load_with_sources
     from mapvote.formats import write_map
-    from mapvote.fusion.fuse import states_over
-    from mapvote.fusion.offline import update_map
+    from mapvote.fusion.fuse import states_over, update_map
 
     if out is None and not dry_run:
         raise MapvoteError("update: give --out MAP, or --dry-run to only report")

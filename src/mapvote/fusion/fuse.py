@@ -7,29 +7,33 @@ test: an object that appeared and disappeared leaves it bit for bit as at first,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.codec.ballot import Ballot, encode, tile_key, unpack_planes
+from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
+from mapvote.core.lazy_tiles import with_changed
+from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
-from mapvote.fusion.change_time import lately_changed
+from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, remembered, temporary
 from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, originals, without
 from mapvote.fusion.edit import add_points, delete_points, words_gone
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
-from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import nothing_reached
-from mapvote.fusion.tile_vote import Odds, TileVote, offered, one_each, silenced
+from mapvote.fusion.tile_vote import Odds, TileVote, newest_votes, offered, one_each, silenced
 
 Rule = Literal["paper", "columns"]
 """How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""
@@ -149,7 +153,7 @@ def decide_tile(
 
     ``drives`` are the votes that count on this tile (``newest_votes`` in fusion/tile_vote.py, ``unspent`` in
     fusion/fuse.py), any order. ``history``: called, where objects are temporary, for all votes that count of the last
-    ``history_days`` (fusion/persistence.py); without it all is of one moment, and everything new stays.
+    ``history_days`` (fusion/change_time.py); without it all is of one moment, and everything new stays.
     """
     given = list(drives)
     drives, copies = originals(given, settings)
@@ -326,3 +330,77 @@ def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np
     same_a, same_b = ~other[a[0]], ~other[b[0]]
     other[a[0][same_a][(a[1][same_a] != b[1][same_b]).any(axis=1)]] = True
     return np.asarray(other)
+
+
+# Offline: a map and a handful of ballots in, the updated map out.
+
+
+def update_map(
+    point_map: PointMap, ballots: Iterable[Ballot], settings: FuseSettings
+) -> tuple[PointMap, dict[TileIndex, Decision]]:
+    """Fuse a round of ballots and edit the map: (updated map, decisions by tile). Untouched tiles are the same objects.
+
+    All ballots of one round; ``settings.min_votes`` applies as given (the paper's cases use 1). MapvoteError if they
+    mix methods or settings, vote on another map or another version of it, or are two different ballots of the same
+    drive, or if a plane is damaged.
+    """
+    unique = {hashlib.sha256(encode(ballot)).hexdigest(): ballot for ballot in ballots}
+    rule = _rule_of_all(unique, point_map)
+    changed: dict[TileIndex, Tile] = {}
+    version = (point_map.version or 0) + 1
+    decisions: dict[TileIndex, Decision] = {}
+    for index in sorted({tile.tile for ballot in unique.values() for tile in ballot.tiles}):
+        tile = point_map.tile(index)
+        votes = [unspent(vote, tile) for vote in newest_votes(_votes_on(index, unique), settings)]
+        decisions[index], edited = fuse_tile(tile, votes, rule, settings, version)
+        if edited is not tile:
+            changed[index] = edited
+    if point_map.version is not None and changed:
+        point_map = replace(point_map, version=version)
+    return replace(point_map, tiles=with_changed(point_map.tiles, changed)), decisions
+
+
+def _rule_of_all(ballots: Mapping[str, Ballot], point_map: PointMap) -> Rule:
+    """The one rule of a round of ballots, by the hash of each; MapvoteError as in :func:`update_map`."""
+    if not ballots:
+        raise MapvoteError("no ballots: give at least one ballot file")
+    first = next(iter(ballots.values()))
+    drives: dict[tuple[str, str], str] = {}
+    for digest, ballot in ballots.items():
+        name = f"ballot {ballot.vehicle}/{ballot.drive}"
+        if (ballot.method, ballot.stage, ballot.settings_hash) != (first.method, first.stage, first.settings_hash):
+            raise MapvoteError(
+                f"{name} was cast by {_method(ballot)}, {first.vehicle}/{first.drive} by {_method(first)}: "
+                "one round never mixes methods; vote again with the same settings"
+            )
+        if ballot.map_id != point_map.map_id:
+            raise MapvoteError(f"{name} is a vote on map {ballot.map_id!r}, not on {point_map.map_id!r}")
+        if drives.setdefault((ballot.vehicle, ballot.drive), digest) != digest:
+            raise MapvoteError(f"{name} is given twice with different votes: keep one of the two files")
+        for tile in ballot.tiles:
+            if not _on_this_tile(ballot, tile.tile, point_map):
+                raise MapvoteError(
+                    f"{name} voted on another version of tile {tile_key(tile.tile)} than this map holds: "
+                    "use the map it was cast against, or vote again with this one"
+                )
+    return rule_of(first.method)
+
+
+def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool:
+    """Whether a ballot was cast against the current tile, or names the earlier version of the map."""
+    if ballot.base[tile_key(index)] == base_hash(point_map.tiles.get(index)):
+        return True
+    memory = point_map.tile(index).memory
+    older = point_map.version is not None and ballot.version < point_map.version
+    return older and memory is not None and len(memory.changed_after(ballot.version)) > 0
+
+
+def _method(ballot: Ballot) -> str:
+    return f"{ballot.method}, {ballot.stage}, settings {ballot.settings_hash[:8]}"
+
+
+def _votes_on(index: TileIndex, ballots: Mapping[str, Ballot]) -> Iterator[TileVote]:
+    for digest, ballot in ballots.items():
+        for tile in ballot.tiles:
+            if tile.tile == index:
+                yield TileVote.of(unpack_planes(tile), ballot.vehicle, ballot.end_ns, digest, ballot.version)

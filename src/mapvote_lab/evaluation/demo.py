@@ -233,7 +233,7 @@ def demo(
 
 def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:
     """Whether the server's map is the offline rule's but for new points that it leaves out: of what comes and goes it
-    also asks who looked last (fusion/persistence.py)."""
+    also asks who looked last (fusion/change_time.py)."""
     old, by_server, by_rule = all_points(first), all_points(served), all_points(offline)
     agreed, left_out = same_rows(by_server, by_rule)
     return bool(agreed.all()) and not same_rows(left_out, old)[0].any()

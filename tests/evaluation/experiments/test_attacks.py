@@ -19,7 +19,7 @@ from mapvote.codec.ballot import (
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote_lab.evaluation.experiments.conditions import ATTACKS
 
 TILE = (0, 0)

@@ -26,7 +26,7 @@ from mapvote.formats.maps.mapvote_folder import read_manifest
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.ply import write_ply
 from mapvote.formats.maps.tiling import map_of
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 
 
 def street(seed: int, n: int = 4000, x: float = 0.0) -> tuple[F64, dict[str, Any]]:

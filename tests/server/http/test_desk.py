@@ -17,7 +17,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
-from mapvote.server.store.round import round_at
+from mapvote.server.store.publish import round_at
 from mapvote.server.store.store import Store
 from mapvote.server.views.point_lod import Clouds
 from stores import send, wall_gone

@@ -20,8 +20,7 @@ from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, pack_points, unpack_points
-from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
-from mapvote.codec.tile_planes import pack_tile
+from mapvote.codec.tile_planes import FIELD_TYPES, pack_fields, pack_tile, unpack_fields
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles
 from mapvote.core.lazy_tiles import LazyTiles
@@ -29,14 +28,14 @@ from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_po
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import export_map, read_map
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote.server.http.app import create_app
 from mapvote.server.store import schema
 from mapvote.server.store.integrity import check, restore_plane, set_aside
 from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish, rollback
-from mapvote.server.store.replay import replay
+from mapvote.server.store.publish import publish
 from mapvote.server.store.retention import clear
+from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import overview
 from stores import send

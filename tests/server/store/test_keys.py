@@ -14,7 +14,7 @@ from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.publish import preview, publish
-from mapvote.server.store.replay import replay
+from mapvote.server.store.rollback import replay
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 from stores import send

@@ -20,8 +20,8 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.publish import publish, rollback, write_version
-from mapvote.server.store.replay import replay
+from mapvote.server.store.publish import publish, write_version
+from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from stores import send
 
@@ -178,7 +178,7 @@ def test_publishing_meanwhile_is_a_conflict(store: Store, monkeypatch: pytest.Mo
         rollback(store, 1)
         return write(*arguments, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("mapvote.server.store.replay.write_version", late)
+    monkeypatch.setattr("mapvote.server.store.rollback.write_version", late)
     with pytest.raises(Conflict, match="somebody else"):
         replay(store, "liar", dry_run=False)
     assert store.versions()[-1].kind == "rollback"

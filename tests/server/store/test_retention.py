@@ -17,9 +17,9 @@ from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.integrity import check
 from mapvote.server.store.policy import KeepPolicy, Policy
-from mapvote.server.store.publish import publish, rollback
-from mapvote.server.store.replay import replay
+from mapvote.server.store.publish import publish
 from mapvote.server.store.retention import clear
+from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.views.explain import explain_cell
 from standing_clock import Clock

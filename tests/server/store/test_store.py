@@ -16,7 +16,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, CellState, MapvoteError
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.server.store.policy import (
@@ -25,7 +25,8 @@ from mapvote.server.store.policy import (
     RoundPolicy,
     changed,
 )
-from mapvote.server.store.publish import preview, publish, rollback
+from mapvote.server.store.publish import preview, publish
+from mapvote.server.store.rollback import rollback
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.explain import explain_cell

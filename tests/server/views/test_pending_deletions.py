@@ -18,7 +18,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.integrity import check
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
-from mapvote.server.store.replay import replay
+from mapvote.server.store.rollback import replay
 from mapvote.server.store.store import Store
 from mapvote.server.views.desk import desk, review
 from mapvote.server.views.explain import CellStory, explain_cell

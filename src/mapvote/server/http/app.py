@@ -29,7 +29,7 @@ from mapvote.server.http.event_routes import deliver
 from mapvote.server.http.schemas import unreadable, unusable
 from mapvote.server.http.security import Guard, Hosts, Probe, Watch
 from mapvote.server.http.services import READING, Services, make_services
-from mapvote.server.store.round import Gate
+from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
 _EVERY_S = 2.0

@@ -57,10 +57,10 @@ from mapvote.server.http.services import Services, operator, reviewer, sees_name
 from mapvote.server.store import keys
 from mapvote.server.store.integrity import check, restore_plane, set_aside
 from mapvote.server.store.policy import PolicyChange
-from mapvote.server.store.publish import Outcome, preview, publish, rollback
+from mapvote.server.store.publish import Outcome, preview, publish
 from mapvote.server.store.queries import log_event
-from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import Cleared, clear
+from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings

@@ -28,8 +28,8 @@ from mapvote.server.store import keys
 from mapvote.server.store.admission import Incoming, Intake, Quota, Receipt
 from mapvote.server.store.fusion_jobs import Watched
 from mapvote.server.store.integrity import KINDS
+from mapvote.server.store.publish import Gate
 from mapvote.server.store.queries import current_number
-from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 from mapvote.server.views.events import Feed
 from mapvote.server.views.localisation_gate import gate_by

@@ -22,10 +22,10 @@ from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
+from mapvote.fusion.change_time import emptied_and_filled
 from mapvote.fusion.distrust import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
-from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store.database import Database, address_of

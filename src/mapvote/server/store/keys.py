@@ -91,7 +91,7 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
     """Revoke every key of a name: (keys, ballots that count no more). NotFound if it has no valid key.
 
     Who is trusted no longer was not to be trusted before: its standing ballots count no more, unless ``keep_votes``.
-    What was published of them stays (:func:`mapvote.server.store.replay.replay` takes that out too).
+    What was published of them stays (:func:`mapvote.server.store.rollback.replay` takes that out too).
     """
     with store.database.writing() as connection:
         return revoke_in(connection, store.clock(), name, by, keep_votes=keep_votes)

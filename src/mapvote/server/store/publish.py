@@ -1,52 +1,55 @@
-"""New versions: publish the round, or roll back.
+"""New versions: what a publish would make now, and the publish.
 
-A round is decided on a snapshot, before the transaction that writes it. Of several publishers exactly one wins; the
-others get Conflict.
+A round follows from the newest version, the ballots, the reviews, the policy and one reading of the clock. It holds
+until an event comes that can change it or, with a minimum age, until the next vote is old enough. It is decided once:
+desk, dry run, picture, review and publish share one :class:`Round`. It is decided on a snapshot, before the transaction
+that writes it. Of several publishers exactly one wins; the others get Conflict.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from threading import Lock
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import scipy
 import sqlalchemy as sa
-from msgspec import structs
 from sqlalchemy.exc import IntegrityError
 
+from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.tile_planes import (
-    pack_memory,
-)
+from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
-from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.lazy_tiles import with_changed
+from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
-from mapvote.core.types import MapvoteError
-from mapvote.fusion.fuse import differing
+from mapvote.core.types import I64, MapvoteError
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
-from mapvote.server.store.database import insert_rows
-from mapvote.server.store.fusion_jobs import Fused
-from mapvote.server.store.integrity import quarantine
+from mapvote.server.store.database import address_of, insert_rows
+from mapvote.server.store.fusion_jobs import Fused, Task, fuse_round
+from mapvote.server.store.integrity import quarantine, tiles_hurt_or_mended
+from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
     current_number,
     current_version,
     end_votes,
-    load_tile,
     log_event,
-    memory_of,
     set_tiles,
     tiles_of,
+    tiles_set_by,
     version_of,
     version_row,
 )
 from mapvote.server.store.retention import clear
-from mapvote.server.store.round import Gate, Round, reasons_to_hold, round_at
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,46 +156,6 @@ def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: 
         log_event(connection, now, "copy", by, copy)
 
 
-def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -> Version:
-    """A new version that is ``to`` again. A change like any other: it spends the votes on every cell that turns back.
-
-    NotFound if there is no such version, Conflict if it is the newest or another version is published meanwhile.
-    """
-    with store.database.reading() as connection:
-        newest = current_version(connection)
-        target = version_of(connection, to)
-        if to == newest.number:
-            raise Conflict(f"version {to} is the newest: there is nothing to roll back")
-        number = newest.number + 1
-        now, then = tiles_of(connection, newest.number), tiles_of(connection, to)
-        tiles, planes = {}, []
-        for index in sorted(now.keys() | then.keys()):
-            if now.get(index) != then.get(index):
-                old, new = _of_two(connection, store.lattice.tile(index), number, now.get(index), then.get(index))
-                digest, plane = pack_memory(turned_back(number, old, new))
-                tiles[index] = structs.replace(then.get(index) or TileHashes.none(), memory=digest)
-                planes.append(plane)
-    policy = dict(target.policy)
-    version = Version(number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, policy)
-    return write_version(store, version, NewTiles(tiles, planes))
-
-
-def turned_back(version: int, now: Tile, then: Tile) -> Memory:
-    """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
-    differ, none = np.flatnonzero(differing(now, then)), Memory.none()
-    return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
-
-
-def _of_two(
-    connection: sa.Connection, window: Grid, number: int, now: TileHashes | None, then: TileHashes | None
-) -> tuple[Tile, Tile]:
-    """A tile now and then; where there is none now, the memory of one."""
-    old = load_tile(connection, window, now)
-    if now is None:
-        old = replace(old, memory=memory_of(connection, number, window.tile_index))
-    return old, load_tile(connection, window, then)
-
-
 @dataclass(frozen=True, slots=True)
 class NewTiles:
     """The tiles that a version sets, and all planes that the store may not hold yet."""
@@ -234,3 +197,210 @@ def _decision_row(number: int, fused: Fused) -> tuple[object, ...]:
     """In the order of the table's columns."""
     counts = fused.vehicles, fused.added, fused.deleted
     return number, *fused.index, fused.states, fused.tally, *counts, fused.odds, fused.standings
+
+
+Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
+"""Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""
+_WITHOUT_EFFECT = "held back", "copy", "key issued"
+"""Kinds of events that change no round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Round:
+    """The decision of every tile, as of one event."""
+
+    newest: Version
+    asked: Electorate
+    until_ns: int | None
+    """Time at which the next vote reaches the minimum age; None: there is no minimum, or all votes have reached it."""
+    decided: Mapping[TileIndex, Fused]
+    """Tiles that may differ from what they were when they were last fused: a publish decides these."""
+    beside: Mapping[TileIndex, Fused]
+    """All other tiles with votes, for what waits there; none unless they were asked for."""
+    every: bool
+    """Whether ``beside`` was asked for."""
+
+    @property
+    def changed(self) -> list[Fused]:
+        """Tiles that a publish would change."""
+        return [fused for fused in self.decided.values() if fused.hashes is not None]
+
+
+@dataclass(slots=True)
+class _Latest:
+    """The latest round of one store, and what its gate said."""
+
+    deciding: Lock = field(default_factory=Lock)
+    judging: Lock = field(default_factory=Lock)
+    round: Round | None = None
+    judged: tuple[Round, Sequence[str]] | None = None
+
+
+_latest: WeakKeyDictionary[Store, _Latest] = WeakKeyDictionary()
+_lock = Lock()
+
+
+def _latest_of(store: Store) -> _Latest:
+    with _lock:
+        return _latest.setdefault(store, _Latest())
+
+
+def round_at(
+    store: Store, now: int, settings: FuseSettings | None = None, executor: Executor | None = None, every: bool = False
+) -> Round:
+    """The round as of ``now``, by the store's clock. Of many threads that ask, one decides it.
+
+    ``settings`` take the place of the policy's ``fuse``, in simulations; such a round is not kept. ``every``: fuse all
+    tiles with votes, for what waits there.
+    """
+    if settings is not None:
+        return _decide(store, now, settings, executor, every, None)
+    latest = _latest_of(store)
+    with latest.deciding:
+        known = latest.round
+        if known is None or not _holds(store, known, now) or (every and not known.every):
+            known = latest.round = _decide(store, now, None, executor, every, known)
+        return known
+
+
+def _decide(
+    store: Store, now: int, settings: FuseSettings | None, executor: Executor | None, every: bool, last: Round | None
+) -> Round:
+    """Fuse every tile that the ``last`` round does not answer."""
+    with store.database.reading() as connection:
+        newest = current_version(connection)
+        mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+        asked = electorate_now(connection, now, mark, settings)
+        dirty = _dirty(connection, newest, asked)
+        wanted = (
+            sorted({*dirty, *standing_tiles(connection, mark)})
+            if every and asked.settings.false_deletions < 1.0
+            else dirty
+        )
+        found = _still_true(connection, last, newest, asked)
+        missing = [index for index in wanted if index not in found]
+        hashes = tiles_of(connection, newest.number, missing)
+        until = next_ripe_ns(connection, asked)
+    made, url = newest.number + 1, address_of(store.database.url)
+    tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
+    found |= {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
+    decided = {index: found[index] for index in dirty}
+    beside = {index: found[index] for index in wanted if index not in decided}
+    return Round(newest, asked, until, decided, beside, every)
+
+
+def _holds(store: Store, known: Round, now: int) -> bool:
+    """Whether no event that can change the round has come since, and no vote has reached the minimum age."""
+    if known.until_ns is not None and now >= known.until_ns:
+        return False
+    e = schema.events.c
+    came = sa.select(e.seq).where(e.seq > known.asked.mark, e.kind.not_in(_WITHOUT_EFFECT)).limit(1)
+    with store.database.reading() as connection:
+        return connection.execute(came).first() is None
+
+
+def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
+    """Tiles that may come to something else than when they were last fused.
+
+    Where the newest version changed something, votes are spent that decided together with others. With another policy,
+    or after a version that was not fused, every tile may differ; with a minimum age votes ripen without any event.
+    """
+    policy = asked.policy
+    fused = newest.kind == "publish" and newest.policy == policy.model_dump(mode="json")
+    if not fused or policy.fuse.min_age_s > 0:
+        return standing_tiles(connection, asked.mark)
+    return sorted({*_touched(connection, asked.mark, newest.mark), *tiles_set_by(connection, newest.number)})
+
+
+def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:
+    """Tiles on which votes, reviews or damage were added or removed after the event ``since``."""
+    return {*standing_tiles(connection, mark, since), *tiles_hurt_or_mended(connection, since)}
+
+
+def _still_true(
+    connection: sa.Connection, last: Round | None, newest: Version, asked: Electorate
+) -> dict[TileIndex, Fused]:
+    """The tiles of the last round on which nothing has changed since."""
+    if last is None or last.newest.number != newest.number or last.asked.policy != asked.policy:
+        return {}
+    if asked.policy.fuse.min_age_s > 0:
+        return {}
+    touched = _touched(connection, asked.mark, last.asked.mark)
+    return {index: fused for index, fused in {**last.decided, **last.beside}.items() if index not in touched}
+
+
+def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
+    """The reasons of the policy, and of its gate, against the version that a round would make."""
+    changed, asked = found.changed, found.asked.policy.gate
+    held = hold_reasons(changed, found.asked.settings)
+    if gate is None or not asked.drive or not changed:
+        return held
+    latest = _latest_of(store)
+    with latest.judging:
+        if latest.judged is None or latest.judged[0] is not found:
+            old = store.point_map(found.newest.number)
+            edited = {
+                f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index)))
+                for f in changed
+            }
+            latest.judged = found, gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))
+        return [*held, *latest.judged[1]]
+
+
+def edited_tile(fused: Fused, before: Tile) -> Tile:
+    """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
+    hashes, planes = fused.hashes, fused.planes
+    assert hashes is not None
+    ground, free = before.ground_z, before.free
+    if hashes.ground in planes:
+        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
+    if hashes.free is not None and hashes.free in planes:
+        free = unpack_free_plane(planes[hashes.free], hashes.free)
+    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)
+
+
+def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
+    """The policy's reasons against publishing these tiles."""
+    reasons = []
+    for fused in changed:
+        name = f"tile {tile_key(fused.index)}"
+        if fused.points and fused.deleted > settings.max_deleted_share * fused.points:
+            share = fused.deleted / fused.points
+            reasons.append(f"deletes {share:.0%} of the points of {name}, more than {settings.max_deleted_share:.0%}")
+        if fused.freed > settings.max_freed_share * CELLS:
+            freed = fused.freed / CELLS
+            reasons.append(f"learns free space in {freed:.0%} of {name}, more than {settings.max_freed_share:.0%}")
+    for what, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
+        rows, cols = lattice_cells([(f, getattr(f, cells)) for f in changed])
+        areas = areas_m2(rows, cols)
+        largest = int(np.argmax(areas)) if len(areas) else 0
+        if len(areas) and areas[largest] > settings.max_change_m2:
+            about = f"{what} one connected thing of {areas[largest]:.0f} m2"
+            reasons.append(f"{about}, more than {settings.max_change_m2:.0f} m2")
+    return reasons
+
+
+def lattice_cells(found: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
+    """(rows, cols) on the lattice of flat cells of some tiles."""
+    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in found]
+    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in found]
+    nothing = np.empty(0, dtype=np.int64)
+    return np.concatenate([nothing, *rows]), np.concatenate([nothing, *cols])
+
+
+def areas_m2(rows: I64, cols: I64) -> np.ndarray:
+    """(k,) the area of each thing: cells that touch, corners included, whatever tile they are in."""
+    if not len(rows):
+        return np.empty(0)
+    keys = (rows << 32) + cols
+    order = np.argsort(keys)
+    ordered, pairs = keys[order], []
+    for step in (1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1):
+        near = np.searchsorted(ordered, keys + step)
+        near[near == len(keys)] = 0
+        touching = np.flatnonzero(ordered[near] == keys + step)
+        pairs.append(np.stack([touching, order[near[touching]]]))
+    a, b = np.concatenate(pairs, axis=1)
+    links = scipy.sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
+    labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    return np.bincount(labels) * CELL_SIZE**2

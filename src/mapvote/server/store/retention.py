@@ -12,7 +12,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mapvote.fusion.persistence import history_days
+from mapvote.fusion.change_time import history_days
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
 from mapvote.server.store.policy import Policy, policy_in

@@ -114,7 +114,7 @@ version_tiles = sa.Table(
 )
 """Only tiles that the version sets; every other tile is that of its parent. Null points: the version has no such tile.
 ``memory``: for every cell the version of its last change, and when objects were added and deleted; null: never.
-``fields``: further attributes of the points (codec/fields.py); null: none."""
+``fields``: further attributes of the points (codec/tile_planes.py); null: none."""
 
 ballots = sa.Table(
     "ballots",

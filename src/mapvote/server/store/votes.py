@@ -21,8 +21,8 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool
+from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import unspent
-from mapvote.fusion.persistence import history_days
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
@@ -388,7 +388,7 @@ def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by:
     """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
 
     NotFound if there is none. What earlier versions made of them stays: see
-    :func:`mapvote.server.store.replay.replay`.
+    :func:`mapvote.server.store.rollback.replay`.
     """
     b = schema.ballots
     whose = f"{vehicle or '*'}/{drive or '*'}"

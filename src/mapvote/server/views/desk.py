@@ -21,9 +21,9 @@ from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.server.errors import NotFound
 from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
+from mapvote.server.store.publish import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
-from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.store import Store
 from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.views.geojson import to_geojson

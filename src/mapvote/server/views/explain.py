@@ -19,9 +19,9 @@ from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
+from mapvote.fusion.change_time import expected_days
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
-from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.server.store import schema
 from mapvote.server.store.decisions import REASONS, Record, Standing, Why, records_of

@@ -25,7 +25,7 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import refine, thin_for_levels
 from mapvote.localisation.prepare import deskew, twist_between
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.store.round import Gate
+from mapvote.server.store.publish import Gate
 from mapvote.server.views.change_objects import changed_cells
 
 Verdict = Literal["pass", "hold", "abstain"]

@@ -29,8 +29,7 @@ from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteErr
 from mapvote.core.voting import one_hot, plurality, to_wire
 from mapvote.detection.paper import reading_table, sightings
 from mapvote.detection.readings import read, readings_of
-from mapvote.fusion.fuse import states_over
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import states_over, update_map
 from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.scores import Scores, score_cells
 from mapvote_lab.evaluation.truths import CaseOutcome, lay_on

@@ -29,8 +29,7 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.formats import read_map
-from mapvote.fusion.fuse import states_over
-from mapvote.fusion.offline import update_map
+from mapvote.fusion.fuse import states_over, update_map
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.experiments.cases import Case, Progress
 from mapvote_lab.evaluation.reporting.tables import Sheet

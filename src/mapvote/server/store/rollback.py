@@ -1,10 +1,10 @@
-"""Un-vote after publication: the map as it would be, had a vehicle never taken part.
+"""Going back: to an earlier version, or to the map as it would be, had a vehicle never taken part.
 
-Starts from the version before its first vote and goes through every later version again, by the policy recorded in
-each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
-Versions before the oldest one kept are not replayed. A round that made no version because of the vehicle left no
-record; the next publish decides its votes. A vote describes the version that its vehicle used: it does not count in
-cells that differ now.
+A replay (un-vote after publication) starts from the version before the vehicle's first vote. It goes through every
+later version again, by the policy recorded in each and with the ballots that stood at its moment, without the vehicle.
+The result is published as one new version. Versions before the oldest one kept are not replayed. A round that made no
+version because of the vehicle left no record; the next publish decides its votes. A vote describes the version that its
+vehicle used: it does not count in cells that differ now.
 """
 
 from __future__ import annotations
@@ -14,23 +14,65 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
 import sqlalchemy as sa
 from msgspec import structs
 
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.tile_planes import pack_tile
-from mapvote.core.grid import TileIndex
+from mapvote.codec.tile_planes import pack_memory, pack_tile
+from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import Bool
 from mapvote.fusion.fuse import differing
-from mapvote.server.errors import NotFound
+from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Task, fuse_round
-from mapvote.server.store.publish import NewTiles, Outcome, turned_back, write_version
-from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
+from mapvote.server.store.publish import NewTiles, Outcome, write_version
+from mapvote.server.store.queries import Version, current_version, load_tile, memory_of, tile_of, tiles_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import Electorate, ballots_aside, standing_tiles
+
+
+def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -> Version:
+    """A new version that is ``to`` again. A change like any other: it spends the votes on every cell that turns back.
+
+    NotFound if there is no such version, Conflict if it is the newest or another version is published meanwhile.
+    """
+    with store.database.reading() as connection:
+        newest = current_version(connection)
+        target = version_of(connection, to)
+        if to == newest.number:
+            raise Conflict(f"version {to} is the newest: there is nothing to roll back")
+        number = newest.number + 1
+        now, then = tiles_of(connection, newest.number), tiles_of(connection, to)
+        tiles, planes = {}, []
+        for index in sorted(now.keys() | then.keys()):
+            if now.get(index) != then.get(index):
+                old, new = _of_two(connection, store.lattice.tile(index), number, now.get(index), then.get(index))
+                digest, plane = pack_memory(turned_back(number, old, new))
+                tiles[index] = structs.replace(then.get(index) or TileHashes.none(), memory=digest)
+                planes.append(plane)
+    policy = dict(target.policy)
+    version = Version(number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, policy)
+    return write_version(store, version, NewTiles(tiles, planes))
+
+
+def turned_back(version: int, now: Tile, then: Tile) -> Memory:
+    """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
+    differ, none = np.flatnonzero(differing(now, then)), Memory.none()
+    return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
+
+
+def _of_two(
+    connection: sa.Connection, window: Grid, number: int, now: TileHashes | None, then: TileHashes | None
+) -> tuple[Tile, Tile]:
+    """A tile now and then; where there is none now, the memory of one."""
+    old = load_tile(connection, window, now)
+    if now is None:
+        old = replace(old, memory=memory_of(connection, number, window.tile_index))
+    return old, load_tile(connection, window, then)
 
 
 @dataclass(frozen=True, slots=True)
