@@ -48,7 +48,7 @@ _HOME = {
     "open_drive": "formats",
     "read_map": "formats",
     "scan_from_point_cloud2": "formats.drives.point_fields",
-    "update_map": "fusion.offline",
+    "update_map": "fusion.fuse",
     "vote_drive": "vehicle",
     "write_map": "formats",
 }
