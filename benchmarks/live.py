@@ -42,10 +42,11 @@ from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import from_cdr
 from mapvote.live.dds import Network
-from mapvote.live.drive import LiveDrive, OneMap, WaitingScan
-from mapvote.live.messages import CLOUD, cloud_message
+from mapvote.live.drive import LiveDrive, WaitingScan
+from mapvote.live.messages import CLOUD
 from mapvote.live.outbox import Outbox
-from mapvote.live.play import opened
+from mapvote.live.play import cloud_message, opened
+from mapvote.live.road_map import OneMap
 from mapvote.vehicle import Vehicle
 from mapvote.warmup import warm_vehicle
 

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 DECIDING = [
     "core/voting", "core/ground_growing", "fusion/fuse", "fusion/tile_vote", "fusion/edit",
     "fusion/distrust", "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper",
-    "detection/evidence", "detection/packed_tiles", "detection/confidence", "perception/fans", "perception/raycast",
+    "detection/evidence", "detection/packed_tiles", "detection/surfaces", "perception/fans", "perception/raycast",
     "slam/clean_map", "server/store/votes", "server/store/publish", "localisation/odometry", "localisation/pose_check",
 ]  # fmt: skip
 TESTS = {
@@ -37,7 +37,7 @@ TESTS = {
     "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/change_time": "fusion/test_change_time.py fusion/test_rules_of_fusion.py",
-    **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/confidence"), "detection"),
+    **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/surfaces"), "detection"),
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
     "server/store/publish": "server/store/test_publish_limits.py server/views/test_rounds.py",
 }

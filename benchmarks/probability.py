@@ -2,7 +2,7 @@
 
     python benchmarks/probability.py CACHE [--fit SCENE:SEED[:SCANS] ...] [--check ...] [--out results/probability.csv]
 
-One command: drives what CACHE lacks, prints the numbers that detection/confidence.py and fusion/loss_budget.py hold
+One command: drives what CACHE lacks, prints the numbers that detection/surfaces.py and fusion/loss_budget.py hold
 (a test does not: paste them), then what docs/measurements/probability.md shows, of the scenes that nothing was fitted
 to: ECE, Brier score and bins, beside those of the votes alone, and for each budget of false deletions what waits, what
 goes, what was promised of that and what came of it. ``--as-is`` fits nothing and checks the numbers that the program
@@ -23,7 +23,7 @@ import numpy as np
 
 from mapvote.codec.ballot import STEPS_PER_NAT, UNSAID
 from mapvote.core.types import F64, I64, Bool, CellState
-from mapvote.detection import confidence
+from mapvote.detection import surfaces as confidence
 from mapvote.fusion import loss_budget
 from mapvote_lab.evaluation.scores import binned
 from probability_scenes import Cells, called, decided, driven, stacked, taken
@@ -67,7 +67,7 @@ def fit(streets: Sequence[str], cache: Path) -> None:
     for name, state in KINDS.items():
         mine = taken(alone, alone.scored & (alone.states == state))
         told = np.column_stack([np.ones(len(mine.states)), mine.looked, mine.depth_m])
-        curves.append(told_as("detection/confidence.py", name, fitted(told, mine.true, evenly(mine.scene))))
+        curves.append(told_as("detection/surfaces.py", name, fitted(told, mine.true, evenly(mine.scene))))
     confidence._BUILT, confidence._DEMOLISHED = curves
     parts = [cells for k, street in enumerate(driven_streets) for cells in decided(street, k, curves, FEWEST)]
     every = stacked(parts)

@@ -26,7 +26,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I8, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.confidence import depths_m
+from mapvote.detection.surfaces import depths_m
 from mapvote.fusion.fuse import Decision, update_map
 from mapvote.fusion.loss_budget import alike_beside, standing_beside
 from mapvote.vehicle import NOTHING, Vehicle, offered
@@ -192,7 +192,7 @@ def _with_odds(ballot: Ballot, told: Told, curves: tuple[F64, F64]) -> Ballot:
 
 
 def sure(states: U8, looked: F64, depth_m: F64, curves: tuple[F64, F64]) -> F64:
-    """(n,) log-odds by curves (k + 2,), as detection/confidence.py has them by its own."""
+    """(n,) log-odds by curves (k + 2,), as detection/surfaces.py has them by its own."""
     told = np.column_stack([np.ones(len(states)), looked, depth_m])
     return np.where(states == CellState.CHANGED_OCCUPIED, told @ curves[0], told @ curves[1])
 

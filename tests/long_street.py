@@ -22,9 +22,9 @@ def long_street() -> PointMap:
 
 def blocks_say_the_same(voter: Voter, monkeypatch: pytest.MonkeyPatch) -> None:
     """Judged tile by tile, what a drive says is what all tiles say at once."""
-    whole = voter.votes()
+    whole = dict(voter.each())
     monkeypatch.setattr(surfaces, "_BLOCK", 1)
-    by_blocks = voter.votes()
+    by_blocks = dict(voter.each())
     assert list(by_blocks) == list(whole)
     changed = []
     for tile, votes in whole.items():

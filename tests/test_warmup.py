@@ -15,7 +15,7 @@ from mapvote.core.ground_growing import _grow
 from mapvote.core.voting import count_states
 from mapvote.fusion.distrust import contradicts, find_alike
 from mapvote.localisation.ndt_solver import align
-from mapvote.perception.range_image import look
+from mapvote.perception.moving_objects import look
 from mapvote.warmup import warm_up
 from mapvote_lab.simulation import simulate
 

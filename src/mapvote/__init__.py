@@ -8,8 +8,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mapvote.kernel_cache import choose_kernel_cache
-
 if TYPE_CHECKING:
     from mapvote.client import MapClient as MapClient
     from mapvote.codec.ballot import Ballot as Ballot
@@ -53,8 +51,6 @@ _HOME = {
     "write_map": "formats",
 }
 __all__ = sorted(_HOME)
-
-choose_kernel_cache()
 
 
 def __getattr__(name: str) -> Any:

@@ -28,9 +28,8 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, Scan
 from mapvote.core.voting import to_wire
-from mapvote.detection.new_points import NewPoints, points_in
 from mapvote.detection.paper import PaperVoter
-from mapvote.detection.voter import TileVotes, Voter
+from mapvote.detection.voter import NewPoints, TileVotes, Voter, points_in
 from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
@@ -253,7 +252,7 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
     kept, bright = offered(point_map, tile, np.where(came, votes.new, NOTHING), points)
     odds = None
     if two_stage and votes.looked is not None:
-        from mapvote.detection.confidence import depths_m, log_odds  # brings scipy, as surfaces do
+        from mapvote.detection.surfaces import depths_m, log_odds  # brings scipy, as surfaces do
 
         changes = votes.states.reshape(-1)[changed_cells_of(votes.states)]
         depth_m = depths_m(votes.states, point_map.tiles.get(tile), kept)

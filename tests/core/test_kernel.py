@@ -1,12 +1,20 @@
-"""Compiled kernels that are kept on disk: after a change of the program no old one is run, and none stops it."""
+"""Compiled kernels that are kept on disk: after a change of the program no old one is run, and none stops it.
+
+They are run: where they are kept, nobody else may have put one.
+"""
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
+import tempfile
 from pathlib import Path
 
+import numba
 import pytest
+
+from mapvote.core.kernel import choose_kernel_cache
 
 RECORDS = """
 from typing import NamedTuple
@@ -96,3 +104,41 @@ def test_a_file_that_a_power_failure_cut_off_is_replaced(package: Path, kept: st
     cut.write_bytes(cut.read_bytes()[:40])
     assert started_anew()[:2] == (32, 1)
     assert started_anew()[:2] == (32, 0)
+
+
+@pytest.fixture
+def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Nothing may be written to but the temporary folder."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)  # is put back
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    return tmp_path
+
+
+def test_the_last_resort_is_a_folder_of_the_user_that_nobody_else_may_write_to(
+    nowhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def chosen() -> Path:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+        choose_kernel_cache()
+        assert os.environ["NUMBA_CACHE_DIR"] == numba.config.CACHE_DIR
+        return Path(numba.config.CACHE_DIR)
+
+    first = chosen()
+    assert (first.parent, first.stat().st_mode & 0o777) == (nowhere, 0o700)
+    assert chosen() == first, "the same at each start"
+    first.chmod(0o777)
+    second = chosen()
+    assert second != first
+    assert second.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("said", ["/kernels", ""])
+def test_what_the_user_says_stays_and_numba_finds_its_own_place_where_there_is_one(
+    nowhere: Path, monkeypatch: pytest.MonkeyPatch, said: str
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", said)
+    monkeypatch.setattr(os, "access", lambda path, mode: not said)
+    choose_kernel_cache()
+    assert os.environ["NUMBA_CACHE_DIR"] == said

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from hand_made import make_tile, states_plane, wall
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.types import I32, NO_VOTE, U8, CellState
-from mapvote.detection.confidence import LOOKS, MOST_CELLS, MOST_HEIGHT_M, depths_m, log_odds, looks
+from mapvote.detection.surfaces import LOOKS, MOST_CELLS, MOST_HEIGHT_M, depths_m, log_odds, looks
 
 CO, CE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY
 TILE = slice(1, TILE_CELLS + 1), slice(1, TILE_CELLS + 1)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.detection import new_points
-from mapvote.detection.new_points import REACH_M, NewPoints, _beyond, points_in, select
+from mapvote.detection import voter as new_points
+from mapvote.detection.voter import REACH_M, NewPoints, _beyond, points_in, select
 
 LATTICE = Lattice()
 

@@ -251,7 +251,7 @@ def seen_twice() -> tuple[PaperVoter, U64]:
 
 def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     voter, may_be_new = seen_twice()
-    votes = voter.votes()
+    votes = dict(voter.each())
     assert list(votes) == [(-1, 0), (-1, 1), (0, 0), (0, 1)], "and where it saw nothing it says so"
     left, right = votes[0, 0], votes[0, 1]
     twice = 2 * round(float(vote_weight(8)) * VOTE_UNIT)
@@ -268,5 +268,5 @@ def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
 
 def test_asking_for_votes_changes_none_and_before_any_scan_there_are_none() -> None:
     voter, _ = seen_twice()
-    assert voter.votes()[0, 1].tally.tobytes() == voter.votes()[0, 1].tally.tobytes()
-    assert PaperVoter(VotingSettings(), PaperSettings(), SENSOR, make_map({})).votes() == {}
+    assert dict(voter.each())[0, 1].tally.tobytes() == dict(voter.each())[0, 1].tally.tobytes()
+    assert list(PaperVoter(VotingSettings(), PaperSettings(), SENSOR, make_map({})).each()) == []

@@ -7,7 +7,7 @@ from typing import Literal, get_args, get_origin
 import pytest
 
 from mapvote.config import PaperSettings
-from mapvote.detection.readings import OPEN_SENTENCES, OpenSentence, readings_of
+from mapvote.detection.paper import OPEN_SENTENCES, OpenSentence, readings_of
 
 
 def test_every_setting_of_the_paper_has_its_sentence() -> None:

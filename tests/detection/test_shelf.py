@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core.types import MapvoteError
-from mapvote.detection import shelf
-from mapvote.detection.shelf import Shelf
+from mapvote.detection import packed_tiles as shelf
+from mapvote.detection.packed_tiles import Shelf
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20))

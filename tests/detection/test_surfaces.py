@@ -53,7 +53,7 @@ def after(point_map: PointMap, points: F64, scans: int = 8) -> TileVotes:
     voter = SurfaceVoter(VotingSettings(), point_map)
     for _ in range(scans):
         voter.observe(one_scan(point_map, points))
-    return voter.votes()[0, 0]
+    return dict(voter.each())[0, 0]
 
 
 def standing_at(y: float, heights: list[float] = HEIGHTS) -> F64:
@@ -168,7 +168,7 @@ def test_what_few_rays_crossed_and_none_met_goes_with_what_many_crossed_beside_i
         if scan:
             seen.view.passed[:, 106:] = 0  # half of the wall is out of sight but once
         voter.observe(seen)
-    assert all(voter.votes()[0, 0].states[cell] == CE for cell in WALL)
+    assert all(dict(voter.each())[0, 0].states[cell] == CE for cell in WALL)
 
 
 def test_what_no_ray_ever_crossed_does_not_go_with_the_rest_of_its_wall() -> None:
@@ -177,7 +177,7 @@ def test_what_no_ray_ever_crossed_does_not_go_with_the_rest_of_its_wall() -> Non
         seen = one_scan(voter.point_map, standing_at(OLD_Y + 9))
         seen.view.passed[:, 106:] = 0
         voter.observe(seen)
-    states = voter.votes()[0, 0].states
+    states = dict(voter.each())[0, 0].states
     assert [int(states[cell]) for cell in WALL] == [CE] * 6 + [NO_VOTE] * 6
 
 
@@ -205,7 +205,7 @@ def test_a_roof_is_gone_with_the_wall_below_it_if_rays_passed_through_its_place(
         seen = one_scan(point_map, standing_at(OLD_Y + 9))
         seen.view.passed[:] &= np.uint64((1 << layers) - 1)
         voter.observe(seen)
-    assert {int(voter.votes()[0, 0].states[cell]) for cell in roof} == {state}
+    assert {int(dict(voter.each())[0, 0].states[cell]) for cell in roof} == {state}
 
 
 def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:
@@ -223,7 +223,7 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
         seen = one_scan(point_map, standing_at(OLD_Y))
         seen.view.passed[:, :105] = 0
         voter.observe(seen)
-    states = voter.votes()[0, 0].states
+    states = dict(voter.each())[0, 0].states
     assert states[ROW + 5, 110] == CellState.UNCHANGED_EMPTY
     assert states[ROW + 5, 100] == NO_VOTE
     assert states[ROW, 100] == UO, "hits need no rays beside them"
@@ -289,7 +289,7 @@ def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> 
             seen = one_scan(point_map, car if scan < scans_there else standing_at(OLD_Y + 9))
             seen.view.passed[:] &= np.uint64(0x5555555555555555)  # every other voxel
             voter.observe(seen)
-        states.append(voter.votes()[0, 0].states)
+        states.append(dict(voter.each())[0, 0].states)
     assert [(s == CO).any() for s in states] == [False, True]
 
 
@@ -305,7 +305,7 @@ def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_be
         seen.view.passed[:] &= np.uint64(0b1111111)
         seen.view.passed[ROW + 1] = np.uint64(2**15 - 1)  # behind it all of a house is seen to be gone
         voter.observe(seen)
-    votes = voter.votes()[0, 0]
+    votes = dict(voter.each())[0, 0]
     assert all(votes.states[cell] == UO for cell in WALL)
     assert votes.gone is not None
     assert not any(votes.gone[cell] >> np.uint64(7) for cell in WALL)

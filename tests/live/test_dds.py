@@ -16,7 +16,8 @@ from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import TYPES, blank_message, from_cdr, stamp_ns, to_cdr
 from mapvote.live.dds import Network, ros_type
-from mapvote.live.messages import CLOUD, TF, cloud_message
+from mapvote.live.messages import CLOUD, TF
+from mapvote.live.play import cloud_message
 
 pytest.importorskip("cyclonedds")
 START = 1_700_000_000_123_456_789

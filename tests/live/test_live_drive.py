@@ -18,8 +18,9 @@ from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.live import drive as drive_module
-from mapvote.live.drive import Counts, LiveDrive, OneMap, Thinning, WaitingScan
+from mapvote.live.drive import Counts, LiveDrive, Thinning, WaitingScan
 from mapvote.live.outbox import Outbox, ballot_of
+from mapvote.live.road_map import OneMap
 from mapvote.vehicle import Cuts, Vehicle
 from streets import drive_along, path, street
 

@@ -15,14 +15,13 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.live.dds import Network, PublishedTopic
-from mapvote.live.drive import OneMap
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, cloud_message, frames_message, matrix_of, odometry_message
+from mapvote.live.dds import Chosen, Network, PublishedTopic, TopicRate, choose_topics, missing_for_drive
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
 from mapvote.live.outbox import Outbox
-from mapvote.live.play import POINTS, POSES
+from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
+from mapvote.live.road_map import OneMap
 from mapvote.live.service import Plan, run
 from mapvote.live.subscriptions import Clocks, Cloud, Subscriptions, Sweeps
-from mapvote.live.topics import Chosen, TopicRate, choose_topics, missing_for_drive
 from streets import drive_along, path, street
 
 pytest.importorskip("cyclonedds")

@@ -18,7 +18,7 @@ from mapvote.formats import open_drive
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.fans import FANS, Rays, follow_rays
-from mapvote.perception.free_rays import SECTORS, SKY_M, Sky
+from mapvote.perception.raycast import SECTORS, SKY_M, Sky
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.scenario import load_scenario

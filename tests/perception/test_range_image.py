@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.azimuth import turn
 from mapvote.core.types import F32, F64
-from mapvote.perception.range_image import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
+from mapvote.perception.moving_objects import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
 
 PIXELS = Pixels(90, 60, np.float32(-0.6), np.float32(50.0))
 MARGIN_M, HEIGHT_M, ENOUGH = 0.5, 0.12, 2

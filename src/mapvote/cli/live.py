@@ -14,8 +14,9 @@ from mapvote.cli.door import client_of, is_url, key_in, map_at
 from mapvote.cli.options import Config, KeyFile, Projector
 
 if TYPE_CHECKING:
-    from mapvote.live.drive import LiveDrive, Maps
+    from mapvote.live.drive import LiveDrive
     from mapvote.live.outbox import Outbox
+    from mapvote.live.road_map import Maps
     from mapvote.live.status import StatusBoard
 
 Domain = Annotated[
@@ -31,8 +32,7 @@ def topics(
 
     mapvote topics
     """
-    from mapvote.live.dds import Network
-    from mapvote.live.topics import measure_rates, missing_for_drive
+    from mapvote.live.dds import Network, measure_rates, missing_for_drive
 
     found = measure_rates(Network(domain), seconds)
     for one in found:
@@ -119,11 +119,10 @@ def drive(
     from mapvote.config import load_settings
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
-    from mapvote.live.dds import Network
+    from mapvote.live.dds import Network, choose_topics
     from mapvote.live.service import Plan, run
     from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
     from mapvote.live.subscriptions import Subscriptions
-    from mapvote.live.topics import choose_topics
     from mapvote.vehicle import Cuts
     from mapvote.warmup import warm_vehicle
 
@@ -180,8 +179,7 @@ def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
 @contextmanager
 def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
     """The tiles around the vehicle of a server's map, or a whole map from a file or store."""
-    from mapvote.live.drive import OneMap
-    from mapvote.live.road_map import RoadMap
+    from mapvote.live.road_map import OneMap, RoadMap
 
     if is_url(where):
         with closing(RoadMap(lambda: client_of(where, key_in(key_file)))) as road_map:

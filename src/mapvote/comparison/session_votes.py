@@ -26,8 +26,7 @@ from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
 from mapvote.core.voting import one_hot
-from mapvote.detection.new_points import NewPoints
-from mapvote.detection.voter import TileVotes
+from mapvote.detection.voter import NewPoints, TileVotes
 from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
 from mapvote.perception.frontend import DriveReport
 from mapvote.perception.raycast import CLEARANCE_M

@@ -77,7 +77,7 @@ class VotingSettings(Section):
 
 
 class PaperSettings(Section):
-    """How the paper's open sentences are read (detection/readings.py has each with its quotation). Surfaces have no
+    """How the paper's open sentences are read (detection/paper.py has each with its quotation). Surfaces have no
     part in it."""
 
     occluded: Literal["votes", "abstains"] = Field(

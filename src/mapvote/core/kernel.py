@@ -8,12 +8,19 @@ get the arrays that they fill: an allocation takes 50 ms to compile, and without
 Compiled kernels are kept on disk. numba compiles a kernel again if its own file has changed. The cache below also does
 so if a kernel or a constant of another file has changed, and if an entry cannot be read: it names a type that was
 renamed since, or a power failure cut it off.
+
+numba keeps them beside the program, else in the user's cache, and else refuses to import them at all. A container with
+a read-only image and a user without a home has neither: there they stay in the temporary folder.
 """
 
 from __future__ import annotations
 
 import inspect
+import os
+import stat
+import tempfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -21,6 +28,37 @@ import numba
 import numpy as np
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+_VARIABLE = "NUMBA_CACHE_DIR"
+
+
+def choose_kernel_cache() -> None:
+    """Name a folder of this user's in the temporary one, where nothing else can be written to."""
+    users = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if os.environ.get(_VARIABLE) or _may_write(Path(__file__).parent) or _may_write(users):
+        return
+    os.environ[_VARIABLE] = folder = _private_folder()
+    numba.config.CACHE_DIR = folder  # numba has read its variables already
+
+
+def _may_write(folder: Path) -> bool:
+    """Whether this folder, or the nearest above it that exists, can be written to."""
+    existing = next((f for f in (folder, *folder.parents) if f.is_dir()), None)
+    return existing is not None and os.access(existing, os.W_OK | os.X_OK)
+
+
+def _private_folder() -> str:
+    """The same one at each start; one for this process alone if others may have put kernels there, for they are run."""
+    within = Path(tempfile.gettempdir())
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = within / f"mapvote-kernels-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if stat.S_ISDIR(found.st_mode) and found.st_uid == user and not found.st_mode & 0o022:
+        return str(folder)
+    return tempfile.mkdtemp(prefix="mapvote-kernels-", dir=within)
+
+
+choose_kernel_cache()
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_rewrites": True}
 
 

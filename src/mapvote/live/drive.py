@@ -1,28 +1,31 @@
-"""A vehicle that votes while it drives: it takes scans and poses as they arrive and gives ballots as they close."""
+"""A vehicle that votes while it drives: it takes scans and poses as they arrive and gives ballots as they close.
+
+No ballot leaves the vehicle before the doctor's checks on the first ten seconds are done.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
-from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
-from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, MapvoteError, Scan
-from mapvote.doctor import Finding
+from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.doctor import Finding, any_error, in_order
+from mapvote.doctor.map_fit import check_on_map
+from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.first_seconds import FirstSeconds
 from mapvote.live.outbox import Outbox
-from mapvote.localisation.map_window import tiles_within
+from mapvote.live.road_map import Maps
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
@@ -43,9 +46,11 @@ _BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
 """A stamp so much before the last one, or after it: the clock has jumped."""
 _JUMPED = 3
 """So many scans in turn make a jump. A single one is late or damaged."""
-KEPT_M = 300.0
-"""Tiles that touch a square reaching so far stay in memory; with those farther away their columns and words go, too."""
-_MOVED_M = 30.0
+_SECONDS_NS = 10 * 10**9
+_EVERY = 4
+"""Each scan is looked at, and one of so many is kept: 30 MB."""
+_SICK = 0.5
+"""If fewer scans have a sure place it is asked how the drive lies on the map."""
 _LATENCIES = 6000
 """Latencies that are kept: ten minutes at 10 Hz."""
 
@@ -68,47 +73,6 @@ class Fixed(NamedTuple):
     T_map_lidar: F64
     covariance: F32
     """(6, 6) as :class:`mapvote.core.types.Registration` has it."""
-
-
-class Maps(Protocol):
-    """The source of a live vehicle's map."""
-
-    def current(self) -> PointMap:
-        """The newest version there is: the next ballot holds to it."""
-
-    def covers(self, position: F64 | None) -> bool:
-        """Whether the tiles that a vehicle at (3,), map metres, compares with are here. None: it is not known where it
-        is. Those farther ahead are asked for."""
-
-
-class OneMap:
-    """A map from a file or a store: all of it is here, and it has one version."""
-
-    def __init__(self, point_map: PointMap) -> None:
-        self._tiles = point_map.tiles if isinstance(point_map.tiles, LazyTiles) else _copied(point_map.tiles)
-        self._point_map = replace(point_map, tiles=self._tiles)
-        self._position: F64 | None = None
-
-    def current(self) -> PointMap:
-        """See :class:`Maps`."""
-        return self._point_map
-
-    def covers(self, position: F64 | None) -> bool:
-        """See :class:`Maps`. Frees what was computed from tiles far from there."""
-        if position is not None and has_moved(position, self._position):
-            self._position = position
-            self._tiles.keep_only(tiles_within(self._point_map, position, KEPT_M))
-        return True
-
-
-def _copied(tiles: Mapping[TileIndex, Tile]) -> LazyTiles:
-    """Tiles that share the arrays of these, and keep what they work out apart from them."""
-    return LazyTiles(lambda index: tiles[index].but(), {index: len(tile.points) for index, tile in tiles.items()})
-
-
-def has_moved(position: F64, since: F64 | None) -> bool:
-    """Whether the vehicle is so far from where it was that other tiles matter."""
-    return since is None or float(np.abs(position[:2] - since[:2]).max()) > _MOVED_M
 
 
 @dataclass(slots=True)
@@ -161,6 +125,65 @@ class Thinning:
             return False
         self._credit -= 1.0
         return True
+
+
+class FirstSeconds:
+    """Some scans of the first ten seconds, and what is wrong with them."""
+
+    def __init__(self, sensor_told: str) -> None:
+        self._told = sensor_told
+        self._kept: dict[int, Scan] = {}
+        self._stamps_ns, self._priors = list[int](), list[F64 | None]()
+        self._looking: Looking | None = None
+
+    def add(self, scan: Scan, T_map_lidar_prior: F64 | None, vehicle: Vehicle) -> bool:
+        """Look at this scan; returns whether the ten seconds are over."""
+        if self._looking is None:
+            self._looking = Looking(self._drive(vehicle))
+        n = len(self._stamps_ns)
+        self._stamps_ns.append(scan.stamp_ns)
+        self._priors.append(T_map_lidar_prior)
+        self._kept[n] = scan
+        self._looking.look([n])
+        if n % _EVERY:
+            del self._kept[n]
+        return scan.stamp_ns - self._stamps_ns[0] >= _SECONDS_NS
+
+    def _drive(self, vehicle: Vehicle) -> Drive:
+        priors = [T for T in self._priors if T is not None]
+        return Drive(
+            Path("the first seconds"),
+            vehicle.name,
+            vehicle.drive_id,
+            vehicle.sensor,
+            np.array(self._stamps_ns, dtype=np.int64),
+            lambda i: self._kept[i] if i in self._kept else self._kept[i - i % _EVERY],
+            np.stack(priors) if priors and len(priors) == len(self._stamps_ns) else None,
+            sensor_told=self._told,
+        )
+
+    def findings(self, vehicle: Vehicle, point_map: PointMap) -> list[Finding]:
+        """What shows in the scans themselves, and, if the vehicle finds no sure place, how they lie on the map."""
+        if self._looking is None:
+            return []
+        drive = self._drive(vehicle)
+        found = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
+        report = vehicle.report
+        decided = len(report.T_map_lidar)
+        if decided and len(report.lost) > _SICK * decided and not any_error(found):
+            found += self._on_map(drive, point_map, len(report.lost), decided)
+        return in_order(found)
+
+    def _on_map(self, drive: Drive, point_map: PointMap, lost: int, decided: int) -> list[Finding]:
+        what = f"{lost} of the first {decided} scans have no sure place on map {point_map.map_id}"
+        lost_scans = Finding("warning", what, "they cast no vote; is this the map of this road?")
+        if drive.T_map_lidar_prior is None:
+            return [lost_scans]
+        try:
+            found = check_on_map(drive, drive.T_map_lidar_prior, point_map)[0]
+        except MapvoteError as error:
+            return [lost_scans, Finding("warning", str(error))]
+        return [lost_scans, *found]
 
 
 class LiveDrive:

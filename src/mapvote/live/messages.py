@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mapvote.core.types import F64, MapvoteError, Scan
-from mapvote.live.cdr import blank_message, header_of, to_cdr
+from mapvote.core.types import F64, MapvoteError
+from mapvote.live.cdr import blank_message, header_of
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 MAP_FRAME, BASE_FRAME, LIDAR_FRAME = "map", "base_link", "lidar"
@@ -39,41 +39,6 @@ def cloud_of(columns: Mapping[str, NDArray[Any]], stamp_ns: int, frame: str) -> 
         data=table.view(np.uint8),
         is_dense=True,
     )
-
-
-def cloud_message(scan: Scan, frame: str = LIDAR_FRAME) -> bytes:
-    """A PointCloud2 of a scan: x, y, z, and what it has of intensity (0 to 255), ring and time (seconds from the
-    stamp)."""
-    columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
-    if scan.intensity is not None:
-        columns["intensity"] = np.float32(255.0) * scan.intensity
-    if scan.ring is not None:
-        columns["ring"] = scan.ring
-    if scan.time_s is not None:
-        columns["time"] = scan.time_s
-    return to_cdr(CLOUD, cloud_of(columns, scan.stamp_ns, frame))
-
-
-def odometry_message(stamp_ns: int, T_map_base: F64) -> bytes:
-    """An Odometry of a pose (4, 4)."""
-    message = blank_message(ODOMETRY, header=header_of(stamp_ns, MAP_FRAME), child_frame_id=BASE_FRAME)
-    message.pose.pose = pose_of(T_map_base)
-    return to_cdr(ODOMETRY, message)
-
-
-def frames_message(stamp_ns: int, T_base_child: Mapping[str, F64]) -> bytes:
-    """A TFMessage of frames on BASE_FRAME, by their names."""
-    transforms = []
-    for child, T in T_base_child.items():
-        pose, transform = pose_of(T), blank_message("geometry_msgs/msg/Transform")
-        transform.translation, transform.rotation = pose.position, pose.orientation
-        header = header_of(stamp_ns, BASE_FRAME)
-        transforms.append(
-            blank_message(
-                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
-            )
-        )
-    return to_cdr(TF, blank_message(TF, transforms=transforms))
 
 
 def pose_of(T: F64) -> Any:

@@ -7,17 +7,20 @@ clouds are made of its scans, odometry of its prior, and /tf_static of its mount
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse
-from mapvote.core.types import Drive, MapvoteError
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.rosbag import Bag, is_rosbag
-from mapvote.live.cdr import TYPES
+from mapvote.live.cdr import TYPES, blank_message, header_of, to_cdr
 from mapvote.live.dds import Network, Publication
-from mapvote.live.messages import CLOUD, LIDAR_FRAME, ODOMETRY, TF, cloud_message, frames_message, odometry_message
+from mapvote.live.messages import BASE_FRAME, CLOUD, LIDAR_FRAME, MAP_FRAME, ODOMETRY, TF, cloud_of, pose_of
 
 _DISCOVERY_S = 0.5
 """Between the first reader and the first message, so that every reader has found every topic."""
@@ -98,3 +101,38 @@ def _messages_of_drive(drive: Drive) -> Iterator[Message]:
             data = odometry_message(stamp_ns, drive.T_map_lidar_prior[i] @ T_lidar_base)
             yield Message(stamp_ns, POSES, ODOMETRY, data)
         yield Message(stamp_ns, POINTS, CLOUD, cloud_message(scan))
+
+
+def cloud_message(scan: Scan, frame: str = LIDAR_FRAME) -> bytes:
+    """A PointCloud2 of a scan: x, y, z, and what it has of intensity (0 to 255), ring and time (seconds from the
+    stamp)."""
+    columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
+    if scan.intensity is not None:
+        columns["intensity"] = np.float32(255.0) * scan.intensity
+    if scan.ring is not None:
+        columns["ring"] = scan.ring
+    if scan.time_s is not None:
+        columns["time"] = scan.time_s
+    return to_cdr(CLOUD, cloud_of(columns, scan.stamp_ns, frame))
+
+
+def odometry_message(stamp_ns: int, T_map_base: F64) -> bytes:
+    """An Odometry of a pose (4, 4)."""
+    message = blank_message(ODOMETRY, header=header_of(stamp_ns, MAP_FRAME), child_frame_id=BASE_FRAME)
+    message.pose.pose = pose_of(T_map_base)
+    return to_cdr(ODOMETRY, message)
+
+
+def frames_message(stamp_ns: int, T_base_child: Mapping[str, F64]) -> bytes:
+    """A TFMessage of frames on BASE_FRAME, by their names."""
+    transforms = []
+    for child, T in T_base_child.items():
+        pose, transform = pose_of(T), blank_message("geometry_msgs/msg/Transform")
+        transform.translation, transform.rotation = pose.position, pose.orientation
+        header = header_of(stamp_ns, BASE_FRAME)
+        transforms.append(
+            blank_message(
+                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
+            )
+        )
+    return to_cdr(TF, blank_message(TF, transforms=transforms))

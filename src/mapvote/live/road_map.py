@@ -1,4 +1,7 @@
-"""The map on the way: the tiles ahead of a vehicle come before it does, and newer versions as they are published."""
+"""The map of a live vehicle: from a file or store, or a server's.
+
+Of a server's the tiles ahead come before the vehicle does, and newer versions as they are published.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ import logging
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -17,15 +22,59 @@ from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
-from mapvote.live.drive import KEPT_M, has_moved
+from mapvote.localisation.map_window import tiles_within
 
 log = logging.getLogger("mapvote.live")
+KEPT_M = 300.0
+"""Tiles that touch a square reaching so far stay in memory; with those farther away their columns and words go, too."""
+_MOVED_M = 30.0
 AHEAD_M, NEEDED_M = KEPT_M, 160.0
 """Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. The local
 map of a vehicle reaches two tiles, 154 m."""
 _POLL_S = 60.0
 """Between two questions for the newest version where events do not come."""
 _RETRY_S = 5.0
+
+
+class Maps(Protocol):
+    """The source of a live vehicle's map."""
+
+    def current(self) -> PointMap:
+        """The newest version there is: the next ballot holds to it."""
+
+    def covers(self, position: F64 | None) -> bool:
+        """Whether the tiles that a vehicle at (3,), map metres, compares with are here. None: it is not known where it
+        is. Those farther ahead are asked for."""
+
+
+class OneMap:
+    """A map from a file or a store: all of it is here, and it has one version."""
+
+    def __init__(self, point_map: PointMap) -> None:
+        self._tiles = point_map.tiles if isinstance(point_map.tiles, LazyTiles) else _copied(point_map.tiles)
+        self._point_map = replace(point_map, tiles=self._tiles)
+        self._position: F64 | None = None
+
+    def current(self) -> PointMap:
+        """See :class:`Maps`."""
+        return self._point_map
+
+    def covers(self, position: F64 | None) -> bool:
+        """See :class:`Maps`. Frees what was computed from tiles far from there."""
+        if position is not None and has_moved(position, self._position):
+            self._position = position
+            self._tiles.keep_only(tiles_within(self._point_map, position, KEPT_M))
+        return True
+
+
+def _copied(tiles: Mapping[TileIndex, Tile]) -> LazyTiles:
+    """Tiles that share the arrays of these, and keep what they work out apart from them."""
+    return LazyTiles(lambda index: tiles[index].but(), {index: len(tile.points) for index, tile in tiles.items()})
+
+
+def has_moved(position: F64, since: F64 | None) -> bool:
+    """Whether the vehicle is so far from where it was that other tiles matter."""
+    return since is None or float(np.abs(position[:2] - since[:2]).max()) > _MOVED_M
 
 
 class Version:
@@ -61,7 +110,7 @@ class Version:
 
 
 class RoadMap:
-    """A server's map for a vehicle on the move (:class:`mapvote.live.drive.Maps`).
+    """A server's map for a vehicle on the move (:class:`Maps`).
 
     A newer version is the current one as soon as its tiles around the vehicle are here. Without a network the vehicle
     drives on what it has. Two threads, of which one only listens for versions.
@@ -105,12 +154,12 @@ class RoadMap:
         self._reader.close()
 
     def current(self) -> PointMap:
-        """See :class:`mapvote.live.drive.Maps`."""
+        """See :class:`Maps`."""
         self._used = self._current
         return self._used.point_map
 
     def covers(self, position: F64 | None) -> bool:
-        """See :class:`mapvote.live.drive.Maps`: of the version that was asked for last."""
+        """See :class:`Maps`: of the version that was asked for last."""
         if position is None or has_moved(position, self._position):
             self._position, self._located = position, True
             self._used.tiles.keep_only(self._used.around(position, KEPT_M))

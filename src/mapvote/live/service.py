@@ -12,9 +12,9 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
-from mapvote.live.drive import LiveDrive, Maps
-from mapvote.live.first_seconds import FirstSeconds
+from mapvote.live.drive import FirstSeconds, LiveDrive
 from mapvote.live.outbox import Outbox
+from mapvote.live.road_map import Maps
 from mapvote.live.subscriptions import Cloud, Subscriptions
 from mapvote.vehicle import Cuts, Vehicle
 

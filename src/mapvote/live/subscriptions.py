@@ -20,10 +20,9 @@ from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.live.cdr import from_cdr, stamp_ns
-from mapvote.live.dds import Network
+from mapvote.live.dds import Chosen, Network
 from mapvote.live.drive import WaitingScan
 from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
-from mapvote.live.topics import Chosen
 
 log = logging.getLogger("mapvote.live")
 _SWEEP = 0.55

@@ -26,8 +26,7 @@ from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, Reference, Sca
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
-from mapvote.perception.free_rays import Sky
-from mapvote.perception.raycast import ScanView, cast_rays, find_obstacles
+from mapvote.perception.raycast import ScanView, Sky, cast_rays, find_obstacles
 
 
 class Movers(Protocol):

@@ -1,6 +1,11 @@
-"""What one scan saw, passed through and could not see, as planes over the local grid (paper III-A).
+"""What one scan saw, passed through and could not see, as planes over the local grid (paper III-A), and into the sky.
 
 The walk over the cells is in mapvote.perception.fans: the 3D question becomes a 2D one.
+
+A sensor reports returns only. Yet in a direction in which the road and the walls answer, and above the highest of them
+nothing does, no surface up there was within range. The test uses whole sectors, because single beams are lost on
+glass, on dark paint and by chance. For the same reason a ray lost between returns proves nothing.
+Above a house that was pulled down, and where one was built, hardly any other ray goes by.
 """
 
 from __future__ import annotations
@@ -16,9 +21,9 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
+from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
-from mapvote.perception.fans import Rays, follow_rays, gather_rays, mark_passed
-from mapvote.perception.free_rays import mark_sight
+from mapvote.perception.fans import FANS, Fans, Rays, follow_rays, gather_rays, mark_passed, set_out
 
 CLEARANCE_M = 0.45
 """A ray proves emptiness only up to here before its own hit: half a voxel's diagonal, range noise and pose error."""
@@ -94,6 +99,45 @@ def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, coun
             counts[k] += 1
 
 
+def mark_sight(
+    rays: Rays, obstacle: NDArray[np.bool_], fans: Fans, origin: F64, corner: tuple[float, float], sight: U8
+) -> None:
+    """Walk every fan from the sensor to the edge of the window, and enter how far it sees into ``sight``."""
+    nearest, farthest = np.full(FANS, np.inf, np.float32), np.zeros(FANS, np.float32)
+    _mark_sight(rays, obstacle, fans.direction, origin, corner, sight, nearest, farthest)
+
+
+@kernel
+def _mark_sight(
+    rays: Rays, obstacle: NDArray[np.bool_], direction: F64, origin: F64, corner: tuple[float, float], sight: U8,
+    nearest: F32, farthest: F32,
+) -> None:  # fmt: skip
+    rows, cols = sight.shape
+    x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
+    for i in range(len(rays.reach)):
+        h, f = rays.reach[i], rays.fan[i]
+        if h >= CELL_SIZE:
+            farthest[f] = max(farthest[f], h)
+            nearest[f] = min(nearest[f], h if obstacle[i] else np.float32(np.inf))
+    for f in range(FANS):
+        if farthest[f] == 0.0:
+            continue
+        dx, dy = direction[f]
+        step_r, step_c = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
+        r, c, t0, next_r, next_c, width_r, width_c = set_out(x, y, dx, dy, np.float32(0.0))
+        while 0 <= r < rows and 0 <= c < cols:
+            level = 1 if t0 > farthest[f] else (2 if t0 > nearest[f] else 3)
+            if sight[r, c] < level:
+                sight[r, c] = level
+            t0 = min(next_c, next_r)
+            if next_c < next_r:
+                c += step_c
+                next_c += width_c
+            else:
+                r += step_r
+                next_r += width_r
+
+
 def cast_rays(
     points_map: F64,
     origin_map: F64,
@@ -110,7 +154,7 @@ def cast_rays(
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
     occupy (docs/method.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
     the view has none: rays are followed to their ends only. ``sky``: which rays passed into the
-    sky (perception/free_rays.py); they are followed, too.
+    sky (:class:`Sky`); they are followed, too.
     """
     if cell is None:
         _, cell = find_obstacles(points_map, reference)
@@ -129,3 +173,64 @@ def cast_rays(
     if with_sight:
         mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)
+
+
+SECTORS = 256
+"""In a turn: of 1.4 deg, 8 firings or so of each beam; the ones beside a sector must be as empty."""
+ANSWERED = 0.25
+"""Share of a sector's rays that must have a return: where fewer have, lost packets or the vehicle may be the cause."""
+SKY_M = 60.0
+"""Horizontal metres for which a ray into the sky is followed: to the corners of any window, and well within range."""
+_EVERY = 2
+"""Of the fans every second one: at 40 m they are .25 m apart."""
+
+
+@kernel
+def _highest(rays: Rays, lean: F64, least: float, top: F32, count: I32) -> None:
+    """Into ``top`` (SECTORS,), from -inf, the steepest slope of a return in each, from the sensor's own plane; infinite
+    where too few came. ``count`` (SECTORS,): scratch of zeros."""
+    wide = FANS // SECTORS
+    for i in range(np.uint64(0), np.uint64(len(rays.reach))):
+        sector = np.uint64(rays.fan[i] // wide)
+        slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
+        top[sector] = max(top[sector], slope)
+        count[sector] += 1
+    for s in range(SECTORS):
+        if count[s] < least:
+            top[s] = np.inf
+
+
+_FAN = np.arange(0, FANS, _EVERY, dtype=np.int32)
+_AZIMUTH = (_FAN + 0.5) * 2.0 * np.pi / FANS
+_X, _Y = np.cos(_AZIMUTH).astype(np.float32), np.sin(_AZIMUTH).astype(np.float32)
+
+
+def _into_sky(rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
+    """Rays of the beams, of ascending ``slopes`` (beams,), that lie above all returns of their sector and its
+    neighbours."""
+    top = np.full(SECTORS, -np.inf, np.float32)
+    _highest(rays, lean, least, top, np.zeros(SECTORS, np.int32))
+    most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
+    above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))  # the next one may have grazed it
+    above = above[_FAN // (FANS // SECTORS)]
+    some = len(slopes) - above
+    of, room = np.repeat(np.arange(len(_FAN)), some), int(some.sum())
+    beam = np.arange(room) - np.repeat(np.cumsum(some) - some - above, some)
+    x, y = _X[of], _Y[of]
+    slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
+    far = np.full(room, np.float32(SKY_M))
+    return Rays(far, x, y, slope, far, _FAN[of])
+
+
+class Sky:
+    """The elevations above which a sensor's rays passed into the sky."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere the end of a ray is unknown
+        self._slopes = np.tan(np.radians(beams)).astype(np.float32)
+        self._least = ANSWERED * len(beams) * sensor.azimuths / SECTORS
+
+    def rays(self, up_map: F64, rays: Rays) -> Rays:
+        """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the sensor's
+        upward axis in their frame, which may lean some degrees."""
+        return _into_sky(rays, self._slopes, up_map[:2] / up_map[2], self._least)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapvote.config import Settings
-from mapvote.detection.readings import OPEN_SENTENCES, read
+from mapvote.detection.paper import OPEN_SENTENCES, read
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases, decided, paper_cases, read_kept
 from mapvote_lab.evaluation.experiments.scene import Scene, pass_folder

@@ -27,8 +27,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteError
 from mapvote.core.voting import one_hot, plurality, to_wire
-from mapvote.detection.paper import reading_table, sightings
-from mapvote.detection.readings import read, readings_of
+from mapvote.detection.paper import read, reading_table, readings_of, sightings
 from mapvote.fusion.fuse import states_over, update_map
 from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.scores import Scores, score_cells

@@ -35,8 +35,7 @@ from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import voxel_downsample
-from mapvote.detection.new_points import NewPoints
-from mapvote.detection.voter import Voter
+from mapvote.detection.voter import NewPoints, Voter
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.formats.atomic import whole_file, whole_folder
 from mapvote.formats.drives.options import parse_scans
