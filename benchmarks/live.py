@@ -34,7 +34,7 @@ import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.lazy_tiles import LazyTiles
+from mapvote.core.point_map import LazyTiles
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import Scan

@@ -14,7 +14,7 @@ import numpy as np
 from hand_made import Say, make_ballot, two_walls, wall, words_plane
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import Receipt, accept, examine

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from mapvote.core.azimuth import azimuth_32, azimuth_64
+from mapvote.core.geometry import azimuth_64
 from mapvote.core.types import F64
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import mapvote
-from mapvote.core.ground_growing import _grow
+from mapvote.core.ground import _grow
 from mapvote.core.voting import count_states
 from mapvote.fusion.distrust import contradicts, find_alike
 from mapvote.localisation.ndt_solver import align

@@ -38,7 +38,7 @@ from mapvote.codec.ballot import (
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import pack_memory, unpack_memory_plane
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.tile_history import PLANES, Memory
+from mapvote.core.tile import PLANES, Memory
 from mapvote.core.types import F32, I8, U64, CellState, MapvoteError
 
 SIZE = 1000

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core import geometry
-from mapvote.core.azimuth import turn
-from mapvote.core.geometry import exp, inverse, log, rotation_angle
+from mapvote.core.geometry import exp, inverse, log, rotation_angle, turn
 from mapvote.core.types import F64
 
 metres = st.floats(-100.0, 100.0)

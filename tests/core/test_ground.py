@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
-from mapvote.core.ground import _sorted_by_cell, base_layers
-from mapvote.core.ground_growing import (
+from mapvote.core.ground import (
     SEED,
     UNREACHED,
     WIDEST,
@@ -19,6 +18,8 @@ from mapvote.core.ground_growing import (
     _continued,
     _like,
     _raise_at_kerbs,
+    _sorted_by_cell,
+    base_layers,
     grow,
     tiles_around,
 )

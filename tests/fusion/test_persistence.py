@@ -11,8 +11,7 @@ import pytest
 
 from hand_made import make_tile, states_plane, two_walls, wall
 from mapvote.config import FuseSettings
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import CellState
 from mapvote.fusion.change_time import (
     DAY_S,

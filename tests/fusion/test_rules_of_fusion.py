@@ -11,8 +11,7 @@ import pytest
 
 from hand_made import make_tile, states_plane, wall, words_plane
 from mapvote.config import FuseSettings
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.sparse_columns import Words

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.fuse import differing, unspent
 from mapvote.fusion.sparse_columns import Words

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapvote.core.azimuth import turn
-from mapvote.core.geometry import rows_from
+from mapvote.core.geometry import rows_from, turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.perception.fans import FANS, FULL_RANGE_M, Rays, follow_rays, gather_rays, mark_passed
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapvote.core.azimuth import turn
+from mapvote.core.geometry import turn
 from mapvote.core.types import F32, F64
 from mapvote.perception.moving_objects import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
 

@@ -25,8 +25,7 @@ from mapvote.codec.ballot import Ballot, decode, encode, tile_index
 from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.codec.tile_planes import check_plane, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.lazy_tiles import made_in_turn
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import PointMap, made_in_turn
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file

@@ -15,8 +15,7 @@ from mapvote.codec.arrays import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import PLANES, Memory
+from mapvote.core.tile import PLANES, Memory, Tile
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 2

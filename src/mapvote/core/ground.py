@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
-from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, settle, tiles_around
+from mapvote.core.ground import SEED, STEP_M, UNREACHED, grow, settle, tiles_around
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, U8, read_only
 
@@ -109,7 +109,7 @@ def lay_ground(
     """Height of the ground in every cell of every tile, (256, 256) float32 map metres, NaN where unknown.
 
     ``n_points``: of each tile. ``road``: where vehicles drove, the height of the road under them. The ground grows
-    from there (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the
+    from there (:mod:`mapvote.core.ground`). Where it does not come to, and in maps of which nobody knows the
     path, it starts from places that the measured cells around agree on and above which nothing rises as gently as
     ground. Tiles are read one by one, in ascending order: of a large map only the heights are held, and no cell of
     tiles that a few strays make (:data:`_POINTS_AROUND`).
@@ -178,7 +178,7 @@ def _lowest_of_each(cells: I64, z: F32) -> Heights:
 def _sow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, least: int) -> None:
     """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things.
 
-    Arguments as :func:`mapvote.core.ground_growing.grow`. What is sown here was not known before and is not called so
+    Arguments as :func:`mapvote.core.ground.grow`. What is sown here was not known before and is not called so
     yet: no plane below changes on the way.
     """
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import LazyTiles, PointMap, all_points
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, MapvoteError

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS
 from mapvote.core.kernel import kernel
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote

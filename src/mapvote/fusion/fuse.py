@@ -21,10 +21,8 @@ from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.lazy_tiles import with_changed
-from mapvote.core.point_map import PointMap
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.point_map import PointMap, with_changed
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, remembered, temporary

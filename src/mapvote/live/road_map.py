@@ -18,8 +18,7 @@ import numpy as np
 from mapvote.client import Manifest, MapClient, Refused, Unreachable
 from mapvote.codec.ballot import tile_index
 from mapvote.core.grid import Lattice, TileIndex, window_around
-from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import LazyTiles, PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.localisation.map_window import tiles_within

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.azimuth import turn
+from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, U64

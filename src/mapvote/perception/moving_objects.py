@@ -32,8 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import MovingSettings
-from mapvote.core.azimuth import turn
-from mapvote.core.geometry import rows_from
+from mapvote.core.geometry import rows_from, turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.sensors import Sensor

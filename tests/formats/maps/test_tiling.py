@@ -14,9 +14,7 @@ from hypothesis import strategies as st
 from hand_made import Say, make_ballot, save_pcd, states_plane, wall
 from mapvote.codec.arrays import pack_plane
 from mapvote.config import FuseSettings
-from mapvote.core import lazy_tiles
-from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.point_map import LazyTiles, PointMap, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, read_map, write_map
 from mapvote.formats.maps import pcd, ply, tiling
@@ -77,7 +75,7 @@ def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPat
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything counts as larger than memory."""
-    monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
+    monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
     monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
     monkeypatch.setattr(pcd, "_BLOCK", 700)
     monkeypatch.setattr(ply, "_BLOCK", 700)
@@ -140,7 +138,7 @@ def test_a_large_map_leaves_as_the_same_file(tmp_path: Path, out: str, monkeypat
     fields["intensity"] = (fields["intensity"] / 999.0).astype(np.float32)
     small = map_of("it", [Cloud(points, fields=fields)])
     export_map(small, tmp_path / "small" / out)
-    monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
+    monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
     monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
     large = map_of("it", [Cloud(points, fields=fields)])
     assert isinstance(large.tiles, LazyTiles)

@@ -21,7 +21,7 @@ from standardwebhooks import Webhook, WebhookVerificationError
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import serving, serving_here
 from mapvote.client import MapClient
-from mapvote.config.server import ServerSettings
+from mapvote.config import ServerSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.event_routes import as_sse, deliver
 from mapvote.server.store import schema

@@ -18,8 +18,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
-from mapvote.config import FuseSettings, Settings
-from mapvote.config.server import ServerSettings
+from mapvote.config import FuseSettings, ServerSettings, Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.http.app import URL, create_app, in_process

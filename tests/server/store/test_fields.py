@@ -22,9 +22,7 @@ from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, pack_points, unpack_points
 from mapvote.codec.tile_planes import FIELD_TYPES, pack_fields, pack_tile, unpack_fields
 from mapvote.config import FuseSettings
-from mapvote.core import lazy_tiles
-from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
+from mapvote.core.point_map import LazyTiles, PointMap, all_fields, all_points, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import export_map, read_map
@@ -215,7 +213,7 @@ def test_of_a_map_larger_than_memory_tiles_are_read_one_by_one_and_the_files_are
     vote(store)
     found = []
     for limit, kind in ((10_000_000, dict), (100, LazyTiles)):
-        monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", limit)
+        monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", limit)
         with TestClient(create_app(store, opened=True), base_url="http://localhost") as app:
             client = client_of(app, tmp_path / f"home{limit}")
             maps = store.point_map(), client.fetch()

@@ -15,7 +15,7 @@ from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall,
 from mapvote.codec.ballot import pack_points, unpack_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.azimuth import azimuth_32
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan

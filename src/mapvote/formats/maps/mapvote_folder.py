@@ -16,8 +16,7 @@ from mapvote.codec.ballot import tile_index, tile_key
 from mapvote.codec.manifest import Manifest, TileHashes, digests_of, shown
 from mapvote.codec.tile_planes import check_plane, pack_tile, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import LazyTiles, PointMap, in_memory_if_small
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder

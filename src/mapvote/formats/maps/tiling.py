@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
-from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
-from mapvote.core.point_map import PointMap, check_extent, cut_tiles
+from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, in_memory_if_small
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE

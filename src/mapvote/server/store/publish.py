@@ -24,8 +24,7 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
-from mapvote.core.lazy_tiles import with_changed
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import PointMap, with_changed
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, MapvoteError
 from mapvote.server.errors import Conflict, Held

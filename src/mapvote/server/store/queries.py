@@ -18,8 +18,7 @@ from mapvote.codec.tile_planes import (
     unpack_tile,
 )
 from mapvote.core.grid import Grid, TileIndex
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED, Question, insert_rows

@@ -21,8 +21,7 @@ from msgspec import structs
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import pack_memory, pack_tile
 from mapvote.core.grid import Grid, TileIndex
-from mapvote.core.tile import Tile
-from mapvote.core.tile_history import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import Bool
 from mapvote.fusion.fuse import differing
 from mapvote.server.errors import Conflict, NotFound

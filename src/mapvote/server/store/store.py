@@ -20,8 +20,7 @@ import sqlalchemy as sa
 from mapvote.codec.ballot import Id, tile_key
 from mapvote.codec.manifest import DIGESTS, Manifest, TileHashes, digests_of, shown
 from mapvote.core.grid import Lattice, TileIndex
-from mapvote.core.lazy_tiles import LazyTiles, is_small
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import LazyTiles, PointMap, is_small
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
