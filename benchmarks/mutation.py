@@ -25,14 +25,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DECIDING = [
-    "core/voting", "core/ground_growing", "fusion/fuse", "fusion/tile_vote", "fusion/edit",
+    "core/voting", "core/ground", "fusion/fuse", "fusion/tile_vote", "fusion/edit",
     "fusion/distrust", "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper",
     "detection/evidence", "detection/packed_tiles", "detection/surfaces", "perception/fans", "perception/raycast",
     "slam/clean_map", "server/store/votes", "server/store/publish", "localisation/odometry", "localisation/pose_check",
 ]  # fmt: skip
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
-    "core/ground_growing": "core/test_ground.py",
+    "core/ground": "core/test_ground.py",
     "fusion/fuse": "fusion/test_fuse.py fusion/test_spent.py fusion/test_distrust.py fusion/test_rules_of_fusion.py",
     "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",

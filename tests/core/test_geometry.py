@@ -1,5 +1,8 @@
-"""SE(3): the group laws, and that log undoes exp."""
+"""SE(3): the group laws, and that log undoes exp. Azimuths as the C library says, corners and all."""
 
+from itertools import product
+
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapvote.core import geometry
 from mapvote.core.geometry import exp, inverse, log, rotation_angle, turn
-from mapvote.core.types import F64
+from mapvote.core.types import F32, F64
 
 metres = st.floats(-100.0, 100.0)
 angles = st.floats(-1.7, 1.7)  # |phi| < sqrt(3) * 1.7 < pi: where log is the inverse of exp
@@ -61,6 +64,26 @@ def test_turn_is_the_azimuth_in_turns_to_1e_5_rad() -> None:
     off = 2.0 * np.pi * np.array(found) - angle
     assert np.abs((off + np.pi) % (2.0 * np.pi) - np.pi).max() < 2e-5
     assert turn(np.float32(0.0), np.float32(0.0)) == 0.0
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def azimuths(y: F32, x: F32) -> F32:
+    out = np.empty_like(x)
+    for i in range(len(x)):
+        out[i] = geometry.azimuth(y[i], x[i])
+    return out
+
+
+def test_the_azimuth_is_the_true_one_but_for_the_last_digit_and_signs_of_zero_count() -> None:
+    """Near and far, on a grid too, so that many points lie on an axis or a diagonal."""
+    rng = np.random.default_rng(3)
+    x, y = (rng.normal(0.0, 1.0, (2, 300_000)) * 10.0 ** rng.uniform(-4.0, 3.0, (2, 300_000))).astype(np.float32)
+    x[::3], y[::3] = np.round(x[::3], 1), np.round(y[::3], 1)
+    corners = np.array(list(product([0.0, -0.0, 2.0, -2.0, 1e-30], [0.0, -0.0, 1.0, -1.0, 1e30, -1e30])), np.float32)
+    y, x = np.append(y, corners[:, 0]), np.append(x, corners[:, 1])
+    exact, found = np.arctan2(y.astype(np.float64), x.astype(np.float64)), azimuths(y, x)
+    assert (np.abs(found - exact) / np.spacing(np.maximum(np.abs(exact), 1e-30).astype(np.float32))).max() < 1.5
+    np.testing.assert_array_equal(np.signbit(found), np.signbit(exact))
 
 
 NUMBER = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([0.0, 1e-12, -1e-9, 1e-7, np.pi, 3.1415920, -3.14159265]))

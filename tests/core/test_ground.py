@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapvote.core.columns import base_layers
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
 from mapvote.core.ground import (
     SEED,
@@ -19,7 +20,6 @@ from mapvote.core.ground import (
     _like,
     _raise_at_kerbs,
     _sorted_by_cell,
-    base_layers,
     grow,
     tiles_around,
 )

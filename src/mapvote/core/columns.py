@@ -137,3 +137,43 @@ def _enter_cells(
         row = int(np.floor((np.float64(points[i, 1]) + y0 - lattice_y0) / CELL_SIZE)) - row0
         col = int(np.floor((np.float64(points[i, 0]) + x0 - lattice_x0) / CELL_SIZE)) - col0
         flat[i] = min(max(row, 0), rows - 1) * cols + min(max(col, 0), cols - 1)
+
+
+def base_layers(ground_z: F32) -> I32:
+    """(rows, cols) lattice layer of bit 0: floor(ground_z / 0.3), unknown cells filled from the nearest known one."""
+    known = np.isfinite(ground_z)
+    if not known.any():
+        return np.zeros(ground_z.shape, dtype=np.int32)
+    low = ground_z.astype(np.float64)
+    if not known.all():
+        low[~known] = np.inf
+        lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
+        np.copyto(low, ground_z, where=known)
+    return np.floor(low / CELL_SIZE).astype(np.int32)
+
+
+@kernel
+def lower_envelope(z: F64, straight: float, diagonal: float) -> None:
+    """Two-pass chamfer: z[c] = min over c' of z[c'] + grade * |c - c'|, in place (Borgefors 1986)."""
+    rows, cols = z.shape
+    for r in range(rows):
+        if r > 0:
+            _reach_from(z[r - 1], z[r], straight, diagonal)
+        for c in range(1, cols):
+            z[r, c] = min(z[r, c], z[r, c - 1] + straight)
+    for r in range(rows - 1, -1, -1):
+        if r + 1 < rows:
+            _reach_from(z[r + 1], z[r], straight, diagonal)
+        for c in range(cols - 2, -1, -1):
+            z[r, c] = min(z[r, c], z[r, c + 1] + straight)
+
+
+@inlined
+def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None:
+    """What a row takes from the one beside it: no cell waits for another, so the compiler makes vectors of it."""
+    last = len(row) - 1
+    for c in range(last + 1):
+        row[c] = min(row[c], beside[c] + straight)
+    for c in range(last):
+        row[c] = min(row[c], beside[c + 1] + diagonal)
+        row[c + 1] = min(row[c + 1], beside[c] + diagonal)

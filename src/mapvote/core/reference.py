@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Iterator
+from dataclasses import fields
+from itertools import repeat
+from typing import Any
 
 import numpy as np
 
-from mapvote.core.columns import fill_columns
+from mapvote.core.columns import base_layers, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
-from mapvote.core.ground import base_layers
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, U64, Reference
 
-Layout = Generator[None, None, Reference]
-"""The planes of a window on their way: each step takes a few milliseconds at most, the last one returns them."""
+Layout = Iterator[Reference | None]
+"""The planes of a window on their way: each step takes a few milliseconds at most, the last one gives them."""
 
 
 def reference_window(point_map: PointMap, grid: Grid) -> Reference:
@@ -21,10 +23,8 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     return _finished(_laid_out(point_map, grid))
 
 
-def _finished(layout: Layout | Reference) -> Reference:
-    while not isinstance(layout, Reference):
-        layout = _step(layout)
-    return layout
+def _finished(layout: Layout) -> Reference:
+    return next(filter(None, layout))
 
 
 def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
@@ -36,9 +36,9 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
         ground_z[common.slices_in(grid)] = tile.ground_z[common.slices_in(tile.window)]
         if tile.free is not None:
             free[common.slices_in(grid)] = tile.free[common.slices_in(tile.window)]
-    yield
+    yield None
     base = base_layers(ground_z)
-    yield
+    yield None
     for tile in tiles:
         if tile.has_ground:  # by the tile alone, so that every editor of the tile reads the words as they were written
             common = tile.window.intersection(grid)
@@ -48,21 +48,12 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
     bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
     top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
     for tile in tiles:
-        yield
+        yield None
         rows, cols, _ = grid.indices_of(tile.points_map)
-        fill_columns(
-            rows, cols, tile.points[:, 2].astype(np.float64), ground_z, base, occupied, counts, bottom_z, top_z
-        )
-    return Reference(
-        grid,
-        ground_z,
-        base,
-        occupied,
-        counts,
-        bottom_z,
-        top_z,
-        free if any(t.free is not None for t in tiles) else None,
-    )
+        z = tile.points[:, 2].astype(np.float64)
+        fill_columns(rows, cols, z, ground_z, base, occupied, counts, bottom_z, top_z)
+    known = free if any(t.free is not None for t in tiles) else None
+    yield Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, known)
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
@@ -83,22 +74,6 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
     return np.where(near, ~np.uint64(0), np.uint64(0))
 
 
-def cut_reference(outer: Reference, window: Grid) -> Reference:
-    """The planes of ``outer`` over ``window``, which lies inside it: views, but for ``base``, whose cells points and
-    rays find by one number."""
-    cut = window.slices_in(outer.grid)
-    return Reference(
-        window,
-        outer.ground_z[cut],
-        np.ascontiguousarray(outer.base[cut]),
-        outer.occupied[cut],
-        outer.counts[cut],
-        outer.bottom_z[cut],
-        outer.top_z[cut],
-        None if outer.free is None else outer.free[cut],
-    )
-
-
 class LocalMap:
     """The reference around a moving vehicle: arrays over the tiles around it, made anew only when it has left them.
 
@@ -111,8 +86,8 @@ class LocalMap:
         self.outer: Reference | None = None
         """The planes made last; windows are views into them."""
         self._middle: TileIndex | None = None
-        self._next: tuple[TileIndex, Layout | Reference] | None = None
-        """Another middle, and what there is of its planes."""
+        self._next: tuple[TileIndex, Layout] | None = None
+        """Another middle, and its planes on their way."""
 
     def at(self, origin_map: F64) -> tuple[Reference, Reference]:
         """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
@@ -121,25 +96,23 @@ class LocalMap:
         row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
         middle = row // TILE_CELLS, col // TILE_CELLS
         if self.outer is None or window.intersection(self.outer.grid) != window:
-            self.outer = _finished(self._ahead(middle, window))
-            self._middle, self._next = middle, None
+            self.outer, self._middle, self._next = _finished(self._ahead(middle, window)), middle, None
         elif middle != self._middle:
             ahead = self._ahead(middle, window)
-            if not isinstance(ahead, Reference):
-                self._next = middle, _step(ahead)
-        return cut_reference(self.outer, window), self.outer
+            done = next(ahead)
+            self._next = middle, ahead if done is None else repeat(done)
+        return _cut(self.outer, window), self.outer
 
-    def _ahead(self, middle: TileIndex, window: Grid) -> Layout | Reference:
+    def _ahead(self, middle: TileIndex, window: Grid) -> Layout:
         if self._next is not None and self._next[0] == middle:
             return self._next[1]
-        centre = self.point_map.lattice.tile(middle)
-        return _laid_out(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+        return _laid_out(self.point_map, self.point_map.lattice.tile(middle).padded(max(TILE_CELLS, window.rows)))
 
 
-def _step(layout: Layout) -> Layout | Reference:
-    try:
-        next(layout)
-    except StopIteration as done:
-        reference: Reference = done.value
-        return reference
-    return layout
+def _cut(outer: Reference, window: Grid) -> Reference:
+    """The planes of ``outer`` over ``window``, which lies inside it: views, but for ``base``, whose cells points and
+    rays find by one number."""
+    cut = window.slices_in(outer.grid)
+    planes = {f.name: getattr(outer, f.name) for f in fields(Reference) if f.name != "grid"}
+    views: dict[str, Any] = {name: None if plane is None else plane[cut] for name, plane in planes.items()}
+    return Reference(window, **views | {"base": np.ascontiguousarray(views["base"])})

@@ -3,7 +3,7 @@ which objects appeared and disappeared there."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import column_bits, flat_cells, mark_obstacles
+from mapvote.core.columns import base_layers, column_bits, flat_cells, mark_obstacles
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
-from mapvote.core.ground import base_layers
 from mapvote.core.types import F32, F64, I32, I64, U8, U32, U64, Bool, check_array, read_only
 
 _SCALES = (1.0, 255.0, 4095.0, 65535.0)
@@ -99,33 +98,20 @@ class Memory:
 
     def but(self, cells: I64, values: U32) -> Memory:
         """The same, but of flat ``cells`` (m,), ascending, these ``values`` (4, m)."""
-        joined, planes, at = self._joined(cells)
-        planes[:, at] = values
-        return _sparse(joined, planes, sure=bool(values.any(axis=0).all()))
-
-    def with_changed(self, cells: I64, version: int) -> Memory:
-        """The same, but flat ``cells`` (m,), ascending, changed in ``version``."""
-        joined, planes, at = self._joined(cells)
-        planes[0, at] = version
-        return _sparse(joined, planes, sure=version > 0)
-
-    def _joined(self, cells: I64) -> tuple[I64, U32, I64]:
-        """(own cells and ``cells`` (m,), (n,) ascending; their values (4, n), zero where they are new; which of all
-        each of ``cells`` is (m,))."""
         named = np.zeros(CELLS, dtype=np.bool_)  # np.union1d takes four times as long, nonzero of numbers ten times
         named[self.cells] = named[cells] = True
         joined = np.flatnonzero(named)
         planes = np.zeros((PLANES, len(joined)), dtype=np.uint32)
         planes[:, np.searchsorted(joined, self.cells)] = self.values
-        return joined, planes, np.searchsorted(joined, cells)
+        planes[:, np.searchsorted(joined, cells)] = values
+        kept = np.flatnonzero(planes.any(axis=0))
+        return Memory(joined[kept], planes[:, kept])
 
-
-def _sparse(cells: I64, values: U32, sure: bool) -> Memory:
-    """A memory of cells (n,) of which some values (4, n) may be all zero, unless one is ``sure`` that none are."""
-    if sure:
-        return Memory(cells, values)
-    kept = np.flatnonzero(values.any(axis=0))
-    return Memory(cells[kept], values[:, kept])
+    def with_changed(self, cells: I64, version: int) -> Memory:
+        """The same, but flat ``cells`` (m,), ascending, changed in ``version``."""
+        values = self.at(cells)
+        values[0] = version
+        return self.but(cells, values)
 
 
 @dataclass(frozen=True, repr=False)
@@ -149,25 +135,16 @@ class Tile:
     """Columns (n,) that came with the points of an imported map: intensity, red, classification, gps_time ..."""
 
     def __post_init__(self) -> None:
-        self._check({"points", "ground_z", "free"})
-        self._keep({"points": self.points, "ground_z": self.ground_z, "free": self.free})
-
-    def _keep(self, planes: Mapping[str, Any]) -> None:
-        """These planes, read-only."""
-        for name, plane in planes.items():
-            self.__dict__[name] = read_only(plane) if isinstance(plane, np.ndarray) else plane
-
-    def _check(self, planes: Collection[str]) -> None:
-        """Of these planes, and of all fields of the points."""
-        if "points" in planes:
-            check_array(self.points, "Tile.points", (None, 3), np.float32)
-        if "ground_z" in planes:
-            check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
-        if "free" in planes and self.free is not None:
+        check_array(self.points, "Tile.points", (None, 3), np.float32)
+        check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
+        if self.free is not None:
             check_array(self.free, "Tile.free", self.window.shape, np.uint64)
         for name, column in self.fields.items():
             if column.shape != (len(self.points),):
                 raise ValueError(f"Tile.fields[{name!r}] is {column.shape}, but there are {len(self.points)} points")
+        for name in ("points", "ground_z", "free"):
+            plane = self.__dict__[name]
+            self.__dict__[name] = plane if plane is None else read_only(plane)
 
     def __repr__(self) -> str:
         row, col = self.index
@@ -184,31 +161,17 @@ class Tile:
 
     def but(self, **planes: Any) -> Tile:
         """The tile with other ``planes``; what was worked out of those that stay goes along."""
-        other = self._with(planes)
-        other._check(planes)
-        return other
-
-    def _with(self, planes: dict[str, Any]) -> Tile:
-        """:meth:`but` of planes that are known to be sound."""
-        stays = {name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys()}
         other = object.__new__(Tile)
-        other.__dict__.update({name: self.__dict__[name] for name in stays})
-        other._keep(planes)
+        stays = (name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys())
+        other.__dict__.update({name: self.__dict__[name] for name in stays}, **planes)
+        other.__post_init__()
         return other
 
     def without(self, dropped: Bool) -> Tile:
         """The tile without some of its points (n,); the others keep their fields."""
         left = np.flatnonzero(~dropped)
-        points, cells = self.points.take(left, axis=0), self.cells.take(left)
         fields = {name: column.take(left) for name, column in self.fields.items()}
-        other, words = self._with({"points": points, "fields": fields}), self.obstacle_words.reshape(-1).copy()
-        touched = np.zeros(CELLS, dtype=np.bool_)
-        touched[self.cells[dropped]] = True
-        words[touched] = 0
-        again = np.flatnonzero(touched[cells])
-        self._mark(words, points[again], cells[again])
-        other.__dict__.update(cells=cells, obstacle_words=words.reshape(self.window.shape))
-        return other
+        return self.but(points=self.points.take(left, axis=0), fields=fields)
 
     def with_new(self, points: F32, intensity: U8 | None = None) -> Tile:
         """The tile with more points (m, 3) after its own.
@@ -222,12 +185,7 @@ class Tile:
             if name == "intensity" and intensity is not None:
                 new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
             fields[name] = np.concatenate([column, new])
-        other = self._with({"points": np.concatenate([self.points, points]), "fields": fields})
-        cells, words = flat_cells(self.window, points), self.obstacle_words.reshape(-1).copy()
-        self._mark(words, points, cells)
-        words = words.reshape(self.window.shape)
-        other.__dict__.update(cells=np.concatenate([self.cells, cells]), obstacle_words=words)
-        return other
+        return self.but(points=np.concatenate([self.points, points]), fields=fields)
 
     @property
     def index(self) -> TileIndex:
@@ -246,7 +204,7 @@ class Tile:
 
     @cached_property
     def base(self) -> I32:
-        """(256, 256) lattice layer of bit 0 of each column, see :func:`mapvote.core.ground.base_layers`."""
+        """(256, 256) lattice layer of bit 0 of each column, see :func:`mapvote.core.columns.base_layers`."""
         return base_layers(self.ground_z)
 
     @property
@@ -257,22 +215,15 @@ class Tile:
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""
-        ground = self.ground_z.reshape(-1)[self.cells]
-        base = self.base.reshape(-1)[self.cells]
-        bit, obstacle = column_bits(self.points[:, 2].astype(np.float64), ground, base)
-        return bit, obstacle
+        ground, base = self.ground_z.reshape(-1)[self.cells], self.base.reshape(-1)[self.cells]
+        return column_bits(self.points[:, 2].astype(np.float64), ground, base)
 
     @cached_property
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
-        words = np.zeros(CELLS, dtype=np.uint64)
-        self._mark(words, self.points, self.cells)
+        words, ground_z, base = np.zeros(CELLS, dtype=np.uint64), self.ground_z.reshape(-1), self.base.reshape(-1)
+        mark_obstacles(words, read_only(self.points), read_only(self.cells), read_only(ground_z), read_only(base))
         return words.reshape(self.window.shape)
-
-    def _mark(self, words: U64, points: F32, cells: I64) -> None:
-        """Enter points (n, 3) in flat ``cells`` (n,) into column ``words`` (65536,), in place."""
-        ground_z, base = self.ground_z.reshape(-1), self.base.reshape(-1)
-        mark_obstacles(words, read_only(points), read_only(cells), read_only(ground_z), read_only(base))
 
 
 def in_bytes(intensity: NDArray[Any]) -> U8:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan
@@ -178,7 +179,7 @@ def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F
         for i in range(n):
             x[i], y[i] = points[start + i, 0], points[start + i, 1]
         for i in range(n):
-            out[start + i] = azimuth_32(y[i], x[i]) / turn_per_s
+            out[start + i] = azimuth(y[i], x[i]) / turn_per_s
 
 
 def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
