@@ -125,7 +125,8 @@ def draw_diagnosis(diagnosis: Diagnosis, point_map: PointMap | None, path: Path)
     part of it from near. Where the doctor knows no way to mend, the right side says so."""
     figure, axes = new_figure(11.0, 11.5, rows=2, cols=2)
     ground = None if point_map is None else _thinned(all_points(point_map), _POINTS_OF_THE_MAP)
-    drive, read, mended = diagnosis.drive, diagnosis.T_read, diagnosis.T_mended
+    drive, mended = diagnosis.drive, diagnosis.T_mended
+    read = None if drive is None else drive.T_map_lidar_prior
     scans = {} if drive is None else _some_scans(drive)
     for column, (title, T) in enumerate((("as read", read), ("as mended", mended))):
         wide, near = axes[:, column]

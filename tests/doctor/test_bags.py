@@ -12,7 +12,7 @@ from bag_recorder import START, Recorder
 from mapvote.core import geometry
 from mapvote.core.types import F64
 from mapvote.doctor import Finding
-from mapvote.doctor.records import check_bag
+from mapvote.doctor.diagnosis import check_bag
 
 T_BASE_LIDAR = geometry.from_xyz_rpy(1.2, 0.0, 1.8, 0.01, 0.02, np.pi / 2)
 

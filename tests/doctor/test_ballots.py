@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
-from mapvote.doctor.records import check_ballot, check_store
+from mapvote.doctor.diagnosis import check_ballot, check_store
 from mapvote.server.store import schema
 from mapvote.server.store.keys import issue
 from mapvote.server.store.store import Store

@@ -121,7 +121,7 @@ def doctor(
     """
     from rich.console import Console
 
-    from mapvote.doctor.diagnosis import Diagnosis, diagnose
+    from mapvote.doctor.diagnosis import Diagnosis, check_store, diagnose
     from mapvote.formats import read_map
 
     if is_url(path):
@@ -131,8 +131,6 @@ def doctor(
         with waiting(f"reading {map_path}"):
             point_map = read_map(map_path)
     if is_store(path):
-        from mapvote.doctor.records import check_store
-
         with opened_store(path) as store, waiting("reading every byte"):
             diagnosis = Diagnosis(check_store(store))
     else:

@@ -17,7 +17,7 @@ import scipy
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress, Severity
-from mapvote.doctor.scans import Looking, Looks, in_map_frame
+from mapvote.doctor.scans import Looking, Looks
 from mapvote.localisation.ndt import NdtMap, fitness, likeliest, refine, thin_for_levels
 
 _UPS = {sign + axis: s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}
@@ -129,11 +129,6 @@ class DriveEvidence:
     def T(self) -> F64 | None:
         """(n, 4, 4) the prior as it was read."""
         return self.drive.T_map_lidar_prior
-
-    @property
-    def in_map_frame(self) -> bool:
-        """Whether the points are in the map's frame: then nothing else can be checked."""
-        return self.T is not None and len(self.looks) > 0 and in_map_frame(self.T, self.looks)
 
     @property
     def readable(self) -> I64:

@@ -178,7 +178,7 @@ def _look(index: int, points: F32) -> np.void:
 def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
     """What ``looks`` at a drive's scans, its times and its prior show."""
     T = drive.T_map_lidar_prior
-    if T is not None and len(looks) and in_map_frame(T, looks):
+    if T is not None and len(looks) and _in_map_frame(T, looks):
         return [IN_MAP_FRAME]
     found = [*_check_times(drive), *_check_scans(drive, looks)]
     if T is None:
@@ -186,7 +186,7 @@ def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
     return [*found, *_check_track(drive, T)] if len(T) >= 2 else found
 
 
-def in_map_frame(T: F64, looks: Looks) -> bool:
+def _in_map_frame(T: F64, looks: Looks) -> bool:
     """Whether the points lie around the prior, or move along with it: then they are in the map's frame already."""
     position, mean = T[looks["index"], :3, 3], looks["mean"]
     away_m = float(np.median(np.linalg.norm(position, axis=1)))
