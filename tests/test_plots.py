@@ -22,7 +22,9 @@ DRIVE = drive_along(POSES, 1, POSES.copy())
 def diagnosis() -> Diagnosis:
     moved = POSES.copy()
     moved[:, 0, 3] += 3.0
-    return Diagnosis([Finding("error", "the prior is 3 m off", "move it")], replace(DRIVE, T_map_lidar_prior=moved), POSES)
+    return Diagnosis(
+        [Finding("error", "the prior is 3 m off", "move it")], replace(DRIVE, T_map_lidar_prior=moved), POSES
+    )
 
 
 @pytest.mark.slow
@@ -38,7 +40,11 @@ def test_the_picture_is_the_same_each_time_and_shows_the_map(tmp_path: Path, dia
 
 def test_what_is_not_known_is_said(tmp_path: Path, diagnosis: Diagnosis) -> None:
     unmended = replace(diagnosis, T_mended=None)
-    for less in (unmended, replace(unmended, drive=replace(DRIVE, T_map_lidar_prior=None)), replace(unmended, drive=None)):
+    for less in (
+        unmended,
+        replace(unmended, drive=replace(DRIVE, T_map_lidar_prior=None)),
+        replace(unmended, drive=None),
+    ):
         draw_diagnosis(less, None, tmp_path / "x.png")
         assert (tmp_path / "x.png").stat().st_size > 1000
 
