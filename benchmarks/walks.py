@@ -35,7 +35,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import CellState
 from mapvote.doctor.diagnosis import diagnose
-from mapvote.formats.drives.kitti import DriveWriter
+from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.server.http.app import URL, in_process
 from mapvote.server.store.policy import Policy

@@ -16,7 +16,7 @@ from mapvote.core.geometry import exp, from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64, I64
 from mapvote.doctor import Finding
 from mapvote.doctor.prior import CAMERA_TO_LIDAR
-from mapvote.formats.drives.kitti import write_poses
+from mapvote.formats.drives.scan_folder import write_poses
 
 VAGUE = "do not belong together|do not fit|leap|the vehicle drives at|off the scans' motion|fits the scans in|nowhere"
 """Errors that say something is wrong without saying what."""

@@ -23,7 +23,7 @@ from mapvote.doctor.diagnosis import diagnose, examine_drive
 from mapvote.doctor.map_fit import MapEvidence, check_on_map, in_another_unit
 from mapvote.doctor.maps import examine_points
 from mapvote.doctor.scans import NO_PRIOR
-from mapvote.formats.drives.kitti import write_poses
+from mapvote.formats.drives.scan_folder import write_poses
 from mapvote.formats.maps.cloud import Cloud
 from mapvote_lab.simulation import simulate
 from streets import drive_along, path

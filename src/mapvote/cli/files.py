@@ -183,10 +183,9 @@ def import_map(
 
     mapvote import city.pcd my_map
     """
-    from mapvote.formats import write_map
+    from mapvote.formats import import_cloud, write_map
     from mapvote.formats.atomic import folder_beside
-    from mapvote.formats.geo.projector import frame_wanted
-    from mapvote.formats.maps.importing import import_cloud
+    from mapvote.formats.geo.frame import frame_wanted
 
     with waiting(f"reading {source}"):
         wanted = frame_wanted(crs, projector)
@@ -282,8 +281,8 @@ def _export(
 
 
 def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str | None) -> None:
+    from mapvote.formats import autoware_pieces
     from mapvote.formats.maps.autoware import lay_version, names_of
-    from mapvote.formats.maps.exporting import autoware_pieces
 
     cloud = autoware_pieces(point_map, out, projector)
     known = frozenset(names_of(str(out), autoware_pieces(older, out, projector))) if older is not None else frozenset()
@@ -325,8 +324,8 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
 
     The frame is chosen once, with the first version, unless ``projector`` names one: a map that grows does not move.
     """
+    from mapvote.formats import autoware_pieces
     from mapvote.formats.maps.autoware import laid_version, lay_version
-    from mapvote.formats.maps.exporting import autoware_pieces
 
     if laid_version(folder) == client.manifest().version:
         return None

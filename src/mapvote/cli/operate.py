@@ -235,8 +235,8 @@ def _write_changes(found: dict[str, Any], out: Path | None) -> None:
     import json
 
     from mapvote.formats.atomic import whole_file
+    from mapvote.formats.geo.frame import frame_of
     from mapvote.formats.geo.geopackage import write_geopackage
-    from mapvote.formats.geo.projector import frame_of
 
     if found.get("damaged"):
         left_out = "; ".join(found["damaged"])

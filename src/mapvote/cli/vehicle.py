@@ -157,7 +157,7 @@ def vote(
     from mapvote.core.point_map import has_open_ground
     from mapvote.formats import is_cloud, open_drive
     from mapvote.formats.atomic import whole_file
-    from mapvote.formats.geo.projector import frame_of
+    from mapvote.formats.geo.frame import frame_of
 
     if out is None and send is None:
         raise MapvoteError("vote: give --out BALLOT, --send URL, or both")

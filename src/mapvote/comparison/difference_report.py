@@ -14,7 +14,7 @@ from mapvote.core.grid import CELL_SIZE, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Bool
-from mapvote.formats.geo.projector import frame_of
+from mapvote.formats.geo.frame import frame_of
 from mapvote.server.views.cutout import cut_out, whole_page
 from mapvote.server.views.geojson import MAP_METRES, rings_to_lonlat
 

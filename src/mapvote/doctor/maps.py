@@ -23,7 +23,7 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor import Finding, any_error, in_order
 from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
-from mapvote.formats.geo.projector import frame_of
+from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.tiling import map_of

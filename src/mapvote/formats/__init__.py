@@ -1,4 +1,5 @@
-"""Maps and drives in everybody's file formats: open a drive, read a map, write a map.
+"""Maps and drives in everybody's file formats: open a drive; read or import a map, in whatever coordinates; write or
+export one.
 
 Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by what lies at the path, never by asking.
 """
@@ -6,6 +7,7 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -13,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, Drive, MapvoteError
-from mapvote.formats.drives.kitti import DriveWriter
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, U8, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
+from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
-from mapvote.formats.maps.cloud import Cloud, joined
-from mapvote.formats.maps.exporting import export_map
+from mapvote.formats.geo.frame import LOCAL, PROJECTOR, MapFrame, autoware_frame, frame_of, frame_wanted
+from mapvote.formats.geo.units import Convert, settle
+from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
-from mapvote.formats.registry import DRIVES, MAPS
+from mapvote.formats.registry import DRIVES, MAPS, WRITERS
 
 __all__ = [
     "DriveWriter",
@@ -35,6 +39,10 @@ __all__ = [
     "write_map",
     "write_pcd",
 ]
+NOISE = (7, 18)
+"""ASPRS classes: low noise, high noise."""
+
+Offset = tuple[float, float, float]
 
 
 def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
@@ -107,9 +115,145 @@ def is_cloud(path: Path | str) -> bool:
     return held and not any(layout.recognised(path) for layout in DRIVES.values())
 
 
+def import_cloud(
+    path: Path,
+    wanted: MapFrame | None = None,
+    from_crs: str | None = None,
+    folder: Path | None = None,
+    look: Look | None = None,
+) -> tuple[PointMap, list[str]]:
+    """(the map, lines that say what became of the file's coordinates, classes and fields).
+
+    ``wanted``: the frame to project to. ``from_crs``: the file's coordinate system, where the file states none or a
+    wrong one. ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of
+    them.
+    """
+    pieces = stream_cloud(path)
+    if from_crs is not None:
+        said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
+        pieces = (replace(piece, frame=said) for piece in pieces)
+    left = _LeftOut()
+    metres = in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)
+    point_map = map_of(str(path), left.noise(metres), folder, look)
+    return point_map, left.told()
+
+
+@dataclass
+class _LeftOut:
+    """What passes by on the way from the file to the map."""
+
+    frame: MapFrame = field(default_factory=MapFrame)
+    points: int = 0
+    fields: dict[str, None] = field(default_factory=dict)
+
+    def noise(self, pieces: Iterator[Cloud]) -> Iterator[Cloud]:
+        """The pieces without the points that the file classifies as noise."""
+        for piece in pieces:
+            self.frame = piece.frame
+            self.fields |= dict.fromkeys(piece.dropped)
+            kept, n = without_noise(piece)
+            self.points += n
+            yield kept
+
+    def told(self) -> list[str]:
+        """In words."""
+        told = [f"coordinates: {self.frame.told()}"]
+        if self.points:
+            told.append(f"dropped: {self.points} points that the file classifies as noise (classes 7 and 18)")
+        if self.fields:
+            told.append(f"dropped fields: {', '.join(self.fields)}")
+        return told
+
+
+def without_noise(cloud: Cloud) -> tuple[Cloud, int]:
+    """The cloud without the points that its file classifies as noise, and how many were dropped."""
+    classes = cloud.fields.get("classification")
+    if classes is None:
+        return cloud, 0
+    noise = np.isin(classes, NOISE)
+    if not noise.any():
+        return cloud, 0
+    fields = {name: column[~noise] for name, column in cloud.fields.items()}
+    return replace(cloud, points=cloud.points[~noise], fields=fields), int(noise.sum())
+
+
 def write_map(point_map: PointMap, path: Path | str) -> None:
     """Write a mapvote map folder, whole or not at all. An older mapvote map there is replaced, anything else is not."""
     write_map_folder(point_map, Path(path))
+
+
+def export_map(
+    point_map: PointMap,
+    path: Path | str,
+    offset: Offset = (0.0, 0.0, 0.0),
+    *,
+    crs: str | None = None,
+    projector: str | None = None,
+) -> tuple[str, MapFrame]:
+    """Write a map's points for others, by the suffix of ``path`` (``WRITERS``); without one as an Autoware folder.
+
+    ``crs`` ("EPSG:32654", WKT) or ``projector`` (a map_projector_info.yaml, "MGRS", ...) name another frame than the
+    map's. ``offset`` (metres) is subtracted from every point, for formats of float32. Whole or not at all.
+    Returns the format's name and the frame of what was written.
+    """
+    path = Path(path)
+    writer = WRITERS.get(path.suffix.lower())
+    if writer is None:
+        suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
+        raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
+    stated, corners = frame_of(point_map.georeference), _corners(path, point_map)
+    if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
+        wanted: MapFrame | None = autoware_frame(stated, corners, projector)
+        if crs is not None:
+            raise MapvoteError(f"{path}: Autoware takes no --crs, but --projector")
+    else:
+        wanted = frame_wanted(crs, projector)
+    frame, convert = settle(str(path), stated, wanted, corners, sure=True)
+    if any(offset):
+        x, y, z = (float(a + b) for a, b in zip(frame.offset_m, offset, strict=True))
+        frame = MapFrame(frame.crs, (x, y, z), frame.heights)
+    writer.write(path, _pieces(point_map, frame, convert, offset, classes=writer.classes))
+    return writer.name, frame
+
+
+def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) -> CloudPieces:
+    """A map's points in a frame that Autoware supports: ``projector``'s, else the one that ``folder`` has already."""
+    stated, corners, chosen = frame_of(point_map.georeference), _corners(folder, point_map), folder / PROJECTOR
+    wanted = projector or (str(chosen) if chosen.is_file() and not stated.is_local else None)
+    frame, convert = settle(str(folder), stated, autoware_frame(stated, corners, wanted), corners, sure=True)
+    return _pieces(point_map, frame, convert)
+
+
+def _pieces(
+    point_map: PointMap, frame: MapFrame, convert: Convert, offset: Offset = (0.0, 0.0, 0.0), *, classes: bool = False
+) -> CloudPieces:
+    """One piece a tile, less ``offset``; ``classes``: with ASPRS classes where the map has none. Fields that only
+    mapvote reads (scans, sources) stay behind."""
+
+    def pieces() -> Iterator[Cloud]:
+        for index in sorted(point_map.tiles):
+            tile = point_map.tiles[index]
+            fields: dict[str, NDArray[Any]] = {name: tile.fields[name] for name in KEPT if name in tile.fields}
+            if classes and "classification" not in fields:
+                fields["classification"] = ground_classes(tile)
+            points = convert(tile.points_map)
+            yield Cloud(points - np.array(offset) if any(offset) else points, frame=frame, fields=fields)
+
+    return CloudPieces.gathered(pieces, frame)
+
+
+def _corners(where: Path, point_map: PointMap) -> F64:
+    """(2, 3) the lowest and the highest coordinates of a map's points; MapvoteError if it has none to write there."""
+    boxes = [(t.points_map.min(axis=0), t.points_map.max(axis=0)) for t in point_map.tiles.values() if len(t.points)]
+    if not boxes:
+        raise MapvoteError(f"{where}: the map holds no points, so there is nothing to export")
+    low, high = np.array(boxes).transpose(1, 0, 2)
+    return np.array([low.min(axis=0), high.max(axis=0)])
+
+
+def ground_classes(tile: Tile) -> U8:
+    """(n,) ASPRS class of every point of a tile: ground, or unclassified."""
+    return np.where(tile.has_ground & ~tile.columns[1], GROUND, UNCLASSIFIED).astype(np.uint8)
 
 
 def _what_is_there(path: Path) -> str:

@@ -11,18 +11,22 @@ from mapvote.formats.drives.datasets import (
     BOREAS,
     MULRAN,
     NEWER_COLLEGE,
+    OXFORD_LIDARS,
     Dataset,
-    is_kitti_raw,
     is_nuscenes,
-    is_oxford,
     open_kitti_raw,
     open_nuscenes,
     open_oxford,
 )
-from mapvote.formats.drives.kitti import is_kitti_folder, open_kitti
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
-from mapvote.formats.drives.scan_folder import is_cloud_scans, is_pcd_drive, open_cloud_scans, open_pcd_drive
+from mapvote.formats.drives.scan_folder import (
+    cloud_scans,
+    open_cloud_scans,
+    open_kitti,
+    open_pcd_scans,
+    pcd_scans,
+)
 from mapvote.formats.maps.autoware import (
     is_autoware,
     is_autoware_default,
@@ -31,18 +35,17 @@ from mapvote.formats.maps.autoware import (
     write_autoware,
 )
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
-from mapvote.formats.maps.e57 import is_e57, stream_e57
-from mapvote.formats.maps.las import is_las, stream_las, write_las
-from mapvote.formats.maps.pcd import is_pcd, is_pcd_tiles, stream_pcd, stream_pcd_tiles, write_pcd
-from mapvote.formats.maps.ply import is_ply, stream_ply, write_ply
+from mapvote.formats.maps.las import stream_las, write_las
+from mapvote.formats.maps.pcd import is_pcd_tiles, stream_pcd, stream_pcd_tiles, write_pcd
+from mapvote.formats.maps.ply_e57 import stream_e57, stream_ply, write_ply
 
 
 @dataclass(frozen=True, slots=True)
 class DriveFormat:
     """A layout of recorded drives."""
 
-    recognised: Callable[[Path], bool]
-    """By what lies at the path; opens no scan."""
+    recognised: Callable[[Path], object]
+    """True, or what was found, by what lies at the path; opens no scan."""
     open: Callable[[Path, DriveOptions], Drive]
 
 
@@ -66,28 +69,36 @@ class MapWriter:
     """Whether the format has a place for ASPRS classes."""
 
 
+def _file(*suffixes: str) -> Callable[[Path], bool]:
+    return lambda path: path.is_file() and path.suffix.lower() in suffixes
+
+
+def _holds(*folders: str) -> Callable[[Path], bool]:
+    return lambda path: any((path / folder).is_dir() for folder in folders)
+
+
 DRIVES: dict[str, DriveFormat | Dataset] = {
-    "KITTI drive folder": DriveFormat(is_kitti_folder, open_kitti),
-    "KITTI raw or KITTI-360 recording": DriveFormat(is_kitti_raw, open_kitti_raw),
+    "KITTI drive folder": DriveFormat(_holds("velodyne"), open_kitti),
+    "KITTI raw or KITTI-360 recording": DriveFormat(_holds("velodyne_points/data"), open_kitti_raw),
     "nuScenes": DriveFormat(is_nuscenes, open_nuscenes),
     "Boreas sequence": BOREAS,
     "MulRan sequence": MULRAN,
     "Newer College experiment": NEWER_COLLEGE,
-    "Oxford RobotCar traversal": DriveFormat(is_oxford, open_oxford),
+    "Oxford RobotCar traversal": DriveFormat(_holds(*OXFORD_LIDARS), open_oxford),
     "ROS bag": DriveFormat(is_rosbag, open_rosbag),
-    "folder of PCD scans": DriveFormat(is_pcd_drive, open_pcd_drive),
-    "folder of PLY, LAS, npy or bin scans": DriveFormat(is_cloud_scans, open_cloud_scans),
+    "folder of PCD scans": DriveFormat(pcd_scans, open_pcd_scans),
+    "folder of PLY, LAS, npy or bin scans": DriveFormat(cloud_scans, open_cloud_scans),
 }
 """In the order in which they are tried."""
 
 MAPS: dict[str, MapFormat] = {
     "Autoware tile folder": MapFormat(is_autoware, stream_autoware),
     "Autoware default folder": MapFormat(is_autoware_default, stream_autoware_default),
-    "PCD file": MapFormat(is_pcd, stream_pcd),
+    "PCD file": MapFormat(_file(".pcd"), stream_pcd),
     "folder of PCD tiles X_Y.pcd": MapFormat(is_pcd_tiles, stream_pcd_tiles),
-    "LAS or LAZ file": MapFormat(is_las, stream_las),
-    "PLY file": MapFormat(is_ply, stream_ply),
-    "E57 file": MapFormat(is_e57, stream_e57),
+    "LAS or LAZ file": MapFormat(_file(".las", ".laz"), stream_las),
+    "PLY file": MapFormat(_file(".ply"), stream_ply),
+    "E57 file": MapFormat(_file(".e57"), stream_e57),
 }
 """Maps that are only points, in the order in which they are tried."""
 

@@ -17,7 +17,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool, MapvoteError
-from mapvote.formats.drives.kitti import DriveWriter, write_poses
+from mapvote.formats.drives.scan_folder import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
 from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
 from mapvote_lab.simulation.lidar import Caster, measure, sweep

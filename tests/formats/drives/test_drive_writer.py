@@ -10,7 +10,7 @@ import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
-from mapvote.formats.drives.kitti import DriveWriter
+from mapvote.formats.drives.scan_folder import DriveWriter
 
 
 def test_a_drive_folder_holds_scans_times_prior_and_description(tmp_path: Path) -> None:

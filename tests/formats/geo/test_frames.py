@@ -8,8 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.geo.frame import MapFrame, enu_frame, read_crs, utm_of
-from mapvote.formats.geo.projector import autoware_frame, frame_of, frame_of_projector, projector_of, read_projector
+from mapvote.formats.geo.frame import (
+    MapFrame,
+    autoware_frame,
+    enu_frame,
+    frame_of,
+    frame_of_projector,
+    projector_of,
+    read_crs,
+    read_projector,
+    utm_of,
+)
 from mapvote.formats.geo.units import settle, with_units
 from mapvote.formats.maps.las import frame_of_keys
 

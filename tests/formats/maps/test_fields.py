@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from mapvote.core.columns import flat_cells
 from mapvote.core.point_map import all_fields
-from mapvote.formats import export_map, read_map, write_map
+from mapvote.formats import export_map, import_cloud, read_map, write_map
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.importing import import_cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.fusion.edit import add_points, delete_points
 

@@ -36,9 +36,6 @@ from mapvote.formats.drives.scan_folder import (
     BinLayout,
     ScanFolder,
     layout_of,
-    lines_of_scans,
-    number_of,
-    of_scans,
     open_scan_folder,
     read_bytes,
     read_times_ns,
@@ -50,6 +47,8 @@ from mapvote.formats.drives.trajectory import (
     exact_ns,
     motions_of_rpy,
     needed,
+    number_of,
+    of_scans,
     read_calib,
     read_columns,
     read_numbers,
@@ -70,13 +69,9 @@ MULRAN_MOUNT = geometry.from_xyz_rpy(1.7042, -0.021, 1.8047, *np.deg2rad([0.0001
 """The dataset's calib_base2ouster.txt."""
 NEWER_COLLEGE_MOUNT = geometry.from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
 """The camera that carries the poses to the Ouster (Ramezani et al. 2020)."""
-_OXFORD_LIDARS = ("velodyne_left", "velodyne_right")
+OXFORD_LIDARS = ("velodyne_left", "velodyne_right")
 _OXFORD_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _NORTH_EAST_DOWN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-
-
-def is_kitti_raw(path: Path) -> bool:
-    return (path / "velodyne_points" / "data").is_dir()
 
 
 def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
@@ -87,16 +82,14 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
     table = path / "velodyne_points" / "timestamps.txt"
     if not table.is_file():
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
-    times_ns = read_times_ns(table)
-    stamps_ns: I64 = times_ns[lines_of_scans(len(times_ns), files, table)]
+    stamps_ns: I64 = of_scans(read_times_ns(table), files, table)
 
     def prior() -> Trajectory | F64 | None:
         if options.prior is None and has_kitti_360_poses(path):
             return kitti_360_poses(path, files, stamps_ns)
         return _oxts_prior(path, files, stamps_ns, options)
 
-    layout = layout_of(files, options.columns, options.dtype)
-    folder = ScanFolder(files, stamps_ns, layout.read, prior, "oxts", zero_is_no_return=False)
+    folder = ScanFolder(files, stamps_ns, layout_of(files, options).read, prior, "oxts", zero_is_no_return=False)
     return open_scan_folder(path, options, folder)
 
 
@@ -309,13 +302,9 @@ def _oxford_poses(file: Path) -> Trajectory:
     return sorted_trajectory(times_ns, T_map_base, of_vehicle=True, frame=MapFrame(utm_of(longitude, latitude)))
 
 
-def is_oxford(path: Path) -> bool:
-    return any((path / name).is_dir() for name in _OXFORD_LIDARS)
-
-
 def open_oxford(path: Path, options: DriveOptions) -> Drive:
     """One LiDAR of a traversal, the left one unless --topic velodyne_right; the INS is the prior."""
-    there = [name for name in _OXFORD_LIDARS if (path / name).is_dir()]
+    there = [name for name in OXFORD_LIDARS if (path / name).is_dir()]
     name = options.topic or there[0]
     if name not in there:
         raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")

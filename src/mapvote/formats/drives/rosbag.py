@@ -20,11 +20,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame
 from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields
-from mapvote.formats.drives.scan_folder import prior_of
-from mapvote.formats.drives.trajectory import (
-    Trajectory,
-    sorted_trajectory,
-)
+from mapvote.formats.drives.trajectory import Trajectory, prior_of, sorted_trajectory
 from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
 

@@ -1,4 +1,5 @@
-"""Folders of numbered scan files, one a scan, and the text files beside them: which line belongs to which scan.
+"""Folders of numbered scan files, one a scan, and their times; KITTI's layout (docs/decisions/data.md), which is
+written here too.
 
 Every such layout opens through :func:`open_scan_folder`; a new one only locates the files. Some files say, or nearly
 say, what they hold: bin and npy, PLY, LAS, LAZ, PCD. Bare numbers have columns: KITTI has four float32, nuScenes five.
@@ -8,65 +9,43 @@ store the points in the map frame then: they are taken back into the sensor's fr
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 import scipy
+import tomli_w
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, mount_of
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.drives.options import DriveOptions, make_drive
 from mapvote.formats.drives.point_fields import BadPoints, log, scan_from_fields
-from mapvote.formats.drives.trajectory import Trajectory, check_rigid, has_times, read_T_map_lidar, read_trajectory
+from mapvote.formats.drives.trajectory import Trajectory, check_rigid, number_of, of_scans, prior_of
 from mapvote.formats.extras import read_text
-from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import Cloud, joined, table_of, xyz
 from mapvote.formats.maps.las import stream_las
 from mapvote.formats.maps.pcd import read_pcd_table, read_viewpoint
-from mapvote.formats.maps.ply import stream_ply
+from mapvote.formats.maps.ply_e57 import stream_ply
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
     """The files ``folder``/*``suffix`` in the order of the last number in their names; MapvoteError if none."""
-    files = (
-        [f for f in folder.iterdir() if f.suffix == suffix and not f.name.startswith(".")] if folder.is_dir() else []
-    )
+    files = [f for f in folder.glob(f"*{suffix}") if not f.name.startswith(".")]
     if not files:
         raise MapvoteError(f"{folder}: no scans (*{suffix}) here; a drive needs at least one")
     return sorted(files, key=lambda f: (number_of(f), f.name))
-
-
-def number_of(file: Path) -> float:
-    """The last number in a file's name, e.g. 12 of 000012.bin or 1316.5 of cloud_1316.5.pcd; -1 without one."""
-    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return float(numbers[-1]) if numbers else -1.0
-
-
-def lines_of_scans(n_lines: int, files: list[Path], table: Path) -> I64:
-    """Which line of ``table`` belongs to each scan: one each in order, or by the number in the scan's name.
-
-    KITTI's recordings lack some scans but no line. MapvoteError if the counts cannot be matched.
-    """
-    if n_lines == len(files):
-        return np.arange(n_lines, dtype=np.int64)
-    numbers = np.array([number_of(f) for f in files])
-    if n_lines > len(files) and len(set(numbers)) == len(files) and numbers.min() >= 0 and numbers.max() < n_lines:
-        return numbers.astype(np.int64)
-    raise MapvoteError(
-        f"{table}: {n_lines} lines for {len(files)} scans ({files[0].name} to {files[-1].name}); it must have one line "
-        f"a scan, in order"
-    )
 
 
 def read_times_ns(file: Path) -> I64:
@@ -97,8 +76,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     """
     table = folder / "times.txt"
     if table.is_file():
-        times_ns = read_times_ns(table)
-        return options.start_ns + times_ns[lines_of_scans(len(times_ns), files, table)]
+        return options.start_ns + of_scans(read_times_ns(table), files, table)
     if options.rate_hz is None and all(number_of(f) > 1e8 for f in files):
         return np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
     if options.rate_hz is None:
@@ -117,23 +95,6 @@ def stamp_in_name_ns(file: Path) -> int:
     number = Decimal(numbers[-1])
     power = next(p for p in (0, 3, 6, 9) if number < Decimal(10) ** (10 + p) or p == 9)
     return int(number * 10 ** (9 - power))
-
-
-def prior_file(folder: Path, options: DriveOptions) -> Path | None:
-    """The file that the options name, here or in ``folder``; else prior.txt, if it exists."""
-    if options.prior is None:
-        return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
-    for file in (Path(options.prior), folder / options.prior):
-        if file.is_file():
-            return file
-    raise MapvoteError(
-        f"{options.prior}: no such prior, neither here nor in {folder}; give a file of 3 x 4 rows, or none"
-    )
-
-
-def of_scans(poses: F64, files: list[Path], table: Path) -> F64:
-    """Poses (m, 4, 4) of a file, one for each scan."""
-    return poses[lines_of_scans(len(poses), files, table)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,31 +147,6 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
     )
 
 
-def prior_of(
-    path: Path,
-    options: DriveOptions,
-    files: list[Path],
-    stamps_ns: I64,
-    own: Callable[[], Trajectory | F64 | None],
-    own_name: str | None = None,
-    T_base_lidar: F64 | None = None,
-) -> tuple[F64 | None, MapFrame]:
-    """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the file that the options name, else prior.txt,
-    else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
-    if options.prior is not None and options.prior.lower() == "none":
-        return None, MapFrame()
-    file = None if options.prior is not None and options.prior == own_name else prior_file(path, options)
-    if file is not None and not has_times(file):
-        return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
-    found = own() if file is None else read_trajectory(file, map_frame(options))
-    if found is None:
-        return None, MapFrame()
-    if not isinstance(found, Trajectory):
-        return of_scans(found, files, path), MapFrame()
-    T = found.at(stamps_ns, str(file or path))
-    return (T @ mount_of(options, T_base_lidar, str(path)) if found.of_vehicle else T), found.frame
-
-
 KITTI = ("x", "y", "z", "intensity")
 NUSCENES = (*KITTI, "ring")
 _SUFFIXES = (".ply", ".las", ".laz", ".npy", ".bin")
@@ -224,21 +160,17 @@ class BinLayout:
     columns: tuple[str, ...] = KITTI
     dtype: str = "<f4"
 
-    @property
-    def record(self) -> np.dtype[np.void]:
-        return np.dtype([(name, self.dtype) for name in self.columns])
-
     def read(self, file: Path) -> NDArray[np.void]:
         """A .bin file as it stands, (n,); MapvoteError if it is cut off or missing."""
-        data = read_bytes(file)
-        size = self.record.itemsize
+        data, record = read_bytes(file), np.dtype([(name, self.dtype) for name in self.columns])
+        size = record.itemsize
         if len(data) % size:
             columns = ", ".join(self.columns)
             raise MapvoteError(
                 f"{file}: {len(data)} bytes are not a multiple of {size} ({np.dtype(self.dtype).name} {columns}): "
                 f"the scan is cut off or has other columns; copy it again, leave it out with --scans, or name --columns"
             )
-        return np.frombuffer(data, dtype=self.record)
+        return np.frombuffer(data, dtype=record)
 
 
 def read_bytes(file: Path) -> bytes:
@@ -249,10 +181,10 @@ def read_bytes(file: Path) -> bytes:
         raise MapvoteError(f"{file}: {error.strerror}; the drive changed while it was read") from error
 
 
-def layout_of(files: Sequence[Path], columns: str | None = None, dtype: str | None = None) -> BinLayout:
+def layout_of(files: Sequence[Path], options: DriveOptions) -> BinLayout:
     """The user's columns, else four (KITTI), or five if the sizes and the fifth column fit (nuScenes)."""
-    if columns is not None or dtype is not None:
-        return _said(columns or ",".join(KITTI), dtype or "float32")
+    if options.columns is not None or options.dtype is not None:
+        return _said(options.columns or ",".join(KITTI), options.dtype or "float32")
     for file in files[:3]:
         data = read_bytes(file)
         if len(data) % 20 == 0 and _has_rings(data):
@@ -266,15 +198,11 @@ def _has_rings(data: bytes) -> bool:
     ring = np.frombuffer(data, dtype="<f4").reshape(-1, 5)[:, 4]
     with np.errstate(invalid="ignore"):
         whole = (ring >= 0) & (ring < 256) & (ring == np.floor(ring))
-    return len(ring) > 1 and bool(whole.all()) and len(np.unique(ring)) > 1 and not _looks_like_four(data)
-
-
-def _looks_like_four(data: bytes) -> bool:
-    """Whether as four columns the last one looks like intensities: all within [0, 1]."""
-    if len(data) % 16:
-        return False
-    last = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, 3]
-    return bool(((last >= 0) & (last <= 1)).all())
+    if len(data) % 16 == 0:  # as four columns the last one may look like intensities: all within [0, 1]
+        last = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, 3]
+        if ((last >= 0) & (last <= 1)).all():
+            return False
+    return bool(whole.all()) and len(np.unique(ring)) > 1
 
 
 def _said(columns: str, dtype: str) -> BinLayout:
@@ -290,7 +218,14 @@ def _said(columns: str, dtype: str) -> BinLayout:
     return BinLayout(names, kind.str)
 
 
-def _folder_of(path: Path) -> tuple[Path, str] | None:
+def open_kitti(path: Path, options: DriveOptions) -> Drive:
+    """The drive in ``path``; KITTI odometry's sequences as they come, their camera poses converted with calib.txt."""
+    files = scan_files(path / "velodyne", ".bin")
+    read, stamps_ns = layout_of(files, options).read, read_stamps(path, files, options)
+    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, read, zero_is_no_return=False, spinning=True))
+
+
+def cloud_scans(path: Path) -> tuple[Path, str] | None:
     """(folder, suffix) of two or more scans of one kind; a single file is a map, not a drive."""
     for name in _FOLDERS:
         for suffix in _SUFFIXES:
@@ -299,24 +234,18 @@ def _folder_of(path: Path) -> tuple[Path, str] | None:
     return None
 
 
-def is_cloud_scans(path: Path) -> bool:
-    return _folder_of(path) is not None
-
-
 def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
-    """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
-    found = _folder_of(path)
-    if found is None:
-        raise MapvoteError(f"{path}: no scans ({', '.join(_SUFFIXES)}) in it")
+    """The drive of which :func:`cloud_scans` knows where it lies."""
+    found = cloud_scans(path)
+    assert found is not None
     files = scan_files(*found)
-    columns = options.columns
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
         ".ply": lambda file: _table(stream_ply(file)),
         ".las": lambda file: _table(stream_las(file)),
         ".laz": lambda file: _table(stream_las(file)),
-        ".npy": lambda file: _read_npy(file, columns),
+        ".npy": lambda file: _read_npy(file, options.columns),
     }
-    read = readers.get(found[1]) or layout_of(files, columns, options.dtype).read
+    read = readers.get(found[1]) or layout_of(files, options).read
     return open_scan_folder(path, options, ScanFolder(files, read_stamps(path, files, options), read))
 
 
@@ -345,20 +274,16 @@ def _read_npy(file: Path, columns: str | None) -> NDArray[np.void]:
     return table
 
 
-def _pcd_folder(path: Path) -> Path | None:
+def pcd_scans(path: Path) -> Path | None:
     """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive."""
     if not path.is_dir() or is_autoware(path):
         return None
     return next((folder for folder in (path / "pcd", path) if any(folder.glob("*.pcd"))), None)
 
 
-def is_pcd_drive(path: Path) -> bool:
-    return _pcd_folder(path) is not None
-
-
-def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
-    """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
-    files = scan_files(_pcd_folder(path) or path, ".pcd")
+def open_pcd_scans(path: Path, options: DriveOptions) -> Drive:
+    """The drive in ``path``, with the VIEWPOINTs as its prior where they say something."""
+    files = scan_files(pcd_scans(path) or path, ".pcd")
     stamps_ns = read_stamps(path, files, options)
     viewpoints = _viewpoints(files)
     in_map_frame = viewpoints is not None and _points_lie_around(viewpoints, files)
@@ -417,3 +342,73 @@ def _to_lidar(where: str, table: np.ndarray, T_map_lidar: F64) -> np.ndarray:
     for column, axis in enumerate("xyz"):
         out[axis] = points[:, column]
     return out
+
+
+@dataclass(frozen=True)
+class DriveWriter:
+    """Writes one drive folder: scans in any order (also from several processes), then :meth:`close`.
+
+    The folder ``path`` appears whole on ``close``; until then everything lies in a sibling that starts with a dot.
+    """
+
+    path: Path
+    vehicle: str
+    sensor: Sensor
+    start_ns: int
+    prior_sigma_m: float = 1.0
+    prior_sigma_deg: float = 1.0
+    T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
+    motion_compensated: bool = True
+    """False: the loader sets Scan.time_s by the spinning-sensor rule."""
+
+    @property
+    def _partial(self) -> Path:
+        return self.path.with_name(f".{self.path.name}.partial")
+
+    def open(self) -> DriveWriter:
+        """Make the hidden folder, empty. MapvoteError if ``path`` exists already."""
+        if self.path.exists():
+            raise MapvoteError(f"{self.path}: exists already; remove it or choose another folder")
+        shutil.rmtree(self._partial, ignore_errors=True)
+        (self._partial / "velodyne").mkdir(parents=True)
+        return self
+
+    def write_scan(self, index: int, points: F32, intensity: F32 | None = None) -> None:
+        """``points`` (n, 3) in the lidar frame, ``intensity`` (n,) in [0, 1] (0 where None)."""
+        rows = np.zeros((len(points), 4), dtype="<f4")
+        rows[:, :3] = points
+        if intensity is not None:
+            rows[:, 3] = intensity
+        rows.tofile(self._partial / "velodyne" / f"{index:06d}.bin")
+
+    def close(self, stamps_ns: I64, T_map_lidar_prior: F64 | None = None) -> None:
+        """Write ``stamps_ns`` (n,) relative to ``start_ns``, priors (n, 4, 4) and drive.toml; the folder appears."""
+        written = len(list((self._partial / "velodyne").iterdir()))
+        if written != len(stamps_ns):
+            raise MapvoteError(f"{self.path}: {written} scans written, but {len(stamps_ns)} stamps")
+        write_times(self._partial / "times.txt", stamps_ns - self.start_ns)
+        if T_map_lidar_prior is not None:
+            write_poses(self._partial / "prior.txt", T_map_lidar_prior)
+        about = {
+            "vehicle": self.vehicle,
+            "sensor": self.sensor.name,
+            "rate_hz": self.sensor.rate_hz,
+            "start_ns": self.start_ns,
+            "prior_sigma_m": self.prior_sigma_m,
+            "prior_sigma_deg": self.prior_sigma_deg,
+            "T_base_lidar": self.T_base_lidar[:3].ravel().tolist(),
+            "motion_compensated": self.motion_compensated,
+        }
+        (self._partial / "drive.toml").write_text(tomli_w.dumps(about))
+        os.replace(self._partial, self.path)
+
+
+def write_times(path: Path, times_ns: I64) -> None:
+    """times.txt: one line of seconds a scan, with nanoseconds kept exactly."""
+    path.write_text("".join(f"{ns // 1_000_000_000}.{ns % 1_000_000_000:09d}\n" for ns in times_ns.tolist()))
+
+
+def write_poses(path: Path, T_map_lidar: F64) -> None:
+    """(n, 4, 4) as KITTI's rows of 12 numbers, the upper 3 x 4, to a hundredth of a micrometre."""
+    with path.open("w") as file:
+        np.savetxt(file, T_map_lidar[:, :3].reshape(-1, 12), fmt="%.8f")

@@ -1,19 +1,24 @@
 """Trajectories in text: KITTI's rows of 12 numbers (Geiger et al. 2013), its camera poses with calib.txt; TUM; CSV with
-a header, also of latitudes and longitudes. Those with times of their own are brought to the scans' stamps.
+a header, also of latitudes and longitudes. Those with times of their own are brought to the scans' stamps; of
+the others each line belongs to a scan. So a drive gets its prior.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.formats.drives.options import DriveOptions, map_frame, mount_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
@@ -333,3 +338,63 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def number_of(file: Path) -> float:
+    """The last number in a file's name, e.g. 12 of 000012.bin or 1316.5 of cloud_1316.5.pcd; -1 without one."""
+    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    return float(numbers[-1]) if numbers else -1.0
+
+
+def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any]:
+    """Of the lines (m, ..) of ``table`` one for each scan: in order, or by the number in the scan's name.
+
+    KITTI's recordings lack some scans but no line. MapvoteError if the counts cannot be matched.
+    """
+    n = len(lines)
+    if n == len(files):
+        return lines
+    numbers = np.array([number_of(f) for f in files])
+    if n > len(files) and len(set(numbers)) == len(files) and numbers.min() >= 0 and numbers.max() < n:
+        return lines[numbers.astype(np.int64)]
+    raise MapvoteError(
+        f"{table}: {n} lines for {len(files)} scans ({files[0].name} to {files[-1].name}); it must have one line "
+        f"a scan, in order"
+    )
+
+
+def prior_file(folder: Path, options: DriveOptions) -> Path | None:
+    """The file that the options name, here or in ``folder``; else prior.txt, if it exists."""
+    if options.prior is None:
+        return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
+    for file in (Path(options.prior), folder / options.prior):
+        if file.is_file():
+            return file
+    raise MapvoteError(
+        f"{options.prior}: no such prior, neither here nor in {folder}; give a file of 3 x 4 rows, or none"
+    )
+
+
+def prior_of(
+    path: Path,
+    options: DriveOptions,
+    files: list[Path],
+    stamps_ns: I64,
+    own: Callable[[], Trajectory | F64 | None],
+    own_name: str | None = None,
+    T_base_lidar: F64 | None = None,
+) -> tuple[F64 | None, MapFrame]:
+    """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the file that the options name, else prior.txt,
+    else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
+    if options.prior is not None and options.prior.lower() == "none":
+        return None, MapFrame()
+    file = None if options.prior is not None and options.prior == own_name else prior_file(path, options)
+    if file is not None and not has_times(file):
+        return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
+    found = own() if file is None else read_trajectory(file, map_frame(options))
+    if found is None:
+        return None, MapFrame()
+    if not isinstance(found, Trajectory):
+        return of_scans(found, files, path), MapFrame()
+    T = found.at(stamps_ns, str(file or path))
+    return (T @ mount_of(options, T_base_lidar, str(path)) if found.of_vehicle else T), found.frame

@@ -25,8 +25,7 @@ import yaml
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import folder_beside, whole_file, whole_folder
 from mapvote.formats.extras import first_line, read_text
-from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
+from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
 from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
@@ -116,7 +115,7 @@ def write_autoware(path: Path, cloud: Cloud | CloudPieces, *, side_m: int = SIDE
     """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
     ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
-    cloud's frame (:func:`mapvote.formats.geo.projector.autoware_frame` chooses one that it has).
+    cloud's frame (:func:`mapvote.formats.geo.frame.autoware_frame` chooses one that it has).
     """
     clouds = CloudPieces.of(cloud)
     projector = projector_of(clouds.frame)

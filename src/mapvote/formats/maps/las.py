@@ -79,10 +79,6 @@ MAX_POINTS_PER_BYTE = 16
 _HEAD = msgspec.json.Decoder(Head)
 
 
-def is_las(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in (".las", ".laz")
-
-
 def stream_las(path: Path) -> Iterator[Cloud]:
     """The points of a LAS, LAZ or COPC file as float64, piece by piece, in the coordinate system that it names.
 

@@ -34,10 +34,6 @@ _PAGE = 4096
 _TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}\.pcd")
 
 
-def is_pcd(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() == ".pcd"
-
-
 def is_pcd_tiles(path: Path) -> bool:
     """A folder whose PCD files are all called X_Y.pcd, in whatever tiling; with stamps or poses it is a drive."""
     names = [file.name for file in path.glob("*.pcd")] if path.is_dir() else []

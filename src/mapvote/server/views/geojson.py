@@ -13,8 +13,7 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64
-from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.geo.projector import frame_of
+from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.server.views.change_objects import ChangeObject
 from mapvote.server.views.outlines import Ring
 

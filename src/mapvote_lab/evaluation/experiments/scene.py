@@ -52,7 +52,7 @@ from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
 from mapvote_lab.simulation.scenario import load_scenario
 
-_DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/kitti.py")
+_DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/scan_folder.py")
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
 _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
 BALLOTS_FROM = (
