@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -56,10 +55,6 @@ class History:
         """In one history of three there are copies."""
         self.masks = 0.9 if seed % 2 else 0.5
         """Share of ballots that mark voxels as gone; in every other history of nearly all, also in cells that stand."""
-        self.repeated = 0
-        """Publishes that were tried again without new votes."""
-        self.remnants = 0
-        """Cells that stand on in a new version, without some of their points."""
 
     @property
     def now_s(self) -> int:
@@ -162,7 +157,6 @@ class History:
         again = publish(self.store, override=True)
         assert not again.published, f"published without new votes: {again.deleted} points go, {again.added} come"
         assert done == self._publish_by_the_rules(), f"published: {done}"
-        self.repeated += 1
 
     def _publish_by_the_rules(self) -> bool:
         done = self.rules.publish(self.now_s)
@@ -254,8 +248,6 @@ class History:
             free = 0 if tile.free is None else int(tile.free[cell])
             found = CellMap(heights, free, *(int(plane[cell]) for plane in memory.planes))
             assert found == wanted, f"{where}: cell {cell} is {found}, by the rules {wanted}"
-            before = self.rules.versions[newest - 1].cells[cell]
-            self.remnants += wanted.stands() and set(wanted.heights) < set(before.heights)
         assert len(tile.points) == sum(len(cell.heights) for cell in expected.cells.values()), where
 
 
@@ -274,10 +266,8 @@ def seen_along(way: str, by: int) -> U8:
     return np.where(np.roll(_mask(way), by, axis=1), np.uint8(UE), np.uint8(NO_VOTE))
 
 
-def live(
-    seed: int, make_store: Callable[[Clock], Store], steps: int = 40, counted: Counter[str] | None = None
-) -> str | None:
-    """One history; what the store and the rules disagree on, None if on nothing. ``counted``: adds up what it held."""
+def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> str | None:
+    """One history; what the store and the rules disagree on, None if on nothing."""
     history = History(seed, make_store)
     try:
         history.live(steps)
@@ -285,6 +275,4 @@ def live(
         return f"seed {seed}: {type(error).__name__} {error}"
     finally:
         history.store.close()
-        if counted is not None:
-            counted.update(repeated=history.repeated, remnants=history.remnants)
     return None

@@ -72,7 +72,7 @@ _MOST_VOTES = 3
 _BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
 _DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
 """Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
-# By benchmarks/probability.py, as are those below.
+# By benchmarks/probability.py at 9f8814a, as are those below.
 _BUILT_SAID = np.array([0.752, 1.166])
 _DEMOLISHED_SAID = np.array([0.31, 1.012])
 """Log-odds of a cell of which they say that it is as likely as not; of each nat that they say."""

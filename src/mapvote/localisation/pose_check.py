@@ -18,8 +18,8 @@ from mapvote.localisation.ndt import SETTLED, NdtGrid, NdtMap, fitness, fitnesse
 from mapvote.localisation.ndt_solver import SEVEN
 
 MIN_FIT = 0.6
-"""Of what the map leads to expect, from which a pose may be voted with; benchmarks/localisation.py shows how often
-wrong poses are trusted."""
+"""Of what the map leads to expect, from which a pose may be voted with; docs/measurements/localisation.md says how
+often wrong poses are trusted."""
 MIN_LEAD = 0.05
 """By how much the best other place must fit worse, in the same scale."""
 MIN_KNOWN = 0.3
