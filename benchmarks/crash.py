@@ -1,30 +1,23 @@
-"""Kill the server's process at random moments, again and again, and see whether anything acknowledged was lost.
+"""Kill `mapvote serve` at random moments, again and again, and see whether anything acknowledged was lost.
 
     python benchmarks/crash.py --kills 200 --database sqlite
     python benchmarks/crash.py --kills 200 --database postgresql
 
-A child takes in ballots on one thread and publishes on another; the parent kills it with SIGKILL after a random number
-of acknowledgements (with PostgreSQL, every fourth time the database server itself), then opens the store as a new
-process would and checks: every acknowledged ballot is there, every version is whole, the next publish succeeds. Ends
-with 1 at the first failure.
-
-With ``--server`` what is killed is `mapvote serve` itself, to which vehicles send ballots by HTTP while an operator
-publishes again and again. That takes some seconds a kill.
+Vehicles send ballots by HTTP while an operator publishes again and again; the server is killed with SIGKILL after a
+random number of acknowledgements (with PostgreSQL, every fourth time the database server too). Then the store is opened
+as a new process would open it: every acknowledged ballot is there, every version is whole, the next publish succeeds.
+Ends with 1 at the first failure.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import random
-import signal
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import httpx2
@@ -36,23 +29,20 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.client import MapClient
-from mapvote.codec.ballot import Ballot, encode
+from mapvote.codec.ballot import Ballot
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.errors import Conflict, Unavailable
 from mapvote.server.store import schema
-from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from postgres_cluster import PostgresCluster
+from postgres_cluster import PostgresCluster, cluster_for
 
 POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)
 TILES = [(row, col) for row in range(2) for col in range(4)]
 CELLS = [(r, c) for r in range(10, 40, 3) for c in range(10, 40, 3)]
 HEIGHTS = [0.45, 0.75, 1.05]
-S = 1_000_000_000
 MOST = 20
 """Acknowledgements before a kill."""
 LAST_S = 0.02
@@ -61,14 +51,6 @@ VEHICLES = 4
 """Pairs of vehicles that send to a server at once."""
 Drives = list[tuple[str, str]]
 """(vehicle, drive) of what was acknowledged."""
-Kill = Callable[[str, int, random.Random, "PostgresCluster | None"], Drives]
-"""(database URL, number, moment, the cluster to kill too) -> what was acknowledged before."""
-
-
-def first_map(url: str) -> None:
-    """A store of eight tiles with a hundred pillars each."""
-    tile = make_tile(np.concatenate([wall(CELLS, [0.05]), wall(CELLS, HEIGHTS)]))
-    Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
 
 
 def votes_on(
@@ -81,71 +63,9 @@ def votes_on(
     state = CellState.CHANGED_EMPTY if stands else CellState.CHANGED_OCCUPIED
     say = Say(states_plane({cell: state}), new_points=None if stands else wall([cell], HEIGHTS))
     now = time.time_ns()
-    return [make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - S + i, version=version) for i in range(2)]
-
-
-def newest(store: Store, tile: TileIndex) -> tuple[Tile, int]:
-    """A tile of the newest version, and the version's number."""
-    version = store.current()
-    content = store.tile(version, tile)
-    assert content is not None
-    return content, version
-
-
-def work(url: str, seed: int, acknowledge: int) -> None:
-    """Take in ballots and publish until killed; one line per acknowledged ballot goes to ``acknowledge``."""
-    store = Store.open(url)
-    rng = random.Random(seed)
-
-    def publish_for_ever() -> None:
-        while True:
-            with contextlib.suppress(Unavailable):  # the database may be gone already
-                publish(store, POLICY)
-            time.sleep(0.002)
-
-    for ballot in votes_on(*newest(store, TILES[0]), TILES[0], CELLS[0], "warm", "warm"):
-        examine(encode(ballot))  # compiled code is loaded before the clock starts
-    threading.Thread(target=publish_for_ever, daemon=True).start()
-    os.write(acknowledge, b"ready\n")
-    turn = 0
-    while True:
-        turn += 1
-        tile = rng.choice(TILES)
-        ballots = votes_on(*newest(store, tile), tile, rng.choice(CELLS), "v", f"{seed}.{turn}")
-        for receipt in accept(store, [examine(encode(ballot)) for ballot in ballots]):
-            if isinstance(receipt, Receipt):
-                os.write(acknowledge, f"{receipt.vehicle} {receipt.drive}\n".encode())
-            elif not isinstance(receipt, Conflict):  # published meanwhile: an honest refusal
-                raise receipt
-
-
-def killed_once(url: str, seed: int, rng: random.Random, cluster: PostgresCluster | None) -> Drives:
-    """Start a worker, kill it (or the database under it); what it had acknowledged."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(reading)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        try:
-            work(url, seed, writing)
-        finally:
-            os._exit(7)
-    os.close(writing)
-    with os.fdopen(reading) as lines:
-        if lines.readline() != "ready\n":
-            raise SystemExit(f"kill {seed}: the worker ended before it began (status {os.waitpid(child, 0)[1]})")
-        told = [lines.readline() for _ in range(rng.randint(1, MOST))]
-        time.sleep(rng.uniform(0.0, LAST_S))
-        if cluster is not None:
-            cluster.stop(crash=True)
-        os.kill(child, signal.SIGKILL)
-        acknowledged = [(words[0], words[1]) for line in (*told, *lines) if len(words := line.split()) == 2]
-    status = os.waitpid(child, 0)[1]
-    if cluster is not None:
-        cluster.start()
-    elif os.WTERMSIG(status) != signal.SIGKILL:
-        raise SystemExit(f"kill {seed}: the worker ended by itself (status {status})")
-    return acknowledged
+    return [
+        make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - 10**9 + i, version=version) for i in range(2)
+    ]
 
 
 class Traffic:
@@ -188,15 +108,12 @@ class Traffic:
                                 self.acknowledged.append((ballot.vehicle, ballot.drive))
                                 self._news.notify_all()
 
-    def _more_than(self, seen: int) -> bool:
-        return len(self.acknowledged) > seen
-
     def _operator(self) -> None:
         seen = 0
         with httpx2.Client(base_url=self._url, timeout=10.0) as http:
             while not self._over.is_set():
                 with self._news:  # without a pause no vehicle ever has the newest map on a slow machine
-                    self._news.wait_for(partial(self._more_than, seen), 0.5)
+                    self._news.wait_for(lambda seen=seen: len(self.acknowledged) > seen, 0.5)
                     seen = len(self.acknowledged)
                 with contextlib.suppress(httpx2.TransportError):
                     http.request("POST", "/v1/publish", json={"override": True})
@@ -257,39 +174,24 @@ def check(url: str, acknowledged: set[tuple[str, str]], whole: set[int]) -> int:
         store.close()
 
 
-def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None, kill: Kill) -> None:
-    """``kills`` rounds on one store; prints a line at the end."""
-    first_map(url)
-    rng = random.Random(seed)
-    acknowledged: set[tuple[str, str]] = set()
-    whole: set[int] = set()
-    newest = 1
-    for i in range(kills):
-        power_cut = cluster if cluster is not None and i % 4 == 3 else None
-        acknowledged |= set(kill(url, seed * 1000 + i, rng, power_cut))
-        newest = check(url, acknowledged, whole)
-        if i % 10 == 9:
-            print(f"{i + 1} kills, {len(acknowledged)} acknowledged ballots", file=sys.stderr)
-    print(f"{kills} kills: {len(acknowledged)} acknowledged ballots, all there; {newest} versions, all whole")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
-    parser.add_argument("--server", action="store_true", help="kill `mapvote serve` under HTTP load")
     parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    kill: Kill = killed_server if options.server else killed_once
-    if options.database == "sqlite":
-        with tempfile.TemporaryDirectory() as folder:
-            run(f"sqlite:///{folder}/store.db", options.kills, options.seed, None, kill)
-        return
-    cluster = PostgresCluster()
-    try:
-        run(cluster.create("crash"), options.kills, options.seed, cluster, kill)
-    finally:
-        cluster.close()
+    asked = parser.parse_args()
+    rng, newest, whole = random.Random(asked.seed), 1, set[int]()
+    acknowledged = set[tuple[str, str]]()
+    with tempfile.TemporaryDirectory() as folder, cluster_for(asked.database) as cluster:
+        url = cluster.create("crash") if cluster else f"sqlite:///{folder}/store.db"
+        tile = make_tile(np.concatenate([wall(CELLS, [0.05]), wall(CELLS, HEIGHTS)]))
+        Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
+        for i in range(asked.kills):
+            acknowledged |= set(killed_server(url, asked.seed * 1000 + i, rng, cluster if i % 4 == 3 else None))
+            newest = check(url, acknowledged, whole)
+            if i % 10 == 9:
+                print(f"{i + 1} kills, {len(acknowledged)} acknowledged ballots", file=sys.stderr)
+    print(f"{asked.kills} kills: {len(acknowledged)} acknowledged ballots, all there; {newest} versions, all whole")
 
 
 if __name__ == "__main__":

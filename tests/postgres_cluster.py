@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 USER = "postgres"
@@ -80,3 +81,14 @@ class PostgresCluster:
             done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, cwd="/", check=False)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)} failed:\n{log.read_text()[-2000:]}")
+
+
+@contextlib.contextmanager
+def cluster_for(database: str) -> Iterator[PostgresCluster | None]:
+    """A cluster for "postgresql", gone at the end; None for "sqlite"."""
+    cluster = PostgresCluster() if database == "postgresql" else None
+    try:
+        yield cluster
+    finally:
+        if cluster:
+            cluster.close()
