@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import shutil
 import sys
 import tempfile
 from collections import Counter
@@ -36,7 +37,7 @@ from mapvote.server.store.integrity import check
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from postgres_cluster import PostgresCluster
+from postgres_cluster import cluster_for
 from stores import send
 
 TILES = [(0, col) for col in range(6)]
@@ -128,40 +129,29 @@ def main() -> None:
     parser.add_argument("--every-table", action="store_true")
     asked = parser.parse_args()
     results: Counter[tuple[str, ...]] = Counter()
-    cluster = PostgresCluster() if asked.database == "postgresql" else None
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            first = Path(folder) / "first.db"
-            make(cluster.create("first") if cluster else f"sqlite:///{first}")
-            url = _copy(cluster, first, "expected")
-            store = Store.open(url)
-            publish(store)
-            expected = dict(store.tiles())
-            store.close()
-            for number in range(asked.flips):
-                url = _copy(cluster, first, f"s{number}")
-                results[try_once(url, random.Random(number), asked.every_table, expected)] += 1
-                if cluster:
-                    cluster.drop(f"s{number}")
-    finally:
-        if cluster:
-            cluster.close()
+    with tempfile.TemporaryDirectory() as folder, cluster_for(asked.database) as cluster:
+
+        def copied(name: str) -> str:
+            if cluster:
+                return cluster.create(name, like="first")
+            return f"sqlite:///{shutil.copy(f'{folder}/first.db', f'{folder}/{name}.db')}"
+
+        make(cluster.create("first") if cluster else f"sqlite:///{folder}/first.db")
+        store = Store.open(copied("expected"))
+        publish(store)
+        expected = dict(store.tiles())
+        store.close()
+        for n in range(asked.flips):
+            results[try_once(copied(f"s{n}"), random.Random(n), asked.every_table, expected)] += 1
+            if cluster:
+                cluster.drop(f"s{n}")
     print(f"| {asked.database}: where the bit was | flips | check | the rest |\n|---|---|---|---|")
     for (where, named, rest), count in sorted(results.items()):
         print(f"| `{where}` | {count} | {named} | {rest} |")
     named = sum(count for (_, found, _), count in results.items() if found == "named")
     whole = sum(count for (_, _, rest), count in results.items() if rest == "all else published")
     print(f"{asked.flips} flips: {named} named, all else published after {whole}")
-    if min(named, whole) < asked.flips:
-        raise SystemExit(1)
-
-
-def _copy(cluster: PostgresCluster | None, first: Path, name: str) -> str:
-    if cluster:
-        return cluster.create(name, like="first")
-    file = first.with_name(f"{name}.db")
-    file.write_bytes(first.read_bytes())
-    return f"sqlite:///{file}"
+    sys.exit(min(named, whole) < asked.flips)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """What every compiled kernel costs, and what plain numpy costs in its place.
 
     python benchmarks/kernels.py [ROOM.FILE ...]
-    python benchmarks/kernels.py --compile      # seconds of CPU that each takes to compile, by how many signatures
 
 Each kernel that Python calls is recorded while a street is mapped, voted on, fused and shown, and while `evaluate
 corner` runs. Its call with the most bytes is then made again: compiled, and by NUMPY, the same work in plain numpy. A
@@ -231,38 +230,6 @@ NUMPY: dict[str, Callable[..., object]] = {
 }
 
 
-def compile_times() -> None:
-    """Of everything that `mapvote warmup` compiles, into an empty cache; kernels that numba inlines count where they
-    are used."""
-    from numba.core import event
-
-    from mapvote.warmup import warm_up
-
-    running: list[list[float]] = []
-    seconds: dict[str, list[float]] = {}
-
-    class Clock(event.Listener):  # type: ignore[misc]
-        """What each kernel's compilation takes, without that of the kernels it calls."""
-
-        def on_start(self, event: Any) -> None:
-            running.append([time.process_time(), 0.0])
-
-        def on_end(self, event: Any) -> None:
-            start, within = running.pop()
-            took, function = time.process_time() - start, event.data["dispatcher"].py_func
-            seconds.setdefault(f"{function.__module__}.{function.__name__}", []).append(took - within)
-            if running:
-                running[-1][1] += took
-
-    event.register("numba:compile", Clock())
-    whole = sum(took for _, took in warm_up())
-    print(f"{'CPU s':>7} {'signatures':>10}  kernel")
-    for name, took in sorted(seconds.items(), key=lambda item: -sum(item[1])):
-        print(f"{sum(took):7.2f} {len(took):10d}  {name.removeprefix('mapvote.')}")
-    every = [one for took in seconds.values() for one in took]
-    print(f"{sum(every):7.2f} {len(every):10d}  in all; {whole:.1f} s with the work itself")
-
-
 def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
     """What calls every kernel; of the ``laboratory`` too, which takes a minute more."""
     from mapvote import warmup
@@ -304,11 +271,6 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
 def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     asked = sys.argv[1:]
-    if asked == ["--compile"]:
-        with tempfile.TemporaryDirectory() as name:
-            os.environ["NUMBA_CACHE_DIR"] = name
-            compile_times()
-        return
     every = {m: mine for m, mine in kernels().items() if not asked or any(part in m for part in asked)}
     for module in every:
         importlib.import_module(module)

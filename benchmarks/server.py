@@ -32,6 +32,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.keys import ROLES, issue
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from postgres_cluster import PostgresCluster
+from postgres_cluster import cluster_for
 from stores import send
 
 Address = tuple[str, int]
@@ -89,11 +90,14 @@ def as_drive(ballot: Ballot, vehicle: str, drive: str) -> tuple[str, bytes]:
     return f"/v1/ballots/{vehicle}/{drive}", body
 
 
+@dataclass
 class Site:
     """A server on a store, and a key for each name."""
 
-    def __init__(self, address: Address, process: Any, url: str, keys: dict[str, str], log: Path) -> None:
-        self.address, self.process, self.url, self.keys, self.log = address, process, url, keys, log
+    address: Address
+    process: Any
+    url: str
+    keys: dict[str, str]
 
     def cpu_s(self) -> float:
         """Processor time that the server has used so far."""
@@ -104,25 +108,20 @@ class Site:
 @contextmanager
 def site(database: str, point_map: PointMap, fill: Callable[[Store], object], vehicles: list[str]) -> Iterator[Site]:
     """Started on a new store that ``fill`` has filled; SystemExit if it stumbles."""
-    with tempfile.TemporaryDirectory() as name:
-        folder, cluster = Path(name), PostgresCluster() if database == "postgresql" else None
-        try:
-            url = cluster.create("bench") if cluster else f"sqlite:///{folder}/store.db"
-            store = Store.create(url, point_map)
-            fill(store)
-            keys = {vehicle: issue(store, vehicle, "vehicle") for vehicle in vehicles}
-            keys |= {role: issue(store, role, role) for role in ROLES if role != "vehicle"}
-            store.close()
-            (folder / "server.toml").write_text(LIMITS)
-            named = url.removeprefix("sqlite:///")
-            with serving(named, "--config", folder / "server.toml", log=folder / "log") as (address, process):
-                host, port = address.removeprefix("http://").split(":")
-                yield Site((host, int(port)), process, url, keys, folder / "log")
-            if "Traceback" in (folder / "log").read_text():
-                raise SystemExit(f"the server stumbled: {(folder / 'log').read_text()[-3000:]}")
-        finally:
-            if cluster:
-                cluster.close()
+    with tempfile.TemporaryDirectory() as name, cluster_for(database) as cluster:
+        url = cluster.create("bench") if cluster else f"sqlite:///{name}/store.db"
+        store = Store.create(url, point_map)
+        fill(store)
+        keys = {vehicle: issue(store, vehicle, "vehicle") for vehicle in vehicles}
+        keys |= {role: issue(store, role, role) for role in ROLES if role != "vehicle"}
+        store.close()
+        config, log = Path(name) / "server.toml", Path(name) / "log"
+        config.write_text(LIMITS)
+        with serving(url.removeprefix("sqlite:///"), "--config", config, log=log) as (address, process):
+            host, port = address.removeprefix("http://").split(":")
+            yield Site((host, int(port)), process, url, keys)
+        if "Traceback" in log.read_text():
+            raise SystemExit(f"the server stumbled: {log.read_text()[-3000:]}")
 
 
 async def ask(address: Address, method: str, path: str, key: str, body: bytes = b"") -> Answer:
@@ -375,17 +374,6 @@ async def honest(at: Site, ballot: Ballot, seconds: float, prefix: str) -> tuple
     return percentiles("ballot", waits["ballot"]) | percentiles("healthz", waits["healthz"]), refused
 
 
-def by_the_server(log: Path, start: int) -> Row:
-    """What the server's own log says of the honest ones since it was ``start`` bytes long: from the headers to the last
-    byte of the answer. Without the waits of this process, which shares the cores with the attackers."""
-    took: dict[str, list[float]] = {"server_ballot": [], "server_healthz": []}
-    for line in log.read_bytes()[start:].splitlines():
-        told = json.loads(line) if line.startswith(b"{") else {}
-        if told.get("key") == "honest":
-            took["server_healthz" if told["path"] == "/healthz" else "server_ballot"].append(told["ms"] / 1e3)
-    return percentiles("server_ballot", took["server_ballot"]) | percentiles("server_healthz", took["server_healthz"])
-
-
 def hostile(options: argparse.Namespace) -> Row:
     """Every row of the table, on one server; the last is everything at once."""
     every, row = set(HOSTILE), Row()
@@ -397,7 +385,6 @@ def hostile(options: argparse.Namespace) -> Row:
         gc.freeze()  # a collection here would look like a wait there
         asyncio.run(honest(at, ballot, 3.0, "warm"))
         for kinds in [every] if options.only_all else [set[str](), *({kind} for kind in sorted(every)), every]:
-            start = at.log.stat().st_size
             process = multiprocessing.get_context("spawn").Process(target=attack, args=(at.address, at.keys, kinds))
             process.start()
             try:
@@ -409,9 +396,7 @@ def hostile(options: argparse.Namespace) -> Row:
             finally:
                 process.kill()
                 process.join()
-            peak = int(Path(f"/proc/{at.process.pid}/status").read_text().split("VmHWM:")[1].split()[0])
             row = {"hostile": ", ".join(sorted(kinds)) or "nobody", "refused": refused[:3]} | waits
-            row |= by_the_server(at.log, start) | {"load": round(os.getloadavg()[0], 1), "peak_MB": peak // 1000}
             print(json.dumps(row), flush=True)
     late = row["ballot_p99_ms"] > 1e3 * MOST_BALLOT_S or row["healthz_p99_ms"] > 1e3 * MOST_HEALTH_S
     if row["refused"] or late:
