@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -31,12 +30,48 @@ from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import changes_between, page_between
 
-PICTURES = Path(__file__).parents[1] / "docs/pictures"
 SHOWN = "performance.getEntriesByName('first-points').length > 0"
 LISTED = "document.querySelectorAll('#changes button').length > 0"
+TALLIED = "!document.querySelector('#content').hidden && document.querySelector('#tally').innerText"
+LARGEST = "document.querySelector('#changes button').click()"
+DEMOLITION = "[...document.querySelectorAll('#changes button')].find(b => b.innerText.includes('Demo')).click()"
+ALONG = "118,40,3,128,-2.25,0.42"
+"""The eye on the middle of the street, from the south-west: x, y, z, distance, bearing, elevation."""
+SLOW = {"offline": False, "latency": 400, "downloadThroughput": 120_000, "uploadThroughput": 60_000}
 
 
-def settled(browser: Chromium, seconds: float = 6.0) -> None:
+@dataclass(frozen=True)
+class Picture:
+    """What is opened, waited for and clicked; without ``still_s`` until all that is in view has come."""
+
+    at: str = ""
+    until: str = LISTED
+    click: str = ""
+    still_s: float | None = None
+    before: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """Calls of Chromium's debugging protocol."""
+    how: Mapping[str, object] = field(default_factory=dict)
+
+
+DEMO = {
+    "page": Picture(f"#eye={ALONG}"),
+    "page_change": Picture(click=LARGEST),
+    "page_dark": Picture(click=DEMOLITION, how={"dark": True}),
+    "page_phone": Picture(click=LARGEST, how={"width": 360, "height": 740}),
+    "page_colour_blind": Picture(
+        click=LARGEST, before={"Emulation.setEmulatedVisionDeficiency": {"type": "deuteranopia"}}
+    ),
+    "page_loading": Picture(until=SHOWN, still_s=0.0, before={"Network.emulateNetworkConditions": SLOW}),
+    "page_swipe": Picture(f"#compare=swipe&swipe=50&paths=1&eye={ALONG}"),
+    "page_2d": Picture("#view=2d&paths=1", still_s=10.0, how={"webgl": False}),
+    "page_next": Picture("#view=2d&paths=1&next=1", still_s=10.0, how={"webgl": False}),
+    "page_lost": Picture(f"#eye={ALONG}"),
+}
+OF_FILE = Picture(until="document.querySelectorAll('.row button').length > 0", still_s=5.0)
+EMPTY = Picture(until=TALLIED, still_s=0.0)
+
+
+def settle(browser: Chromium, seconds: float = 6.0) -> None:
     """Wait until all that is in view has come."""
     browser.wait(SHOWN, 90)
     count, since = -1, time.monotonic()
@@ -49,96 +84,21 @@ def settled(browser: Chromium, seconds: float = 6.0) -> None:
         time.sleep(0.2)
 
 
-ALONG = "118,40,3,128,-2.25,0.42"
-"""The eye on the middle of the street, from the south-west: x, y, z, distance, bearing, elevation."""
-
-
-def of_demo(browser: Chromium, url: str) -> None:
-    """Along the street."""
-    browser.open(f"{url}/#eye={ALONG}")
-    browser.wait(LISTED, 90)
-    settled(browser)
-
-
-def of_swipe(browser: Chromium, url: str) -> None:
-    """Before and after beside a bar, with the paths of those who voted."""
-    browser.open(f"{url}/#compare=swipe&swipe=50&paths=1&eye={ALONG}")
-    browser.wait(LISTED, 90)
-    settled(browser)
-
-
-def from_above(browser: Chromium, url: str, also: str = "") -> None:
-    """Without WebGL, or by a key."""
-    browser.open(f"{url}/#view=2d&paths=1{also}")
-    browser.wait(LISTED, 90)
-    time.sleep(10.0)
-
-
-def of_change(browser: Chromium, url: str) -> None:
-    """The eye on the largest change, told beside it."""
-    browser.open(url)
-    browser.wait(LISTED, 90)
-    browser.run("document.querySelector('#changes button').click()")
-    settled(browser)
-
-
-def of_demolition(browser: Chromium, url: str) -> None:
-    """The eye on the largest demolition."""
-    browser.open(url)
-    browser.wait(LISTED, 90)
-    browser.run("[...document.querySelectorAll('#changes button')].find(b => b.innerText.includes('Demo')).click()")
-    settled(browser)
-
-
-def as_seen_without_red(browser: Chromium, url: str) -> None:
-    """As of_change, to someone who cannot tell red from green."""
-    browser.call("Emulation.setEmulatedVisionDeficiency", type="deuteranopia")
-    of_change(browser, url)
-
-
-def while_loading(browser: Chromium, url: str) -> None:
-    """Over a slow line: the first points are there, more is coming."""
-    browser.call("Network.emulateNetworkConditions", offline=False, latency=400, downloadThroughput=120_000,
-                 uploadThroughput=60_000)  # fmt: skip
-    browser.open(url)
-    browser.wait(SHOWN, 120)
-
-
-def nothing_yet(browser: Chromium, url: str) -> None:
-    """A store with its first map, before anybody has driven."""
-    browser.open(url)
-    browser.wait("!document.querySelector('#content').hidden && document.querySelector('#tally').innerText", 60)
-
-
-def connection_lost(process: subprocess.Popen[str], browser: Chromium, url: str) -> None:
-    """The server has gone; what is shown stays."""
-    of_demo(browser, url)
-    process.terminate()
-    browser.wait("!document.querySelector('#offline').hidden", 60)
-
-
-Picture = tuple[str, Callable[[Chromium, str], None], dict[str, object]]
-DEMO: list[Picture] = [
-    ("page", of_demo, {}),
-    ("page_change", of_change, {}),
-    ("page_dark", of_demolition, {"dark": True}),
-    ("page_phone", of_change, {"width": 360, "height": 740}),
-    ("page_colour_blind", as_seen_without_red, {}),
-    ("page_loading", while_loading, {}),
-    ("page_swipe", of_swipe, {}),
-    ("page_2d", from_above, {"webgl": False}),
-    ("page_next", partial(from_above, also="&next=1"), {"webgl": False}),
-]
-
-
-def take(picture: Picture, url: str, key: str, to: Path) -> None:
-    """One picture, by a browser of its own, to an operator; in 256 colours, which is all that it has."""
-    name, prepare, how = picture
-    browser = Chromium(**{"width": 1400, "height": 900, "webgl": True} | how)  # type: ignore[arg-type]
+def take(picture: Picture, url: str, key: str, file: Path, end: Callable[[], object] | None = None) -> None:
+    """One picture, by a browser of its own, to an operator; in 256 colours, which is all that it has. ``end``: takes
+    the server away; what is shown stays."""
+    browser = Chromium(**{"width": 1400, "height": 900, "webgl": True} | dict(picture.how))  # type: ignore[arg-type]
     browser.call("Network.setExtraHTTPHeaders", headers={"Authorization": f"Bearer {key}"})
     try:
-        prepare(browser, url)
-        file = to / f"{name}.png"
+        for method, arguments in picture.before.items():
+            browser.call(method, **arguments)
+        browser.open(url + picture.at)
+        browser.wait(picture.until, 120)
+        browser.run(picture.click or "0")
+        settle(browser) if picture.still_s is None else time.sleep(picture.still_s)
+        if end:
+            end()
+            browser.wait("!document.querySelector('#offline').hidden", 60)
         browser.screenshot(file)
         Image.open(file).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
         print(file)
@@ -146,58 +106,42 @@ def take(picture: Picture, url: str, key: str, to: Path) -> None:
         browser.close()
 
 
-def closed(store: Path) -> str:
-    """An operator's key to a store, which needs keys from then on."""
+def closed(store: Path, page: Path | None = None) -> str:
+    """An operator's key to a store, which needs keys from then on; ``page``: gets what `mapvote log --html` writes of
+    the newest version."""
     opened = Store.open(f"sqlite:///{store}")
     try:
+        if page:
+            newest = opened.current()
+            page.write_text(page_between(opened, newest - 1, newest, changes_between(opened, newest - 1, newest)))
         return keys.issue(opened, "operator", "operator")
     finally:
         opened.close()
-
-
-def file_of_changes(store: Path, folder: Path) -> Path:
-    """What `mapvote log --html` writes of the newest version."""
-    opened = Store.open(f"sqlite:///{store}")
-    try:
-        newest = opened.current()
-        page = page_between(opened, newest - 1, newest, changes_between(opened, newest - 1, newest))
-    finally:
-        opened.close()
-    (folder / "changes.html").write_text(page)
-    return folder / "changes.html"
-
-
-def of_file(browser: Chromium, url: str) -> None:
-    """A change in a file of its own."""
-    browser.open(url)
-    browser.wait("document.querySelectorAll('.row button').length > 0", 60)
-    time.sleep(5.0)
 
 
 def main() -> None:
     """Parse and run."""
     asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     asked.add_argument("store", type=Path, help="of the demo")
-    asked.add_argument("--to", type=Path, default=PICTURES)
+    asked.add_argument("--to", type=Path, default=Path(__file__).parents[1] / "docs/pictures")
     asked.add_argument("--only", default="", help="names without page_, by commas")
     options = asked.parse_args()
-    wanted = {f"page_{name}" if name != "page" else name for name in filter(None, options.only.split(","))}
-    with tempfile.TemporaryDirectory() as folder:
-        log, copy = Path(folder) / "log", Path(folder) / "demo.db"
-        shutil.copy(options.store, copy)
-        key = closed(copy)
-        if not wanted or "page_file" in wanted:
-            take(("page_file", of_file, {}), file_of_changes(copy, Path(folder)).as_uri(), key, options.to)
-        with serving(copy, log=log) as (url, process):
-            for picture in [*DEMO, ("page_lost", partial(connection_lost, process), {})]:
-                if not wanted or picture[0] in wanted:
-                    take(picture, url, key, options.to)
-        if not wanted or "page_empty" in wanted:
-            store = Path(folder) / "empty.db"
-            Store.create(f"sqlite:///{store}", make_map({})).close()
-            key = closed(store)
-            with serving(store, log=log) as (url, _):
-                take(("page_empty", nothing_yet, {}), url, key, options.to)
+    wanted = {f"page_{name}".removesuffix("_page") for name in filter(None, options.only.split(","))}
+    wanted = wanted or {*DEMO, "page_file", "page_empty"}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        key = closed(Path(shutil.copy(options.store, folder / "demo.db")), folder / "changes.html")
+        if "page_file" in wanted:
+            take(OF_FILE, (folder / "changes.html").as_uri(), key, options.to / "page_file.png")
+        with serving(folder / "demo.db", log=folder / "log") as (url, process):
+            for one in (one for one in DEMO if one in wanted):
+                file = options.to / f"{one}.png"
+                take(DEMO[one], f"{url}/", key, file, process.terminate if one == "page_lost" else None)
+        if "page_empty" in wanted:
+            Store.create(f"sqlite:///{folder}/empty.db", make_map({})).close()
+            key = closed(folder / "empty.db")
+            with serving(folder / "empty.db", log=folder / "log") as (url, _):
+                take(EMPTY, f"{url}/", key, options.to / "page_empty.png")
 
 
 if __name__ == "__main__":
