@@ -11,24 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
-from mapvote.codec.ballot import (
-    Ballot,
-    BallotTile,
-    check_path,
-    pack_odds,
-    pack_plane,
-    pack_points,
-    pack_words,
-    tile_key,
-    unpack_planes,
-)
+from mapvote.codec.arrays import pack_plane
+from mapvote.codec.ballot import Ballot, BallotTile, check_path, pack_odds, pack_points, tile_key, unpack_planes
+from mapvote.codec.sparse_columns import Words, mark, nothing_reached, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, Scan
-from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix

@@ -20,8 +20,8 @@ from mapvote.codec.ballot import (
     unpack_states,
     unpack_sureness,
     unpack_tally,
-    unpack_words,
 )
+from mapvote.codec.sparse_columns import unpack_words
 from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points

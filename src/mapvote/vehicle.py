@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import (
     Ballot,
     BallotTile,
@@ -15,11 +16,10 @@ from mapvote.codec.ballot import (
     in_steps,
     pack_odds,
     pack_path,
-    pack_plane,
     pack_points,
-    pack_words,
     tile_key,
 )
+from mapvote.codec.sparse_columns import pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, Cell, make_map, make_tile, states_plane, wall, words_plane
+from mapvote.codec.sparse_columns import Words
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, NO_VOTE, CellState
 from mapvote.fusion.edit import add_points, delete_points, words_gone
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote, silenced
 
 GRID = Lattice().tile((0, 0))

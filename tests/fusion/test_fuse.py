@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
+from mapvote.codec.sparse_columns import Words
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Rule, count, fuse_tile, states_over
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote
 
 LATTICE = Lattice()

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
-from mapvote.codec.ballot import MOST_STEPS, UNSAID
+from mapvote.codec.ballot import MOST_STEPS, UNSAID, Odds
 from mapvote.config import FuseSettings, load_settings
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap
@@ -29,7 +29,7 @@ from mapvote.fusion.loss_budget import (
     unpack_agreed,
     waypoints,
 )
-from mapvote.fusion.tile_vote import Odds, TileVote, fold, silenced
+from mapvote.fusion.tile_vote import TileVote, fold, silenced
 
 CELL, FLAT = (10, 10), 10 * 256 + 10
 EMPTY, STANDS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED

@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapvote.codec.ballot import Odds
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled
-from mapvote.fusion.tile_vote import Odds, TileVote
+from mapvote.fusion.tile_vote import TileVote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 WINDOW = Lattice().tile((0, 0))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from hand_made import make_tile, states_plane, wall, words_plane
+from mapvote.codec.sparse_columns import Words
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Memory, Tile
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Spoken, Version, fuse
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, at_least, words_plane
-from mapvote.codec.ballot import pack_plane, pack_words, unpack_sparse
+from mapvote.codec.arrays import pack_plane
+from mapvote.codec.sparse_columns import Words, pack_words, unpack_sparse
 from mapvote.core.types import MapvoteError
-from mapvote.fusion.sparse_columns import Words
 
 CELL = (10, 10)
 

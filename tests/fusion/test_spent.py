@@ -10,11 +10,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
+from mapvote.codec.sparse_columns import Words
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.fuse import differing, unspent
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote
 
 CE = int(CellState.CHANGED_EMPTY)

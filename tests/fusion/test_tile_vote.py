@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, at_least, make_ballot, states_plane, two_walls, unpack_all, wall, words_plane
+from mapvote.codec.sparse_columns import Words, nothing_reached
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.fusion.sparse_columns import Words, nothing_reached
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, silenced
 
 UO, UE, CO, CE, UN = CellState

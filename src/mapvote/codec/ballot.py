@@ -9,17 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, unpack_bytes, unpack_plane
-from mapvote.codec.arrays import pack_plane as pack_plane
+from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane
+from mapvote.codec.sparse_columns import Words, unpack_sparse
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError
+from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, Bool, CellState, MapvoteError
 
 FORMAT_VERSION = 1
 MAX_TILES = 4096
@@ -143,45 +143,50 @@ def decode(data: bytes) -> Ballot:
     return ballot
 
 
-class PackedPlanes(Protocol):
-    """The planes of a ballot on one tile, as they travel (:class:`BallotTile`) and as a server stores them."""
+class Odds(NamedTuple):
+    """How sure a vehicle is, or those who agree are, of some cells of a tile; of all others nothing is stated."""
 
-    @property
-    def states(self) -> bytes | None: ...
-    @property
-    def tally(self) -> bytes | None: ...
-    @property
-    def gone(self) -> bytes | None: ...
-    @property
-    def new_points(self) -> bytes | None: ...
-    @property
-    def intensity(self) -> bytes | None: ...
-    @property
-    def free(self) -> bytes | None: ...
-    @property
-    def odds(self) -> bytes | None: ...
+    cells: I64
+    """(n,) flat cells of the tile, ascending."""
+    steps: I8
+    """(n,) log-odds in steps, see :func:`in_steps`."""
+
+    @classmethod
+    def none(cls) -> Odds:
+        """No cell has a stated confidence."""
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
+
+    def at(self, cells: I64) -> I8:
+        """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""
+        plane = np.full(CELLS, UNSAID, dtype=np.int8)
+        plane[self.cells] = self.steps
+        return plane[cells]
+
+    def within(self, mine: Bool) -> Odds:
+        """Only those of the flat cells given (65536,)."""
+        keep = mine[self.cells]
+        return Odds(self.cells[keep], self.steps[keep])
 
 
-Sparse = tuple[NDArray[np.intp], U64]
-"""(flat cells (n,), ascending; their column words (n,), none of them 0)."""
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Planes:
-    """:class:`PackedPlanes`, unpacked and checked."""
+    """The planes of a :class:`BallotTile`, unpacked and checked."""
 
-    states: U8 | None
-    """(256, 256)"""
-    tally: U16 | None
-    """(256, 256, 5)"""
-    gone: Sparse | None
-    new_points: F32 | None
-    """(m, 3)"""
-    intensity: U8 | None
-    """(m,)"""
-    free: Sparse | None
-    odds: tuple[I64, I8] | None
-    """(flat cells that the states call changed (n,), ascending; how sure the vehicle is of each (n,))."""
+    states: U8 | None = None
+    """(256, 256): two-stage."""
+    tally: U16 | None = None
+    """(256, 256, 5): one-stage."""
+    gone: Words | None = None
+    """Column words to delete where the vote is changed-empty, and remnants where the cell stands; None: no
+    remnants, and the whole column above ground."""
+    new_points: F32 | None = None
+    """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
+    intensity: U8 | None = None
+    """(m,) of the new points, 255 for 1.0; None: not measured."""
+    free: Words | None = None
+    """Column words that rays passed through."""
+    odds: Odds | None = None
+    """How sure it is of the cells that it calls changed; None: it does not say."""
 
     @property
     def nbytes(self) -> int:
@@ -192,11 +197,15 @@ class Planes:
 
     def spoken(self) -> Bool:
         """(256, 256) the cells on which it votes."""
-        return spoken_cells(self.states, self.tally)
+        if self.states is not None:
+            return self.states != NO_VOTE
+        assert self.tally is not None
+        return np.asarray(self.tally.any(axis=-1))
 
 
-def unpack_planes(packed: PackedPlanes) -> Planes:
-    """The votes on one tile; MapvoteError if a plane is damaged or impossible."""
+def unpack_planes(packed: BallotTile) -> Planes:
+    """The votes on one tile, of a ballot or of a server's row with its planes; MapvoteError if a plane is damaged or
+    impossible."""
     new_points, intensity = unpack_offer(packed.new_points, packed.intensity)
     states = None if packed.states is None else unpack_states(packed.states)
     return Planes(
@@ -208,14 +217,6 @@ def unpack_planes(packed: PackedPlanes) -> Planes:
         free=None if packed.free is None else unpack_sparse(packed.free, "free"),
         odds=unpack_sureness(packed.odds, states),
     )
-
-
-def spoken_cells(states: U8 | None, tally: U16 | None) -> Bool:
-    """(256, 256) the cells on which a vote of two stages (``states``) or of one (``tally``) says anything."""
-    if states is not None:
-        return states != NO_VOTE
-    assert tally is not None
-    return np.asarray(tally.any(axis=-1))
 
 
 def unpack_states(data: bytes) -> U8:
@@ -242,71 +243,18 @@ def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32
     return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
 
 
-def unpack_sureness(odds: bytes | None, states: U8 | None) -> tuple[I64, I8] | None:
-    """(changed cells of ``states`` (256, 256), how sure the vehicle is of each); None if it does not say. MapvoteError
-    as :func:`unpack_odds`, and if there are odds but no states."""
+def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
+    """Of the changed cells of ``states`` (256, 256); None if it does not say. MapvoteError if damaged, not one for each
+    changed cell, nothing that a vehicle says, or without states."""
     if odds is None:
         return None
     if states is None:
         raise MapvoteError("ballot: a tile has the odds of changed cells, but no states")
     cells = changed_cells_of(states)
-    return cells, unpack_odds(odds, len(cells))
-
-
-# Column words: only those that are not zero, for masks and free space mark few of a tile's cells. Under zstd lie the
-# ways from each cell to the next as two planes of bytes, then the words as eight: bytes that mean the same lie
-# together, which packs a fifth smaller than the words as they are.
-
-_WAY, _WORD = 2, 8
-"""Bytes of the way to a cell, and of its word."""
-
-
-def pack_words(plane: U64) -> bytes:
-    """A (256, 256) plane."""
-    flat = plane.reshape(-1)
-    cells = np.flatnonzero(flat)
-    return compress(_by_byte(np.diff(cells, prepend=0), _WAY) + _by_byte(flat[cells], _WORD))
-
-
-def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
-    """(flat cells (n,), ascending; their words (n,), none of them 0). MapvoteError if damaged.
-
-    ``what`` names the plane in messages, e.g. "gone".
-    """
-    raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
-    n, left = divmod(len(raw), _WAY + _WORD)
-    cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
-    if left or not _ascending(raw, cells, words):
-        raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
-    return cells, words
-
-
-@kernel
-def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
-    """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
-    n, cell, sound = len(cells), np.int64(0), True
-    for i in range(n):
-        way = np.int64(raw[i]) | (np.int64(raw[n + i]) << 8)
-        cell += way
-        word = np.uint64(0)
-        for k in range(_WORD):
-            word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
-        cells[i], words[i] = cell, word
-        sound &= (way > 0 or i == 0) and word != 0
-    return bool(sound and cell < CELLS)
-
-
-def unpack_words(data: bytes, what: str) -> U64:
-    """(256, 256) uint64; MapvoteError if damaged."""
-    cells, words = unpack_sparse(data, what)
-    plane = np.zeros(CELLS, dtype=np.uint64)
-    plane[cells] = words
-    return plane.reshape(TILE_CELLS, TILE_CELLS)
-
-
-def _by_byte(values: NDArray[np.integer], size: int) -> bytes:
-    """All lowest bytes first, then all that come next .."""
-    return np.ascontiguousarray(values.astype(f"<u{size}").view(np.uint8).reshape(-1, size).T).tobytes()
+    steps = unpack_plane(odds, "<i1", (len(cells),), "ballot: odds")
+    if (steps == UNSAID).any():
+        raise MapvoteError("ballot: odds holds a value that is no log-odds")
+    return Odds(cells, steps)
 
 
 # New points: the voxel of each, and where in it to a 32nd of its side. Half a centimetre is less than a sensor's noise
@@ -440,15 +388,6 @@ def changed_cells_of(states: U8) -> I64:
 def pack_odds(steps: I8) -> bytes:
     """(m,) of the changed cells of a tile, in their order."""
     return compress(np.ascontiguousarray(steps, dtype=np.int8).tobytes())
-
-
-def unpack_odds(data: bytes, cells: int) -> I8:
-    """(cells,) int8. MapvoteError if damaged, not one for each of so many changed cells, or nothing that a vehicle
-    says."""
-    steps = unpack_plane(data, "<i1", (cells,), "ballot: odds")
-    if (steps == UNSAID).any():
-        raise MapvoteError("ballot: odds holds a value that is no log-odds")
-    return steps
 
 
 # Path: a cell of the lattice every few metres, for display. Cells as steps from one to the next, int32, under zstd: two

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.codec.sparse_columns import Words, counted, nothing_reached, words_of
 from mapvote.core.columns import EVERY_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
-from mapvote.fusion.sparse_columns import Words, counted, nothing_reached, words_of
 from mapvote.fusion.tile_vote import TileVote
 
 

@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.ballot import Ballot, encode, tile_key, unpack_planes
+from mapvote.codec.ballot import Ballot, Odds, encode, tile_key, unpack_planes
+from mapvote.codec.sparse_columns import nothing_reached
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
@@ -30,8 +31,7 @@ from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, o
 from mapvote.fusion.edit import add_points, delete_points, words_gone
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
-from mapvote.fusion.sparse_columns import nothing_reached
-from mapvote.fusion.tile_vote import Odds, TileVote, newest_votes, offered, one_each, silenced
+from mapvote.fusion.tile_vote import TileVote, newest_votes, offered, one_each, silenced
 
 Rule = Literal["paper", "columns"]
 """How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""

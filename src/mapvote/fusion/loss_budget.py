@@ -25,11 +25,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.codec.arrays import unpack_plane
-from mapvote.codec.ballot import UNSAID, changed_cells_of, in_nats, pack_odds
+from mapvote.codec.ballot import UNSAID, Odds, changed_cells_of, in_nats, pack_odds
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
-from mapvote.fusion.tile_vote import Odds, TileVote
+from mapvote.fusion.tile_vote import TileVote
 
 
 def agreed_odds(votes: Sequence[TileVote], states: U8, quorum: int) -> Odds:

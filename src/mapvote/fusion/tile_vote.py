@@ -12,65 +12,24 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.ballot import UNSAID, Planes, spoken_cells
+from mapvote.codec.ballot import Odds, Planes
+from mapvote.codec.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, I8, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
-from mapvote.fusion.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, read_only
 
 DAY_NS = 86_400_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Odds:
-    """The confidence of some cells of a tile; none is stated of all others."""
-
-    cells: I64
-    """(n,) flat cells of the tile, ascending."""
-    steps: I8
-    """(n,) log-odds in steps, see :func:`mapvote.codec.ballot.in_steps`."""
-
-    @classmethod
-    def none(cls) -> Odds:
-        """No cell has a stated confidence."""
-        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
-
-    def at(self, cells: I64) -> I8:
-        """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""
-        plane = np.full(CELLS, UNSAID, dtype=np.int8)
-        plane[self.cells] = self.steps
-        return plane[cells]
-
-    def within(self, mine: Bool) -> Odds:
-        """Only those of the flat cells given (65536,)."""
-        keep = mine[self.cells]
-        return Odds(self.cells[keep], self.steps[keep])
-
-
-@dataclass(frozen=True, slots=True)
-class TileVote:
+class TileVote(Planes):
     """The vote of one drive, or of one vehicle after :func:`fold`, on one tile."""
 
     vehicle: str
     end_ns: int
     digest: str
     """Hash of the ballot: breaks ties between drives that end at the same moment."""
-    states: U8 | None = None
-    """(256, 256): two-stage."""
-    tally: U16 | None = None
-    """(256, 256, 5): one-stage."""
-    gone: Words | None = None
-    """Column words to delete where the vote is changed-empty, and remnants where the cell stands; None: no
-    remnants, and the whole column above ground."""
-    new_points: F32 | None = None
-    """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
-    intensity: U8 | None = None
-    """(m,) of the new points, 255 for 1.0; None: not measured."""
-    free: Words | None = None
-    """Column words that rays passed through."""
-    odds: Odds | None = None
-    """How sure it is of the cells that it calls changed; None: it does not say."""
     version: int = 0
     """Of the map that the vehicle drove with."""
     unrestricted: U8 | None = None
@@ -83,19 +42,8 @@ class TileVote:
     @classmethod
     def of(cls, planes: Planes, vehicle: str = "", end_ns: int = 0, digest: str = "", version: int = 0) -> TileVote:
         """The vote of a ballot on one tile."""
-        return cls(
-            vehicle=vehicle,
-            end_ns=end_ns,
-            digest=digest,
-            states=planes.states,
-            tally=planes.tally,
-            gone=None if planes.gone is None else Words(*planes.gone),
-            new_points=planes.new_points,
-            intensity=planes.intensity,
-            free=None if planes.free is None else Words(*planes.free),
-            odds=None if planes.odds is None else Odds(*planes.odds),
-            version=version,
-        )
+        said = {name: getattr(planes, name) for name in Planes.__slots__}
+        return cls(vehicle=vehicle, end_ns=end_ns, digest=digest, version=version, **said)
 
     @property
     def sent(self) -> U8 | None:
@@ -107,10 +55,6 @@ class TileVote:
         if self.intensity is not None:
             return self.intensity
         return np.zeros(0 if self.new_points is None else len(self.new_points), dtype=np.uint8)
-
-    def spoken(self) -> Bool:
-        """(256, 256) where this vote has a state."""
-        return spoken_cells(self.states, self.tally)
 
     def supports(self, state: CellState, cells: NDArray[np.intp]) -> Bool:
         """(n,) at which of the flat ``cells`` this vote is, or in one stage also counts, for ``state``."""
@@ -136,7 +80,7 @@ class TileVote:
         return np.asarray(counts.any(axis=-1))
 
     def mark_passed(self, reached: U64) -> None:
-        """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of the voxels that rays
+        """One more voter in ``reached`` (see :func:`mapvote.codec.sparse_columns.mark`): of the voxels that rays
         passed through, in cells with a vote."""
         assert self.free is not None
         if self.states is not None:

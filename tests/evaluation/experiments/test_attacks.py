@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 
 from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.ballot import (
-    MOST_OFF_M,
-    Ballot,
-    BallotTile,
-    decode,
-    encode,
-    unpack_points,
-    unpack_states,
-    unpack_words,
-)
+from mapvote.codec.ballot import MOST_OFF_M, Ballot, BallotTile, decode, encode, unpack_points, unpack_states
+from mapvote.codec.sparse_columns import unpack_words
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState

@@ -207,7 +207,7 @@ BYTES = SHAPE[0] * SHAPE[1]
 
 
 def unpacked(state: int) -> Planes:
-    return Planes(np.full(SHAPE, state, dtype=np.uint8), None, None, None, None, None, None)
+    return Planes(states=np.full(SHAPE, state, dtype=np.uint8))
 
 
 def test_what_was_not_asked_for_longest_is_forgotten_first_and_never_more_is_kept_than_may_be() -> None:

@@ -16,11 +16,11 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes, unpack_plane
+from mapvote.codec.ballot import Odds
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.loss_budget import unpack_agreed
-from mapvote.fusion.tile_vote import Odds
 from mapvote.server.store import schema
 
 _BYTE_MAX = 255

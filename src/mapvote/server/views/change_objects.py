@@ -12,14 +12,13 @@ from typing import Literal
 
 import numpy as np
 
-from mapvote.codec.ballot import UNSAID
+from mapvote.codec.ballot import UNSAID, Odds
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.loss_budget import alike_beside, change_probability
-from mapvote.fusion.tile_vote import Odds
 from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]

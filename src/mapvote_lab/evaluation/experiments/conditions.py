@@ -14,25 +14,23 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import (
     MOST_STEPS,
     Ballot,
     BallotTile,
     changed_cells_of,
     pack_odds,
-    pack_plane,
     pack_points,
-    pack_words,
     unpack_points,
     unpack_states,
     unpack_sureness,
-    unpack_words,
 )
+from mapvote.codec.sparse_columns import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U64, Bool, CellState, Drive, Scan
-from mapvote.fusion.tile_vote import Odds
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
@@ -210,7 +208,7 @@ def _moved(ballot: Ballot, by: int) -> Ballot:
             states = _shifted(before, NO_VOTE, by)
             said = unpack_sureness(tile.odds, before)
             if said is not None:
-                odds = pack_odds(Odds(*said).at(changed_cells_of(states) - by * (TILE_CELLS + 1)))
+                odds = pack_odds(said.at(changed_cells_of(states) - by * (TILE_CELLS + 1)))
         return msgspec.structs.replace(
             tile,
             states=None if states is None else pack_plane(states),
