@@ -46,7 +46,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import database
-from mapvote.server.store.admission import Receipt, accept, examine
+from mapvote.server.store.admission import Intake, Receipt, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
@@ -103,7 +103,7 @@ class Fleet:
                 says = {tile: Say(say.states) for tile, say in says.items()}
             data = encode(make_ballot(self.base, says, f"v{vehicle:03}", "d", end_ns=DAY_NS + vehicle))
             self.bytes += len(data)
-            (receipt,) = accept(self.store, [examine(data)])
+            (receipt,) = Intake(self.store).write([examine(data)])
             assert isinstance(receipt, Receipt), receipt
         self.vehicles += vehicles
 

@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.tile import Memory
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.admission import Receipt, accept, examine
+from mapvote.server.store.admission import Intake, Receipt, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.reviews import decide, undo
@@ -147,7 +147,7 @@ class History:
         )
         base = {(0, 0): self.hashes[version]}
         ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=version)
-        (receipt,) = accept(self.store, [examine(encode(ballot))])
+        (receipt,) = Intake(self.store).write([examine(encode(ballot))])
         assert isinstance(receipt, Receipt | Conflict), receipt
         return isinstance(receipt, Receipt)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hand_made import Cell, Say, states_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import I8, NO_VOTE, CellState, MapvoteError
-from mapvote.server.store.admission import Intake, Receipt, accept, examine
+from mapvote.server.store.admission import Intake, Receipt, examine
 from mapvote.server.store.store import Store
 
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
@@ -15,7 +15,7 @@ WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 def send(store: Store | Intake, *ballots: Ballot) -> list[Receipt]:
     """Receipts of these ballots, stored in one transaction; the first refusal is raised."""
     examined = [examine(encode(ballot)) for ballot in ballots]
-    receipts = store.write(examined) if isinstance(store, Intake) else accept(store, examined)
+    receipts = (store if isinstance(store, Intake) else Intake(store)).write(examined)
     for receipt in receipts:
         if isinstance(receipt, MapvoteError):
             raise receipt

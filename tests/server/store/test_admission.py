@@ -24,7 +24,6 @@ from mapvote.server.store.admission import (
     Quota,
     Receipt,
     Votes,
-    accept,
     examine,
     refuse_out_of_reach,
 )
@@ -94,10 +93,12 @@ def at_height(z: float, tile: tuple[int, int] = (0, 0)) -> Ballot:
 def test_new_points_lie_at_a_height_where_something_can_be(tmp_path: Path, tile: tuple[int, int]) -> None:
     """The ground of the map lies at 0 m."""
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
-    said = [str(answer) for answer in accept(store, [examine(encode(at_height(z, tile))) for z in (-11.0, 121.0)])]
+    said = [
+        str(answer) for answer in Intake(store).write([examine(encode(at_height(z, tile))) for z in (-11.0, 121.0)])
+    ]
     assert all("within 10 m below to 120 m above the map's lowest ground there, 0.0 m" in text for text in said)
-    (low,) = accept(store, [examine(encode(at_height(-9.0, tile)))])
-    (high,) = accept(store, [examine(encode(at_height(119.0, tile)))])
+    (low,) = Intake(store).write([examine(encode(at_height(-9.0, tile)))])
+    (high,) = Intake(store).write([examine(encode(at_height(119.0, tile)))])
     assert isinstance(low, Receipt)
     assert isinstance(high, Receipt)
     store.close()
@@ -109,10 +110,10 @@ def test_a_drive_is_no_older_than_the_map_and_not_of_tomorrow(tmp_path: Path) ->
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", first, clock=lambda: now)
     stamps = {now - 101: "before the map was surveyed", now + 301 * 10**9: "ends in the future"}
     for end_ns, why in stamps.items():
-        (answer,) = accept(store, [examine(encode(ballot(start_ns=0, end_ns=end_ns)))])
+        (answer,) = Intake(store).write([examine(encode(ballot(start_ns=0, end_ns=end_ns)))])
         assert why in str(answer)
     for end_ns in (now - 100, now + 299 * 10**9):
-        (answer,) = accept(store, [examine(encode(ballot(start_ns=0, end_ns=end_ns)))])
+        (answer,) = Intake(store).write([examine(encode(ballot(start_ns=0, end_ns=end_ns)))])
         assert isinstance(answer, Receipt), answer
     assert Store.open(f"sqlite:///{tmp_path / 's.db'}").point_map().surveyed_ns == now - 100
     store.close()

@@ -31,9 +31,9 @@ from mapvote.server.store.decisions import (
 )
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
-from mapvote.server.store.queries import oldest_kept, tile_as_of
+from mapvote.server.store.queries import Version, oldest_kept, tile_as_of
 from mapvote.server.store.reviews import decide
-from mapvote.server.store.store import Store, Version
+from mapvote.server.store.store import Store
 from mapvote.server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
 from standing_clock import Clock
 from stores import send

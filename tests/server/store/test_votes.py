@@ -25,7 +25,7 @@ from mapvote.server.store.queries import Version
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
     Electorate,
-    counting_votes,
+    judged_on,
     judged_votes,
     read_votes,
     recent_votes,
@@ -95,7 +95,7 @@ def judged(store: Store, question: Electorate) -> dict[str, str]:
 def counting(store: Store, question: Electorate, **more: object) -> list[TileVote]:
     tile = replace(store.point_map().tiles[HERE], **more)  # type: ignore[arg-type]
     with store.database.reading() as connection:
-        return counting_votes(connection, tile, question)
+        return [one.vote for one in judged_on(connection, tile, question) if one.vote is not None]
 
 
 def spoken(vote: TileVote) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ Where a vehicle can have been is checked too: near the map, on one path, at heig
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -176,13 +177,14 @@ class Intake:
             return []
         now = self._store.clock()
         results: list[Receipt | MapvoteError] = []
+        replaced: list[dict[str, int]] = []
         with self._store.database.writing() as connection:
             newest, policy, seq = connection.execute(_HEAD).one()
             self._catch_up(connection, newest, policy)
             came_with = {ballot.key_hash for ballot in ballots if ballot.key_hash is not None}
             valid = keys.of(connection, came_with, now) if came_with else {}
             first, standing = _heard_of(connection, ballots)
-            rows = _Rows()
+            rows: Rows = defaultdict(list)
             for one in ballots:
                 old, old_digest = standing.get(one.drive, (None, ""))
                 if old is not None and old_digest == one.digest:
@@ -194,10 +196,15 @@ class Intake:
                     results.append(why)
                     continue
                 seq += 1
-                rows.add(one, seq, first.setdefault(one.drive, seq), now, old)
+                _enter(rows, one, seq, first.setdefault(one.drive, seq), now)
+                if old is not None:
+                    replaced.append({"old": old, "by": seq})
                 standing[one.drive] = seq, one.digest
                 results.append(Receipt(*one.drive, "created" if old is None else "replaced", seq))
-            rows.insert(connection)
+            for table, some in rows.items():
+                insert_rows(connection, table, some)
+            if replaced:
+                connection.execute(_REPLACED, replaced)
         return results
 
     def _catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
@@ -306,9 +313,8 @@ _HEAD = sa.select(
 """The newest version, policy and event."""
 
 
-def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
-    """:meth:`Intake.write`, once."""
-    return Intake(store).write(ballots)
+_REPLACED = schema.ballots.update().where(schema.ballots.c.seq == sa.bindparam("old"))
+_REPLACED = _REPLACED.values(gone_seq=sa.bindparam("by"))
 
 
 def _heard_of(
@@ -327,39 +333,20 @@ def _heard_of(
     return first, standing
 
 
-@dataclass(slots=True)
-class _Rows:
-    """The rows of several ballots, each in the order of its table's columns."""
+Rows = dict[sa.Table, list[tuple[Any, ...]]]
+"""Rows to insert, each in the order of its table's columns."""
 
-    log: list[tuple[Any, ...]] = field(default_factory=list)
-    ballots: list[tuple[Any, ...]] = field(default_factory=list)
-    tiles: list[tuple[Any, ...]] = field(default_factory=list)
-    paths: list[tuple[Any, ...]] = field(default_factory=list)
-    replaced: list[dict[str, int]] = field(default_factory=list)
 
-    def add(self, incoming: Incoming, seq: int, first_seq: int, now: int, old: int | None) -> None:
-        """A ballot that replaces ``old``, if there is one."""
-        ballot = incoming.ballot
-        self.log.append((seq, now, "ballot", *incoming.drive))
-        times = ballot.start_ns, ballot.end_ns, now
-        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
-        self.ballots.append((seq, first_seq, None, *incoming.drive, incoming.digest, *times, *how))
-        self.tiles += [(*votes.tile, seq, *votes.stored) for votes in incoming.votes]
-        if ballot.path is not None:
-            self.paths.append((seq, ballot.path))
-        if old is not None:
-            self.replaced.append({"old": old, "by": seq})
-
-    def insert(self, connection: sa.Connection) -> None:
-        b = schema.ballots
-        for table, rows in (
-            (schema.events, self.log), (b, self.ballots), (schema.ballot_tiles, self.tiles), (schema.paths, self.paths)
-        ):  # fmt: skip
-            if rows:
-                insert_rows(connection, table, rows)
-        if self.replaced:
-            mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
-            connection.execute(mark, self.replaced)
+def _enter(rows: Rows, incoming: Incoming, seq: int, first_seq: int, now: int) -> None:
+    """Add those of a ballot."""
+    ballot = incoming.ballot
+    rows[schema.events].append((seq, now, "ballot", *incoming.drive))
+    times = ballot.start_ns, ballot.end_ns, now
+    how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
+    rows[schema.ballots].append((seq, first_seq, None, *incoming.drive, incoming.digest, *times, *how))
+    rows[schema.ballot_tiles] += [(*votes.tile, seq, *votes.stored) for votes in incoming.votes]
+    if ballot.path is not None:
+        rows[schema.paths].append((seq, ballot.path))
 
 
 def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:

@@ -118,7 +118,7 @@ def address_of(url: sa.URL) -> str:
 
 def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:
     """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them. A last column
-    of :func:`sum_over` is added where it is left out.
+    of :func:`sum_but` is added where it is left out.
 
     SQLAlchemy's own work on each row would cost more than the database's.
     """
@@ -186,20 +186,21 @@ def _raw(part: Any) -> bytes:
     return str(operator.index(part)).encode()
 
 
-def sum_over(*names: str) -> sa.Column[str]:
-    """A last column, of the sum over these: of all that is written once. Whoever inserts a row need not think of it."""
+def sum_but(*names: str) -> sa.Column[str]:
+    """A last column, of the sum over all others but these: over what is written once. Whoever inserts a row need not
+    think of it."""
 
     def of_row(context: Any) -> str:
         row = context.get_current_parameters()
-        return sum_of(*(row.get(name) for name in names))
+        return sum_of(*(row.get(name) for name in summed(context.current_column.table)))
 
-    return sa.Column("sum", sa.String(64), nullable=False, default=of_row, info={"over": names})
+    return sa.Column("sum", sa.String(64), nullable=False, default=of_row, info={"but": {"sum", *names}})
 
 
+@cache
 def summed(table: sa.Table) -> Sequence[str]:
-    """The columns that the table's sum is over; none where rows carry none."""
-    over: Sequence[str] = table.c["sum"].info["over"] if "sum" in table.c else ()
-    return over
+    """The columns that the table's sum is over, in their order."""
+    return [column.name for column in table.c if column.name not in table.c["sum"].info["but"]]
 
 
 def is_sound(table: sa.Table, row: Any) -> bool:

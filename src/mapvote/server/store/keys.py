@@ -93,19 +93,14 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
     Who is trusted no longer was not to be trusted before: its standing ballots count no more, unless ``keep_votes``.
     What was published of them stays (:func:`mapvote.server.store.rollback.replay` takes that out too).
     """
-    with store.database.writing() as connection:
-        return revoke_in(connection, store.clock(), name, by, keep_votes=keep_votes)
-
-
-def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_votes: bool = False) -> tuple[int, int]:
-    """:func:`revoke` within a transaction."""
-    k = schema.keys
+    k, now = schema.keys, store.clock()
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
-    done = connection.execute(k.update().where(valid).values(revoked_ns=now))
-    if not done.rowcount:
-        raise NotFound(f"{name!r} has no valid key")
-    seq = log_event(connection, now, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
-    return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
+    with store.database.writing() as connection:
+        done = connection.execute(k.update().where(valid).values(revoked_ns=now))
+        if not done.rowcount:
+            raise NotFound(f"{name!r} has no valid key")
+        seq = log_event(connection, now, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
+        return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
 
 
 def ballots_standing(store: Store) -> dict[str, int]:

@@ -116,11 +116,3 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"][:2])
         raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error
-
-
-def changes_of(connection: sa.Connection) -> list[PolicyChange]:
-    """Every change, oldest first."""
-    p, e = schema.policies, schema.events
-    rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
-    found = connection.execute(rows.order_by(p.c.seq)).all()
-    return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]

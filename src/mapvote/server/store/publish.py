@@ -40,9 +40,10 @@ from mapvote.server.store.queries import (
     current_version,
     end_votes,
     log_event,
+    newest_seq,
     set_tiles,
     tiles_of,
-    tiles_set_by,
+    tiles_set_between,
     version_of,
     version_row,
 )
@@ -268,7 +269,7 @@ def _decide(
     """Fuse every tile that the ``last`` round does not answer."""
     with store.database.reading() as connection:
         newest = current_version(connection)
-        mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+        mark = newest_seq(connection)
         asked = electorate_now(connection, now, mark, settings)
         dirty = _dirty(connection, newest, asked)
         wanted = (
@@ -308,7 +309,8 @@ def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> lis
     fused = newest.kind == "publish" and newest.policy == policy.model_dump(mode="json")
     if not fused or policy.fuse.min_age_s > 0:
         return standing_tiles(connection, asked.mark)
-    return sorted({*_touched(connection, asked.mark, newest.mark), *tiles_set_by(connection, newest.number)})
+    edited = tiles_set_between(connection, newest.number - 1, newest.number)
+    return sorted({*_touched(connection, asked.mark, newest.mark), *edited})
 
 
 def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:

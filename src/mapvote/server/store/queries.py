@@ -12,7 +12,6 @@ from mapvote.codec.arrays import FRAME_HEAD
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import (
-    pack_tile,
     points_in_plane,
     unpack_memory_plane,
     unpack_tile,
@@ -106,12 +105,6 @@ def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memor
     return None if row is None or row.memory is None else load_memory(connection, row.memory)
 
 
-def tiles_set_by(connection: sa.Connection, number: int) -> list[TileIndex]:
-    """The tiles that a version changed."""
-    t = schema.version_tiles
-    return [(row.row, row.col) for row in connection.execute(sa.select(t.c.row, t.c.col).where(t.c.version == number))]
-
-
 def tiles_set_between(connection: sa.Connection, old: int, new: int) -> list[TileIndex]:
     """The tiles that versions after ``old`` up to ``new`` set, ascending: all others are the same in both."""
     t = schema.version_tiles
@@ -169,7 +162,7 @@ def _there(data: bytes | None, digest: str) -> bytes:
 
 def log_event(connection: sa.Connection, at_ns: int, kind: str, actor: str, detail: str) -> int:
     """Append to the log; its number. Only within a writing transaction."""
-    seq = next_seq(connection)
+    seq = newest_seq(connection) + 1  # safe, because writers take turns
     event = {"seq": seq, "at_ns": at_ns, "kind": kind, "actor": actor[:80], "detail": detail[:400]}
     connection.execute(schema.events.insert(), [event])
     return seq
@@ -182,9 +175,9 @@ def end_votes(connection: sa.Connection, vehicle: str, seq: int) -> int:
     return int(connection.execute(standing.values(gone_seq=seq)).rowcount)
 
 
-def next_seq(connection: sa.Connection) -> int:
-    """The number of the next event: safe, because writers take turns."""
-    return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one() or 0) + 1
+def newest_seq(connection: sa.Connection) -> int:
+    """Number of the newest event; 0 if there is none yet."""
+    return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one() or 0)
 
 
 def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
@@ -196,16 +189,6 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
         new = [(digest, planes[digest]) for digest in some if digest not in known]
         if new:
             insert_rows(connection, schema.blobs, new)
-
-
-def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, Tile]) -> None:
-    """Insert a version that sets ``tiles``; sqlalchemy's IntegrityError if its number is taken."""
-    connection.execute(schema.versions.insert().values(**version_row(version)))
-    packed = {}
-    for index, tile in tiles.items():
-        packed[index], planes = pack_tile(tile)
-        add_blobs(connection, planes)
-    set_tiles(connection, version.number, packed)
 
 
 def version_row(version: Version) -> dict[str, Any]:

@@ -29,7 +29,16 @@ from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Task, fuse_round
 from mapvote.server.store.publish import NewTiles, Outcome, write_version
-from mapvote.server.store.queries import Version, current_version, load_tile, memory_of, tile_of, tiles_of, version_of
+from mapvote.server.store.queries import (
+    Version,
+    current_version,
+    load_tile,
+    memory_of,
+    newest_seq,
+    tile_of,
+    tiles_of,
+    version_of,
+)
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import Electorate, ballots_aside, standing_tiles
 
@@ -109,7 +118,7 @@ def replay(
         b = schema.ballots
         heard = sa.select(b.c.vehicle, sa.func.min(b.c.first_seq)).where(b.c.vehicle.in_(out)).group_by(b.c.vehicle)
         first = {row[0]: row[1] for row in connection.execute(heard)}
-        mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+        mark = newest_seq(connection)
     if vehicle not in first:
         raise NotFound(f"{vehicle!r} never voted here")
     touched = next((v for v in history if v.kind == "publish" and v.mark >= min(first.values())), None)

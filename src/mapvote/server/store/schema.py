@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-from mapvote.server.store.database import sum_over
+from mapvote.server.store.database import sum_but
 
 metadata = sa.MetaData(
     naming_convention={
@@ -33,7 +33,7 @@ maps = sa.Table(
     sa.Column("georeference", sa.JSON, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),
     sa.Column("surveyed_ns", sa.BigInteger),
-    sum_over("map_id", "georeference", "secret", "surveyed_ns"),
+    sum_but("x0", "y0"),
 )
 """``secret``: the key of vehicles' pseudonyms; it never leaves the store. ``surveyed_ns``: end of the last drive of
 which the first version was made; null if unknown."""
@@ -43,7 +43,7 @@ policies = sa.Table(
     metadata,
     sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), primary_key=True, autoincrement=False),
     sa.Column("policy", sa.JSON, nullable=False),
-    sum_over("seq", "policy"),
+    sum_but(),
 )
 """One row a change; the event says who made it, when and why. The newest one holds."""
 
@@ -56,7 +56,7 @@ keys = sa.Table(
     sa.Column("created_ns", sa.BigInteger, nullable=False),
     sa.Column("revoked_ns", sa.BigInteger),
     sa.Column("expires_ns", sa.BigInteger),
-    sum_over("name", "role", "hash", "created_ns"),
+    sum_but("revoked_ns", "expires_ns"),
     sa.UniqueConstraint("hash"),
 )
 """``role``: vehicle, reader, reviewer or operator; only the hash of a key is kept. ``expires_ns``: null for never."""
@@ -69,7 +69,7 @@ events = sa.Table(
     sa.Column("kind", sa.String(16), nullable=False),
     sa.Column("actor", sa.String(80), nullable=False),
     sa.Column("detail", sa.String(400), nullable=False),
-    sum_over("seq", "at_ns", "kind", "actor", "detail"),
+    sum_but(),
 )
 """The log, and the one order of everything: writers take turns, so ``seq`` grows in the order of commits."""
 
@@ -94,7 +94,7 @@ versions = sa.Table(
     sa.Column("mark", sa.BigInteger, nullable=False),
     sa.Column("policy", sa.JSON, nullable=False),
     sa.Column("cleared_seq", sa.BigInteger),
-    sum_over("number", "parent", "kind", "target", "created_ns", "published_by", "reason", "mark", "policy"),
+    sum_but("cleared_seq"),
 )
 """``mark``: the last event that the version knew of. ``target``: the version that a rollback or replay starts from.
 ``cleared_seq``: the event by which its planes and decisions were cleared away; what is left is that it was."""
@@ -105,11 +105,7 @@ version_tiles = sa.Table(
     sa.Column("version", sa.Integer, sa.ForeignKey("versions.number"), primary_key=True),
     sa.Column("row", sa.Integer, primary_key=True),
     sa.Column("col", sa.Integer, primary_key=True),
-    sa.Column("points", _Hash),
-    sa.Column("ground", _Hash),
-    sa.Column("free", _Hash),
-    sa.Column("memory", _Hash),
-    sa.Column("fields", _Hash),
+    *(sa.Column(plane, _Hash) for plane in TILE_PLANES),
     sa.Index("ix_version_tiles_tile", "row", "col", "version"),
 )
 """Only tiles that the version sets; every other tile is that of its parent. Null points: the version has no such tile.
@@ -132,19 +128,7 @@ ballots = sa.Table(
     sa.Column("cast_by", sa.String(32), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
-    sum_over(
-        "seq",
-        "first_seq",
-        "vehicle",
-        "drive",
-        "digest",
-        "start_ns",
-        "end_ns",
-        "received_ns",
-        "settings_hash",
-        "cast_by",
-        "version",
-    ),
+    sum_but("gone_seq", "bytes"),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
     sa.Index("ix_ballots_gone_seq", "gone_seq"),
 )
@@ -159,14 +143,8 @@ ballot_tiles = sa.Table(
     sa.Column("col", sa.Integer, primary_key=True),
     sa.Column("ballot", sa.BigInteger, sa.ForeignKey("ballots.seq"), primary_key=True),
     sa.Column("base", sa.String(64), nullable=False),
-    sa.Column("states", sa.LargeBinary),
-    sa.Column("tally", sa.LargeBinary),
-    sa.Column("gone", sa.LargeBinary),
-    sa.Column("new_points", sa.LargeBinary),
-    sa.Column("free", sa.LargeBinary),
-    sa.Column("intensity", sa.LargeBinary),
-    sa.Column("odds", sa.LargeBinary),
-    sum_over("base", *BALLOT_PLANES),
+    *(sa.Column(plane, sa.LargeBinary) for plane in BALLOT_PLANES),
+    sum_but("row", "col", "ballot"),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
 """Two rows of the same sum say the same."""
@@ -176,7 +154,7 @@ paths = sa.Table(
     metadata,
     sa.Column("ballot", sa.BigInteger, sa.ForeignKey("ballots.seq"), primary_key=True, autoincrement=False),
     sa.Column("path", sa.LargeBinary, nullable=False),
-    sum_over("ballot", "path"),
+    sum_but(),
 )
 """Paths of vehicles, for ballots that contain one (:func:`mapvote.codec.ballot.pack_path`)."""
 
@@ -193,7 +171,7 @@ decisions = sa.Table(
     sa.Column("deleted", sa.Integer, nullable=False),
     sa.Column("odds", sa.LargeBinary),
     sa.Column("standings", sa.LargeBinary, nullable=False),
-    sum_over("states", "tally", "odds", "standings"),
+    sum_but("version", "row", "col", "vehicles", "added", "deleted"),
 )
 """The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: log-odds of the changed
 cells by the vehicles that voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: no vehicle sent
@@ -207,7 +185,7 @@ reviews = sa.Table(
     sa.Column("verdict", sa.String(16), nullable=False),
     sa.Column("comment", sa.String(400), nullable=False),
     sa.Column("feature", sa.JSON, nullable=False),
-    sum_over("seq", "verdict", "comment", "feature"),
+    sum_but("gone_seq"),
 )
 """Verdicts of reviewers. ``feature``: the change as they saw it; ``gone_seq``: the event that undid the verdict."""
 
@@ -218,7 +196,7 @@ review_cells = sa.Table(
     sa.Column("col", sa.Integer, primary_key=True),
     sa.Column("review", sa.BigInteger, sa.ForeignKey("reviews.seq"), primary_key=True),
     sa.Column("cells", sa.LargeBinary, nullable=False),
-    sum_over("row", "col", "review", "cells"),
+    sum_but(),
 )
 """The cells (65536 packed bits) of a reviewed change. Change votes on them do not count: for a rejected change votes of
 drives that first arrived before the rejection, for a held one all votes until the hold ends."""

@@ -17,8 +17,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Id, tile_key
+from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import DIGESTS, Manifest, TileHashes, digests_of, shown
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import LazyTiles, PointMap, is_small
 from mapvote.core.tile import Tile
@@ -26,24 +27,23 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.database import Database
-from mapvote.server.store.policy import Policy, PolicyChange, changed, changes_of, policy_in, write_policy
+from mapvote.server.store.policy import Policy, PolicyChange, changed, policy_in, write_policy
 from mapvote.server.store.queries import (
     VERSION_COLUMNS,
     Version,
     add_blobs,
-    add_version,
     current_number,
     load_blob,
     load_tile,
     log_event,
     points_of,
+    set_tiles,
     tile_of,
     tiles_of,
     tiles_set_between,
     version_of,
+    version_row,
 )
-
-__all__ = ["Id", "Store", "Version", "add_blobs", "log_event", "url_of"]
 
 
 def _digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
@@ -112,7 +112,12 @@ class Store:
                 now = clock()
                 mark = log_event(connection, now, "import", by, point_map.map_id)
                 version = Version(point_map.version or 1, None, "import", None, now, by, "first map", mark, {})
-                add_version(connection, version, point_map.tiles)
+                connection.execute(schema.versions.insert().values(**version_row(version)))
+                packed = {}
+                for index, tile in point_map.tiles.items():
+                    packed[index], planes = pack_tile(tile)
+                    add_blobs(connection, planes)
+                set_tiles(connection, version.number, packed)
                 write_policy(connection, policy or Policy(), now, by, "a new store")
         except BaseException:
             database.close()
@@ -143,8 +148,11 @@ class Store:
 
     def policy_changes(self) -> list[PolicyChange]:
         """Every change of the policy, oldest first."""
+        p, e = schema.policies, schema.events
+        rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
         with self.database.reading() as connection:
-            return changes_of(connection)
+            found = connection.execute(rows.order_by(p.c.seq)).all()
+        return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]
 
     def set_policy(self, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
         """Let another policy hold from now on; the number of the event."""

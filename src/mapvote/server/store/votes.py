@@ -132,7 +132,7 @@ class Polled:
 
 
 def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
-    """All that :func:`counted_votes` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
+    """All that :func:`judged_on` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
     then."""
     standing, bars = _standing_on(connection, row, cols, asked.mark), defaultdict[TileIndex, list[Any]](list)
     reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
@@ -211,16 +211,6 @@ def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> Why:
     return "young" if vote.received_ns > asked.received_by_ns else ""
 
 
-def counting_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[TileVote]:
-    """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent."""
-    return [vote for _, vote in counted_votes(connection, tile, asked)]
-
-
-def counted_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[tuple[StoredVote, TileVote]]:
-    """:func:`counting_votes`, each with its ballot."""
-    return [(one.stored, one.vote) for one in judged_on(connection, tile, asked) if one.vote is not None]
-
-
 @dataclass(frozen=True, slots=True)
 class Judged:
     """One standing vote on a tile, and what becomes of it before the votes are compared with each other."""
@@ -287,8 +277,8 @@ def recent_votes(
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
 ) -> list[TileVote]:
-    """As :func:`counting_votes`, of every vehicle and of the last :func:`history_days`: what has come and gone
-    here, and since when?"""
+    """The votes that count on ``tile``, in the cells where they are not spent, of every vehicle and of the last
+    :func:`history_days`: what has come and gone here, and since when?"""
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
     judged = _judged(polled.standing[index], index, asked)
@@ -365,7 +355,11 @@ def read_votes(
     missing = [(index[1], vote) for vote in new.values() if (*index, vote.seq) not in known]
     rows = {**known, **read_rows(connection, index[0], missing)} if missing else known
     mine = [(vote, rows[*index, vote.seq]) for vote in new.values()]
-    _check(row for _, row in mine)
+    # Whoever is remembered is read too, or what is decided would follow from what this process happened to read before
+    # the disk lost it.
+    damaged = [ballot_name(vote.seq, *index) for vote, row in mine if not is_sound(_T, row)]
+    if damaged:
+        raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
     unpacked = remembered.get(row.sum for _, row in mine)
     for vote, row in mine:
         if row.sum not in unpacked:
@@ -374,14 +368,6 @@ def read_votes(
         planes = unpacked[row.sum]
         read[*index, vote.seq] = TileVote.of(planes, vote.vehicle, vote.end_ns, vote.digest, vote.version)
     return [read[*index, vote.seq] for vote in stored]
-
-
-def _check(rows: Iterable[Any]) -> None:
-    """DamagedBallots if some are not what their sums say. Whoever is remembered is read too, or what is decided would
-    follow from what this process happened to read before the disk lost it."""
-    damaged = [ballot_name(row.ballot, row.row, row.col) for row in rows if not is_sound(_T, row)]
-    if damaged:
-        raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:

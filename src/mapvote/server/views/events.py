@@ -13,7 +13,7 @@ import sqlalchemy as sa
 
 from mapvote.server.store import schema
 from mapvote.server.store.keys import hash_of
-from mapvote.server.store.queries import current_number
+from mapvote.server.store.queries import current_number, newest_seq
 from mapvote.server.store.store import Store
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
@@ -41,7 +41,7 @@ class Event:
 def newest_event(store: Store) -> int:
     """Number of the last event."""
     with store.database.reading() as connection:
-        return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one())
+        return newest_seq(connection)
 
 
 def taken_up_to(store: Store, address: str) -> int:
@@ -50,7 +50,7 @@ def taken_up_to(store: Store, address: str) -> int:
     with store.database.writing() as connection:
         taken = connection.execute(sa.select(d.c.seq).where(d.c.address == hash_of(address))).scalar_one_or_none()
         if taken is None:
-            taken = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+            taken = newest_seq(connection)
             connection.execute(d.insert().values(address=hash_of(address), seq=taken))
     return int(taken)
 
