@@ -115,8 +115,7 @@ def test_an_address_without_a_secret_and_a_secret_of_another_form_are_refused() 
 def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path, receiver: tuple[str, Posts]) -> None:
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
     settings = SimpleNamespace(server=ServerSettings(webhook_url=receiver[0], webhook_secret=SECRET))
-    threads = SimpleNamespace(fetching=None)
-    parts = cast("Services", SimpleNamespace(store=store, settings=settings, threads=threads, feed=Feed(store, 0.0)))
+    parts = cast("Services", SimpleNamespace(store=store, settings=settings, fetching=None, feed=Feed(store, 0.0)))
 
     async def listen(posts: int) -> list[str]:
         task = asyncio.create_task(deliver(parts))

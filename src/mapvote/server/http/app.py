@@ -17,30 +17,16 @@ from fastapi.exceptions import RequestValidationError
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
-from mapvote.server.http import (
-    cloud_routes,
-    desk_routes,
-    event_routes,
-    operator_routes,
-    pages,
-    vehicle_routes,
-)
+from mapvote.server.http import desk_routes, event_routes, operator_routes, page_routes, vehicle_routes
 from mapvote.server.http.event_routes import deliver
 from mapvote.server.http.schemas import unreadable, unusable
 from mapvote.server.http.security import Guard, Hosts, Probe, Watch
-from mapvote.server.http.services import READING, Services, make_services
+from mapvote.server.http.services import READING, Services
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
 _EVERY_S = 2.0
-ROUTES = (
-    vehicle_routes,
-    operator_routes,
-    desk_routes,
-    cloud_routes,
-    event_routes,
-    pages,
-)
+ROUTES = vehicle_routes, operator_routes, desk_routes, event_routes, page_routes
 
 
 def create_app(
@@ -59,7 +45,7 @@ def create_app(
     (:func:`mapvote.server.http.app.in_process`).
     ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``: where tiles are fused, two threads by default.
     """
-    parts = make_services(store, settings or Settings(), gate, executor, limited=owner is None)
+    parts = Services(store, settings or Settings(), gate, executor, limited=owner is None)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -88,7 +74,7 @@ def create_app(
         app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
     app.add_exception_handler(RequestValidationError, unusable)
-    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened, owner=owner)
+    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.lookups, opened=opened, owner=owner)
     probe = Probe(parts.check_ready)
     app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)
     return app
@@ -109,7 +95,7 @@ async def keep_overview(parts: Services) -> None:
 async def _make(parts: Services, version: int) -> None:
     try:
         make, stop = parts.clouds.overview, parts.stopping.is_set
-        await to_thread.run_sync(make, version, stop, limiter=parts.threads.fetching)
+        await to_thread.run_sync(make, version, stop, limiter=parts.fetching)
     except Unavailable:
         raise
     except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request, Response
@@ -12,10 +11,20 @@ from pydantic import Field
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
-from mapvote.server.http.answers import DeskAnswer, Pending, VerdictGiven
-from mapvote.server.http.cloud_routes import AS_BYTES, packed
-from mapvote.server.http.schemas import AS_CSV, PLAIN, Ask, Places, as_json, as_table, problems
-from mapvote.server.http.services import reviewer, services
+from mapvote.server.http.page_routes import AS_BYTES, packed
+from mapvote.server.http.schemas import (
+    AS_CSV,
+    PLAIN,
+    Ask,
+    DeskAnswer,
+    Pending,
+    TableOrMap,
+    VerdictGiven,
+    as_json,
+    as_table,
+    problems,
+)
+from mapvote.server.http.services import Parts, Reviewer, Services
 from mapvote.server.store.reviews import undo
 from mapvote.server.views.desk import Desk, desk, review, verdict_of
 from mapvote.server.views.geojson import feature_rows
@@ -38,14 +47,14 @@ class ReviewAsk(Ask):
     responses=problems(403) | AS_CSV,
     summary="What a publish would change now",
 )
-async def whole_desk(request: Request, format: Places = "json") -> Response:
+async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
     """Pending changes as GeoJSON with their verdicts; deletions beyond the policy's budget; held and rejected changes;
     the reasons to hold the version; the hashes of the tiles that a publish would make (null: without points), which
     `/v1/clouds` serves meanwhile.
 
     As ``geojson`` or ``csv``: all of them in one list.
     """
-    found = await _look(request)
+    found = await _look(parts)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
         answer = {"version": found.version, "held": found.held, "pending": found.pending}
@@ -61,20 +70,17 @@ async def whole_desk(request: Request, format: Places = "json") -> Response:
     response_class=Response,
     summary="Points that a publish would add and delete",
 )
-async def pending_clouds(request: Request) -> Response:
+async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Response:
     """Tile by tile, two clouds each, as `/v1/clouds/changed` gives them."""
-    found = await _look(request)
-    return packed(request, found.clouds, "no-store")
+    return packed(request, (await _look(parts)).clouds, "no-store")
 
 
 def _hashes(hashes: TileHashes, tile: Tile) -> dict[str, str] | None:
     return {"points": hashes.points, "ground": hashes.ground} if len(tile.points) else None
 
 
-async def _look(request: Request) -> Desk:
+async def _look(parts: Services) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
-    reviewer(request)
-    parts = services(request)
     found = await parts.decide(desk, parts.store, parts.fusing, parts.gate)
     parts.clouds.propose(found.edited.values())
     return found
@@ -87,19 +93,19 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
-async def decide(request: Request, ask: ReviewAsk) -> VerdictGiven:
+async def decide(by: Reviewer, parts: Parts, ask: ReviewAsk) -> VerdictGiven:
     """A publish obeys it: the votes of a rejected change do not count any more, those of a held one wait.
 
     409 if another reviewer decided meanwhile.
     """
-    by, parts = reviewer(request), services(request)
     given = parts.store, ask.change, ask.verdict
-    said = partial(review, *given, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
-    return VerdictGiven(seq=await parts.decide(said))
+    return VerdictGiven(
+        seq=await parts.decide(review, *given, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
+    )
 
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
-def take_back(request: Request, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> VerdictGiven:
+def take_back(by: Reviewer, parts: Parts, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> VerdictGiven:
     """The change is pending again."""
-    undo(services(request).store, seq, by=reviewer(request))
+    undo(parts.store, seq, by=by)
     return VerdictGiven(seq=seq)

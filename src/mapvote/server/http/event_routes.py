@@ -20,7 +20,7 @@ from standardwebhooks import Webhook
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.schemas import problems
-from mapvote.server.http.services import Services, sees_names, services
+from mapvote.server.http.services import Known, Parts, Services
 from mapvote.server.views.events import Event, newest_event, take, taken_up_to, without_names
 
 _EVERY_S = 1.0
@@ -37,6 +37,8 @@ router = APIRouter()
 )
 async def listen(
     request: Request,
+    parts: Parts,
+    named: Known,
     after: Annotated[int | None, Query(ge=0, le=_MOST)] = None,
     last_event_id: Annotated[int | None, Header(ge=0, le=_MOST)] = None,
 ) -> StreamingResponse:
@@ -45,10 +47,9 @@ async def listen(
     ``after`` (or ``Last-Event-ID``, which browsers send): the events after that number; else those to come. Events of
     ballots, and the names in all others, go to reviewers and operators only.
     """
-    parts, named = services(request), sees_names(request)
     start = last_event_id if last_event_id is not None else after
     if start is None:
-        start = await to_thread.run_sync(newest_event, parts.store, limiter=parts.threads.fetching)
+        start = await to_thread.run_sync(newest_event, parts.store, limiter=parts.fetching)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(_stream(request, parts, start, named), media_type="text/event-stream", headers=headers)
 
@@ -57,7 +58,7 @@ async def _stream(request: Request, parts: Services, seq: int, named: bool) -> A
     yield b": listening\n\n"
     silent = 0.0
     while not parts.stopping.is_set() and not await request.is_disconnected():
-        found = await to_thread.run_sync(parts.feed.after, seq, limiter=parts.threads.fetching)
+        found = await to_thread.run_sync(parts.feed.after, seq, limiter=parts.fetching)
         for event in found if named else without_names(found):
             yield as_sse(event)
         if found:
@@ -98,7 +99,7 @@ async def deliver(parts: Services) -> None:
     A post that is not answered by 2xx is repeated, after one second, then two, four, at most sixty; none overtakes it.
     """
     asked = parts.settings.server
-    ask = partial(to_thread.run_sync, limiter=parts.threads.fetching)
+    ask = partial(to_thread.run_sync, limiter=parts.fetching)
     seq = noted = await ask(taken_up_to, parts.store, asked.webhook_url)
     wait = _EVERY_S
     async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:

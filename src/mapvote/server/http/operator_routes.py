@@ -15,45 +15,43 @@ from prometheus_client import generate_latest
 from mapvote.codec.ballot import tile_key
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Held, Unavailable
-from mapvote.server.http.answers import (
+from mapvote.server.http.schemas import (
+    AS_CSV,
     Cancelled,
     Changes,
     Checked,
     Coverage,
+    Digest,
+    From,
     Health,
     Info,
+    IssueAsk,
     KeyIssued,
     KeysAnswer,
     KeysRevoked,
     Log,
-    Published,
-    Publishes,
-    Ready,
-    Restored,
-    RolledBack,
-    Vehicles,
-    Withdrawn,
-)
-from mapvote.server.http.answers import Places as PlacesAnswer
-from mapvote.server.http.schemas import (
-    AS_CSV,
-    Digest,
-    From,
-    IssueAsk,
     MinCells,
     Newest,
     Places,
     PolicyAsk,
     PublishAsk,
+    Published,
+    Publishes,
+    Ready,
     ReplayAsk,
+    Restored,
     RevokeAsk,
     RollbackAsk,
+    RolledBack,
     RotateAsk,
+    TableOrMap,
+    Vehicles,
+    Withdrawn,
     as_json,
     as_table,
     problems,
 )
-from mapvote.server.http.services import Services, operator, reviewer, sees_names, services
+from mapvote.server.http.services import Known, Operator, Parts, Reviewer, Services
 from mapvote.server.store import keys
 from mapvote.server.store.integrity import check, restore_plane, set_aside
 from mapvote.server.store.policy import PolicyChange
@@ -65,8 +63,8 @@ from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
 from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
-from mapvote.server.views.explain import CellStory, explain_cell, seen
-from mapvote.server.views.geojson import feature_rows, tile_squares, utc
+from mapvote.server.views.explain import CellStory, explain_cell
+from mapvote.server.views.geojson import feature_rows, tile_squares
 from mapvote.server.views.history import changes_between, log_of, overview, page_between
 
 _MOST_EVIDENCE = 50
@@ -74,23 +72,23 @@ router = APIRouter()
 
 
 @router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
-async def publish_now(request: Request, ask: PublishAsk) -> Published:
+async def publish_now(by: Operator, parts: Parts, ask: PublishAsk) -> Published:
     """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
-    by, parts = operator(request), services(request)
     return await parts.decide(_publish, parts, ask, by)
 
 
-@router.get("/v1/publish", responses=problems(403), summary="How far a publish is")
-async def publishing_now(request: Request) -> Publishes:
+@router.get("/v1/publish", response_model=Publishes, responses=problems(403), summary="How far a publish is")
+async def publishing_now(by: Reviewer, parts: Parts) -> Response:
     """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
-    reviewer(request)
-    return Publishes(running=services(request).publishing.now())
+    return as_json({"running": parts.publishing.now()})
 
 
-@router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
-async def cancel_publishing(request: Request) -> Cancelled:
+@router.delete(
+    "/v1/publish", response_model=Cancelled, responses=problems(403, 404), summary="Cancel what is being published"
+)
+async def cancel_publishing(by: Operator, parts: Parts) -> Response:
     """Every publish under way ends before its next tiles with 409; no part of it is published."""
-    return Cancelled(cancelled=services(request).publishing.cancel(operator(request)))
+    return as_json({"cancelled": parts.publishing.cancel(by)})
 
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
@@ -128,12 +126,13 @@ def _as_answer(done: Outcome) -> Published:
     )
 
 
-@router.post("/v1/rollback", responses=problems(403, 404, 409), summary="Go back to an older version")
-async def roll_back(request: Request, ask: RollbackAsk) -> RolledBack:
+@router.post(
+    "/v1/rollback", response_model=RolledBack, responses=problems(403, 404, 409), summary="Go back to an older version"
+)
+async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
-    by, parts = operator(request), services(request)
     version = await parts.decide(rollback, parts.store, ask.to, by=by, reason=ask.reason)
-    return RolledBack(version=version.number)
+    return as_json({"version": version.number})
 
 
 @router.get(
@@ -143,7 +142,8 @@ async def roll_back(request: Request, ask: RollbackAsk) -> RolledBack:
     summary="What changed, as GeoJSON in map metres or as CSV",
 )
 def changes(
-    request: Request,
+    parts: Parts,
+    known: Known,
     old: From,
     new: Newest = None,
     min_cells: MinCells = 1,
@@ -151,12 +151,9 @@ def changes(
     format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
     """Things built and demolished between two versions; ``to`` is the newest by default."""
-    store, known = services(request).store, sees_names(request)
-    newest = store.current() if new is None else new
-    found = changes_between(store, old, newest, min_cells, lonlat=lonlat, known=known)
-    if format == "csv":
-        return as_table(feature_rows(found))
-    return as_json(found)
+    newest = parts.store.current() if new is None else new
+    found = changes_between(parts.store, old, newest, min_cells, lonlat=lonlat, known=known)
+    return as_table(feature_rows(found)) if format == "csv" else as_json(found)
 
 
 @router.get(
@@ -165,14 +162,9 @@ def changes(
     responses=problems(404) | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
     summary="What changed, as a page that needs no server",
 )
-def changes_page(
-    request: Request,
-    old: From,
-    new: Newest = None,
-    min_cells: MinCells = 1,
-) -> Response:
+def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_cells: MinCells = 1) -> Response:
     """A file to keep or to mail: the clouds of the largest changes, before and after."""
-    store, known = services(request).store, sees_names(request)
+    store = parts.store
     newest = store.current() if new is None else new
     page = page_between(store, old, newest, changes_between(store, old, newest, min_cells, known=known))
     kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
@@ -180,47 +172,40 @@ def changes_page(
 
 
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
-def cell(request: Request, x: float, y: float) -> Response:
+def cell(parts: Parts, known: Known, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
-    return as_json(explain_cell(services(request).store, x, y, known=sees_names(request)))
+    return as_json(explain_cell(parts.store, x, y, known=known))
 
 
 @router.get(
     "/v1/coverage",
-    response_model=Coverage | PlacesAnswer,
+    response_model=Coverage | Places,
     responses=problems() | AS_CSV,
     summary="Freshness of every tile",
 )
-def fresh(request: Request, format: Places = "json") -> Response:
+def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
-    store = services(request).store
-    tiles, known = tiles_seen(store), sees_names(request)
-    answer = [
-        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": utc(seen(t["last_seen_ns"], known))}
-        for t in tiles
-    ]
+    answer = tiles_seen(parts.store, known)
     if format == "csv":
         return as_table(answer)
-    return as_json(tile_squares(answer, store.lattice) if format == "geojson" else {"tiles": answer})
+    return as_json(tile_squares(answer, parts.store.lattice) if format == "geojson" else {"tiles": answer})
 
 
-@router.get("/v1/coverage/passes", response_model=PlacesAnswer, responses=problems(403), summary="Where to drive next")
-def passes(request: Request) -> Response:
+@router.get("/v1/coverage/passes", response_model=Places, responses=problems(403), summary="Where to drive next")
+def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
-    reviewer(request)
-    return as_json(as_features(wanted_passes(services(request).store)))
+    return as_json(as_features(wanted_passes(parts.store)))
 
 
 @router.get(
     "/v1/vehicles",
-    response_model=Vehicles | PlacesAnswer,
+    response_model=Vehicles | Places,
     responses=problems(403) | AS_CSV,
     summary="Vehicles that contradict the others",
 )
-def vehicles(request: Request, format: Places = "json") -> Response:
+def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
     """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
-    reviewer(request)
-    found = vehicle_standings(services(request).store)
+    found = vehicle_standings(parts.store)
     if format == "csv":
         return as_table(standing_rows(found))
     if format == "geojson":
@@ -251,70 +236,60 @@ def _unless_stopping(parts: Services) -> Iterator[None]:
 
 
 @router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
-def policy(request: Request) -> Response:
+def policy(parts: Parts) -> Response:
     """The policy in force, who set it and why."""
-    return as_json(services(request).store.policy_changes()[-1])
+    return as_json(parts.store.policy_changes()[-1])
 
 
 @router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
-def change_policy(request: Request, ask: PolicyAsk) -> Response:
+def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
-    by, store = operator(request), services(request).store
-    store.change_policy(ask.values, by=by, reason=ask.reason)
-    return as_json(store.policy_changes()[-1])
+    parts.store.change_policy(ask.values, by=by, reason=ask.reason)
+    return policy(parts)
 
 
 @router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
-def info(request: Request) -> Response:
+def info(parts: Parts) -> Response:
     """The map, its newest version, and how much there is of everything."""
-    return as_json(overview(services(request).store))
+    return as_json(overview(parts.store))
 
 
 @router.get("/v1/log", response_model=Log, responses=problems(403), summary="What happened")
-def log(request: Request, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
+def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
     """Every version, and the last so many events."""
-    reviewer(request)
-    return as_json(log_of(services(request).store, events))
+    return as_json(log_of(parts.store, events))
 
 
 @router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
-async def whole(request: Request) -> Response:
+async def whole(by: Operator, parts: Parts) -> Response:
     """Reads the whole store and names what is damaged. Nothing is changed."""
-    operator(request)
-    parts = services(request)
-    found = await parts.decide(check, parts.store)
-    return as_json({"damage": found})
+    return as_json({"damage": await parts.decide(check, parts.store)})
 
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
-async def mend(request: Request) -> Response:
+async def mend(by: Operator, parts: Parts) -> Response:
     """As GET; damaged items are also quarantined."""
-    by, parts = operator(request), services(request)
-    found = await parts.decide(check, parts.store, mend=True, by=by)
-    return as_json({"damage": found})
+    return as_json({"damage": await parts.decide(check, parts.store, mend=True, by=by)})
 
 
 @router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
-async def restore(request: Request, digest: Digest) -> Restored:
+async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
-    by, parts = operator(request), services(request)
     raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
     return Restored(restored=await parts.decide(restore_plane, parts.store, digest, raw, by=by))
 
 
 @router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
-async def begin_anew(request: Request, everybody: bool) -> Withdrawn:
+async def begin_anew(by: Operator, parts: Parts, everybody: bool) -> Withdrawn:
     """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
-    by, parts = operator(request), services(request)
     if not everybody:
         raise MapvoteError("name a vehicle in the path, or say everybody=true")
     return Withdrawn(withdrawn=await parts.decide(withdraw, parts.store, None, by=by))
 
 
 @router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
-async def replay_without(request: Request, ask: ReplayAsk) -> Published:
+async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Published:
     """Every version again without its votes; the difference to the newest is one new version."""
-    by, parts = operator(request), services(request)
     return await parts.decide(_replay, parts, ask, by)
 
 
@@ -324,51 +299,43 @@ def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
 
 
 @router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
-async def clearable(request: Request) -> Response:
+async def clearable(by: Operator, parts: Parts) -> Response:
     """Old versions and ballots that POST would delete."""
-    operator(request)
-    parts = services(request)
     return as_json(await parts.decide(clear, parts.store, dry_run=True))
 
 
 @router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
-async def clear_now(request: Request) -> Response:
+async def clear_now(by: Operator, parts: Parts) -> Response:
     """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
-    by, parts = operator(request), services(request)
     return as_json(await parts.decide(clear, parts.store, dry_run=False, by=by))
 
 
 @router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
-def listed_keys(request: Request) -> Response:
+def listed_keys(by: Operator, parts: Parts) -> Response:
     """All keys ever issued, revoked and expired ones too."""
-    operator(request)
-    store = services(request).store
-    standing, now = keys.ballots_standing(store), store.clock()
-    listed = [
-        asdict(key) | {"valid": key.valid_at(now), "ballots": standing.get(key.name, 0)} for key in keys.listed(store)
-    ]
-    return as_json({"keys": listed})
+    standing, now = keys.ballots_standing(parts.store), parts.store.clock()
+    listed = keys.listed(parts.store)
+    told = [asdict(key) | {"valid": key.valid_at(now), "ballots": standing.get(key.name, 0)} for key in listed]
+    return as_json({"keys": told})
 
 
-@router.post("/v1/keys", responses=problems(403), summary="Issue a key")
-def issue_key(request: Request, ask: IssueAsk) -> KeyIssued:
+@router.post("/v1/keys", response_model=KeyIssued, responses=problems(403), summary="Issue a key")
+def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
     """The answer is the only place where the key is ever seen: the store keeps its hash."""
-    by, role = operator(request), cast("keys.Role", ask.role)
-    return KeyIssued(key=keys.issue(services(request).store, ask.name, role, by=by, days=ask.days))
+    role = cast("keys.Role", ask.role)
+    return as_json({"key": keys.issue(parts.store, ask.name, role, by=by, days=ask.days)})
 
 
-@router.post("/v1/keys/rotate", responses=problems(403, 404), summary="Replace a key")
-def rotate_key(request: Request, ask: RotateAsk) -> KeyIssued:
+@router.post("/v1/keys/rotate", response_model=KeyIssued, responses=problems(403, 404), summary="Replace a key")
+def rotate_key(by: Operator, parts: Parts, ask: RotateAsk) -> Response:
     """A new key of the same role and length for who has a valid one."""
-    by = operator(request)
-    return KeyIssued(key=keys.rotate(services(request).store, ask.name, by=by, overlap_days=ask.overlap_days))
+    return as_json({"key": keys.rotate(parts.store, ask.name, by=by, overlap_days=ask.overlap_days)})
 
 
 @router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
-def revoke_keys(request: Request, ask: RevokeAsk) -> KeysRevoked:
+def revoke_keys(by: Operator, parts: Parts, ask: RevokeAsk) -> KeysRevoked:
     """Its standing ballots count no more, unless ``keep_votes``."""
-    by, store = operator(request), services(request).store
-    revoked, ballots = keys.revoke(store, ask.name, by=by, keep_votes=ask.keep_votes)
+    revoked, ballots = keys.revoke(parts.store, ask.name, by=by, keep_votes=ask.keep_votes)
     return KeysRevoked(revoked=revoked, ballots=ballots)
 
 
@@ -389,26 +356,24 @@ async def live() -> Response:
 
 
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
-async def health(request: Request) -> Health:
+async def health(parts: Parts) -> Health:
     """200 with the newest version, 503 if the database does not answer."""
-    return Health(status="ok", version=await services(request).newest.put(None))
+    return Health(status="ok", version=await parts.newest.put(None))
 
 
 @router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
-async def ready(request: Request) -> Ready:
+async def ready(parts: Parts) -> Ready:
     """200 if the database can be written now; 503 with its error if not, or if the server is stopping.
 
     ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
     """
-    parts = services(request)
     version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
     return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
 
 
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
-async def metrics(request: Request) -> Response:
+async def metrics(parts: Parts) -> Response:
     """Counters, latencies, the newest version."""
-    parts = services(request)
     parts.metrics.version.set(await parts.newest.put(None))
     parts.metrics.tell_damaged(await parts.look_up(_damaged))
     return Response(generate_latest(parts.metrics.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -247,9 +247,8 @@ class Watch:
         finally:
             seconds = time.perf_counter() - start
             method = scope["method"]
-            counted = self._metrics.of(method, status)
-            counted.requests.inc()
-            counted.seconds.observe(seconds)
+            self._metrics.requests.labels(method, status).inc()
+            self._metrics.seconds.labels(method).observe(seconds)
             tell = log.warning if status >= 500 else log.info
             name = key.name if key else "-"
             tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))

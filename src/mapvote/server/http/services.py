@@ -11,13 +11,13 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from threading import Event, Lock
-from typing import Generic, NamedTuple, ParamSpec, TypeVar
+from typing import Annotated, Generic, NamedTuple, ParamSpec, TypeVar
 
 import msgspec
 from anyio import CapacityLimiter, to_thread
-from fastapi import Request
+from fastapi import Depends, Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.requests import ClientDisconnect
 
@@ -41,23 +41,6 @@ Given = ParamSpec("Given")
 READING = 1
 """Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
 that answer vehicles."""
-
-
-@dataclass(frozen=True, slots=True)
-class Threads:
-    """Each kind of work has its own threads, so that none blocks another.
-
-    All other work runs in FastAPI's own pool of :data:`READING` threads: what operators read.
-    """
-
-    ballots: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3, "ballots"))
-    lookups: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "lookups"))
-    """Keys, the newest version, health: short questions before every answer."""
-    fuse: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "fuse"))
-    fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
-    """Manifests and tiles."""
-    deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
-    """Threads for slow requests, which fuse tiles or read the whole store: publish, desk, check. Others do not wait."""
 
 
 class RateLimit:
@@ -222,23 +205,12 @@ class Metrics:
         self.publish_seconds = histogram("mapvote_publish_seconds", "Time to publish", buckets=(0.1, 1, 10, 60, 600))
         self.version = Gauge("mapvote_version", "Newest version", registry=self.registry)
         self.quarantined = Gauge("mapvote_quarantined", "Damaged, and set aside", ["kind"], registry=self.registry)
-        self.of = lru_cache(maxsize=256)(self._of)
 
     def tell_damaged(self, found: Sequence[str]) -> None:
         """``found``: "kind name: why"."""
         counts = TallyOf(text.partition(" ")[0] for text in found)
         for kind in KINDS:
             self.quarantined.labels(kind).set(counts[kind])
-
-    def _of(self, method: str, status: int) -> Counted:
-        return Counted(self.requests.labels(method, status), self.seconds.labels(method))
-
-
-class Counted(NamedTuple):
-    """The counters of one kind of request."""
-
-    requests: Counter
-    seconds: Histogram
 
 
 _KEPT = 16
@@ -260,10 +232,6 @@ class Manifests:
         self._store = store
         self._lock = Lock()
         self._made: dict[tuple[int, int | None], Made] = {}
-
-    def newest(self, asked: Sequence[None]) -> list[int]:
-        """The newest version's number, for each of a batch of requests by one query."""
-        return [self._store.current()] * len(asked)
 
     def ready(self, number: int, since: int | None) -> Made | None:
         """A manifest that was made before."""
@@ -344,34 +312,42 @@ _READERS = 1024
 """Requests answered by one query of the newest version."""
 
 
-@dataclass(frozen=True, slots=True)
 class Services:
-    """The parts that live as long as the app; :func:`services` gives them to a route."""
+    """The parts that live as long as the app, on an open store; :func:`services` gives them to a route.
 
-    store: Store
-    settings: Settings
-    gate: Gate
-    """Compares a version with the one before, before it is published."""
-    fusing: Executor
-    """The executor that fuses tiles."""
-    threads: Threads
-    intake: Intake
-    writer: Batcher[Incoming, Receipt]
-    """Writes ballots, many in one transaction."""
-    newest: Batcher[None, int]
-    """The number of the newest version, read once for all requests that wait for it."""
-    manifests: Manifests
-    publishing: Publishing
-    """Rounds under way."""
-    clouds: Clouds
-    """Levels of detail for the page."""
-    feed: Feed
-    """Events, for all listeners."""
-    metrics: Metrics
-    limit: RateLimit
-    uploads: Uploads
-    stopping: Event = field(default_factory=Event)
-    """Set once the server stops."""
+    Each kind of work has its own threads, so that none blocks another. All other work runs in FastAPI's own pool of
+    :data:`READING` threads: what operators read. ``executor`` as in :func:`mapvote.server.http.app.create_app`.
+    ``limited``: whether the quotas of vehicles hold.
+    """
+
+    def __init__(
+        self, store: Store, settings: Settings, gate: Gate | None, executor: Executor | None, *, limited: bool = True
+    ) -> None:
+        most = settings.server
+        self.store, self.settings = store, settings
+        self.gate = gate or gate_by(settings.ndt)
+        """Compares a version with the one before, before it is published."""
+        self.receiving = ThreadPoolExecutor(3, "ballots")
+        self.lookups = ThreadPoolExecutor(2, "lookups")
+        """Keys, the newest version, health: short questions before every answer."""
+        self._fuse = ThreadPoolExecutor(2, "fuse")
+        self.fusing = executor or self._fuse
+        """The executor that fuses tiles."""
+        self.fetching = CapacityLimiter(4)
+        """Threads for manifests and tiles."""
+        self._deciding = CapacityLimiter(4)
+        quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
+        self.writer: Batcher[Incoming, Receipt] = Batcher(Intake(store, quota).write, _BATCH, self.receiving)
+        """Writes ballots, many in one transaction."""
+        self.newest: Batcher[None, int] = Batcher(lambda asked: [store.current()] * len(asked), _READERS, self.lookups)
+        """The number of the newest version, read once for all requests that wait for it."""
+        self.manifests = Manifests(store)
+        self.publishing = Publishing()
+        self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()
+        self.limit = RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute))
+        self.uploads = Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes)
+        self.stopping = Event()
+        """Set once the server stops."""
 
     async def check_ready(self) -> int:
         """The newest version, of a database that takes a writer now; Unavailable if it does not, or if the server is
@@ -382,21 +358,21 @@ class Services:
 
     async def look_up(self, ask: Callable[[Store], Answer]) -> Answer:
         """The result of a short question to the store, in the threads for lookups."""
-        return await asyncio.get_running_loop().run_in_executor(self.threads.lookups, ask, self.store)
+        return await asyncio.get_running_loop().run_in_executor(self.lookups, ask, self.store)
 
     async def decide(self, work: Callable[Given, Answer], *given: Given.args, **more: Given.kwargs) -> Answer:
-        """The result of slow work, in the threads for it."""
-        return await to_thread.run_sync(partial(work, *given, **more), limiter=self.threads.deciding)
+        """The result of slow work, which fuses tiles or reads the whole store, in the threads for it."""
+        return await to_thread.run_sync(partial(work, *given, **more), limiter=self._deciding)
 
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
         self.stopping.set()
-        self.threads.fuse.shutdown(wait=False, cancel_futures=True)
+        self._fuse.shutdown(wait=False, cancel_futures=True)
 
     async def close(self) -> None:
         """Wait until every accepted ballot is written."""
         await self.writer.close()
-        for pool in (self.threads.fuse, self.threads.ballots, self.threads.lookups):
+        for pool in (self._fuse, self.receiving, self.lookups):
             pool.shutdown(cancel_futures=True)
 
 
@@ -405,39 +381,14 @@ def _newest_if_writable(store: Store) -> int:
         return current_number(connection)
 
 
-def make_services(
-    store: Store, settings: Settings, gate: Gate | None, executor: Executor | None, *, limited: bool = True
-) -> Services:
-    """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`.
-
-    ``limited``: whether the quotas of vehicles hold.
-    """
-    manifests, threads, most = Manifests(store), Threads(), settings.server
-    quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
-    intake = Intake(store, quota)
-    return Services(
-        store=store,
-        settings=settings,
-        gate=gate or gate_by(settings.ndt),
-        fusing=executor or threads.fuse,
-        threads=threads,
-        intake=intake,
-        writer=Batcher(intake.write, _BATCH, threads.ballots),
-        newest=Batcher(manifests.newest, _READERS, threads.lookups),
-        manifests=manifests,
-        publishing=Publishing(),
-        clouds=Clouds(store),
-        feed=Feed(store),
-        metrics=Metrics(),
-        limit=RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute)),
-        uploads=Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes),
-    )
-
-
 def services(request: Request) -> Services:
     """The parts of the app of a request."""
     found: Services = request.app.state.services
     return found
+
+
+async def _parts(request: Request) -> Services:
+    return services(request)
 
 
 def own(request: Request, vehicle: str) -> str:
@@ -453,26 +404,35 @@ def own(request: Request, vehicle: str) -> str:
     return key.name
 
 
-def operator(request: Request) -> str:
+async def operator(request: Request) -> str:
     """The operator's name; Forbidden for other roles."""
-    return _one_of(request, "operator")
+    return name_of(request, "operator")
 
 
-def reviewer(request: Request) -> str:
+async def reviewer(request: Request) -> str:
     """The name of a reviewer or an operator; Forbidden for other roles."""
-    return _one_of(request, "reviewer", "operator")
+    return name_of(request, "reviewer", "operator")
 
 
-def sees_names(request: Request) -> bool:
+async def sees_names(request: Request) -> bool:
     """Whether the key permits the names of vehicles and exact times; others get pseudonyms and days."""
     key: keys.Key | None = request.state.key
     return key is None or key.role in ("reviewer", "operator")
 
 
-def _one_of(request: Request, *roles: keys.Role) -> str:
+def name_of(request: Request, *roles: keys.Role) -> str:
+    """The name on a key of one of these roles; Forbidden for others."""
     key: keys.Key | None = request.state.key
     if key is None:
         return "operator"
     if key.role not in roles:
         raise Forbidden(f"only an {roles[-1]} can do this" if len(roles) == 1 else f"only a {' or '.join(roles)} can")
     return key.name
+
+
+Parts = Annotated[Services, Depends(_parts)]
+"""Parameters of routes. Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
+Routes that hundreds of vehicles ask at once look for themselves, which is sooner done."""
+Operator = Annotated[str, Depends(operator)]
+Reviewer = Annotated[str, Depends(reviewer)]
+Known = Annotated[bool, Depends(sees_names)]

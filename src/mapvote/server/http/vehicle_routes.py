@@ -17,19 +17,21 @@ from fastapi.routing import APIRoute
 
 from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
-from mapvote.server.http.answers import ManifestAnswer, Versions, Withdrawn
 from mapvote.server.http.schemas import (
     AS_CSV,
     Digest,
+    ManifestAnswer,
     Name,
     Number,
     Table,
     VersionQuery,
+    Versions,
+    Withdrawn,
     as_json,
     as_table,
     problems,
 )
-from mapvote.server.http.services import own, services
+from mapvote.server.http.services import Parts, own, services
 from mapvote.server.store.admission import Receipt, examine
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.geojson import utc
@@ -50,10 +52,10 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
 
 
 @router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
-def versions(request: Request, format: Table = "json") -> Response:
+def versions(parts: Parts, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by."""
     listed = []
-    for v in services(request).store.versions():
+    for v in parts.store.versions():
         entry = {name: getattr(v, name) for name in ("number", "parent", "kind", "target", "published_by", "reason")}
         listed.append(entry | {"created": utc(v.created_ns), "policy": v.policy})
     if format == "csv":
@@ -87,7 +89,7 @@ async def plane(request: Request, digest: Digest) -> Response:
         "Vary": "Accept-Encoding",
     }
     parts = services(request)
-    data = await to_thread.run_sync(parts.store.blob, digest, limiter=parts.threads.fetching)
+    data = await to_thread.run_sync(parts.store.blob, digest, limiter=parts.fetching)
     if request.headers.get("if-none-match") == f'"{digest}"':
         return Response(status_code=304, headers=headers)
     if "zstd" in request.headers.get("accept-encoding", ""):
@@ -116,7 +118,7 @@ async def _manifest(request: Request, number: int | None, since: int | None) -> 
     number = await parts.newest.put(None) if number is None else number
     made = parts.manifests.ready(number, since)
     if made is None:
-        made = await to_thread.run_sync(parts.manifests.make, number, since, limiter=parts.threads.fetching)
+        made = await to_thread.run_sync(parts.manifests.make, number, since, limiter=parts.fetching)
     headers = {"ETag": made.tag, "Cache-Control": "private, no-cache"}
     if request.headers.get("if-none-match") == made.tag:
         return Response(status_code=304, headers=headers)
@@ -151,7 +153,7 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
     work = partial(examine, body, (vehicle, drive), request.state.key_hash)
-    incoming = await asyncio.get_running_loop().run_in_executor(parts.threads.ballots, work)
+    incoming = await asyncio.get_running_loop().run_in_executor(parts.receiving, work)
     receipt = await parts.writer.put(incoming)
     parts.metrics.ballots.labels(receipt.result).inc()
     created = receipt.result == "created"

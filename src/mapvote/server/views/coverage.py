@@ -17,7 +17,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
-from mapvote.server.views.explain import said_by, votes_by_tile
+from mapvote.server.views.explain import said_by, seen, votes_by_tile
 from mapvote.server.views.geojson import collection, utc
 
 
@@ -63,8 +63,9 @@ def as_features(wanted: list[Stretch]) -> dict[str, Any]:
     )
 
 
-def tiles_seen(store: Store) -> list[dict[str, Any]]:
-    """Per tile of the map or of a standing ballot: end of the last drive past it (ns), number of vehicles."""
+def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:
+    """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
+    ``known``, see :func:`mapvote.server.views.explain.seen`."""
     b, t = schema.ballots, schema.ballot_tiles
     last = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
     last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
@@ -74,7 +75,7 @@ def tiles_seen(store: Store) -> list[dict[str, Any]]:
         )
         tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
     return [
-        {"row": index[0], "col": index[1], "last_seen_ns": last_ns, "vehicles": vehicles}
+        {"row": index[0], "col": index[1], "vehicles": vehicles, "last_seen": utc(seen(last_ns, known))}
         for index, (last_ns, vehicles) in sorted(tiles.items())
     ]
 

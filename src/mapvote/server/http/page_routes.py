@@ -1,4 +1,7 @@
-"""The operator's page, and the API's documentation."""
+"""The operator's page, the data that it draws in 3D, and the API's documentation.
+
+Data: levels of detail, points added and deleted, votes per cell, paths.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,33 @@ import html
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.arrays import compress
+from mapvote.codec.manifest import TileHashes
 from mapvote.server.errors import NotFound
+from mapvote.server.http.schemas import (
+    AS_CSV,
+    Digest,
+    From,
+    Places,
+    TableOrMap,
+    To,
+    VersionQuery,
+    as_json,
+    as_table,
+    problems,
+)
+from mapvote.server.http.services import Parts, Reviewer, name_of
+from mapvote.server.views.coverage import paths
+from mapvote.server.views.explain import evidence
+from mapvote.server.views.point_lod import N_LEVELS
 
+AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+_FOR_EVER = "private, max-age=31536000, immutable"
+_Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
 _OPEN = b"""<p class="open-server" role="alert">This server is open: every user of this machine can vote, publish and
 roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --role operator</code></p>"""
 _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
@@ -25,6 +49,82 @@ _OF_A_FILE = "standalone.js", "bundle.js"
 """Modules of a page that lies in a file of its own."""
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
+
+
+@router.get(
+    "/v1/clouds/overview",
+    responses=problems(404) | AS_BYTES,
+    response_class=Response,
+    summary="A whole version, coarse",
+)
+def overview(request: Request, parts: Parts, version: VersionQuery | None = None) -> Response:
+    """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
+    number = parts.store.current() if version is None else version
+    return packed(request, parts.clouds.overview(number), "private, no-cache")
+
+
+@router.get(
+    "/v1/clouds/changed",
+    responses=problems(404) | AS_BYTES,
+    response_class=Response,
+    summary="Points added and deleted between two versions",
+)
+def changed(request: Request, parts: Parts, old: From, new: To) -> Response:
+    """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
+    return packed(request, parts.clouds.changed(old, new), _FOR_EVER)
+
+
+@router.get(
+    "/v1/clouds/{points}/{ground}/{level}",
+    responses=problems(404) | AS_BYTES,
+    response_class=Response,
+    summary="One level of detail of a tile",
+)
+def level_of(
+    request: Request,
+    parts: Parts,
+    points: Digest,
+    ground: Digest,
+    level: Annotated[int, Path(ge=0, lt=N_LEVELS)],
+    fields: Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}$")] = None,
+) -> Response:
+    """Immutable. Levels add to one another: every point is in exactly one of the six. With the hash of the tile's
+    ``fields`` the intensity of each point follows, a byte, if there is one."""
+    hashes = TileHashes(points, ground, None, fields=fields)
+    return packed(request, parts.clouds.levels(hashes).part(level), _FOR_EVER)
+
+
+@router.get(
+    "/v1/evidence/{row}/{col}",
+    responses=problems(403) | AS_BYTES,
+    response_class=Response,
+    summary="Votes cell by cell",
+)
+def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
+    """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
+
+    Of one ``vehicle`` only for reviewers and operators.
+    """
+    if vehicle is not None:
+        name_of(request, "reviewer", "operator")
+    plane = evidence(parts.store, (row, col), vehicle)
+    return packed(request, plane.tobytes(), "private, no-cache")
+
+
+@router.get("/v1/paths", response_model=Places, responses=problems(403) | AS_CSV, summary="Paths of the drives")
+def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
+    """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
+    ``csv`` without the lines."""
+    found = paths(parts.store, vehicle)
+    return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
+
+
+def packed(request: Request, data: bytes, cache: str) -> Response:
+    """Bytes, compressed where the client takes it."""
+    headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        data, headers["Content-Encoding"] = compress(data, 1), "zstd"
+    return Response(data, media_type="application/octet-stream", headers=headers)
 
 
 @router.get("/docs", include_in_schema=False)
