@@ -18,8 +18,8 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import Ballot, encode, pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.http.schemas import Answer
 from mapvote.server.http.app import ROUTES, create_app
+from mapvote.server.http.schemas import Answer
 from mapvote.server.http.security import Probe
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
