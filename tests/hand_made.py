@@ -19,9 +19,8 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, Scan
+from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, PosePrior, Scan
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles

@@ -27,9 +27,8 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, NO_VOTE, CellState, Drive, MapvoteError, Registration, Scan
+from mapvote.core.types import F64, NO_VOTE, CellState, Drive, MapvoteError, PosePrior, Registration, Scan
 from mapvote.fusion.fuse import update_map
-from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import DriveReport
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, vote_in_stretches

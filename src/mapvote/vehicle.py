@@ -26,12 +26,11 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
 from mapvote.detection.paper import PaperVoter
 from mapvote.detection.voter import NewPoints, TileVotes, Voter, points_in
 from mapvote.localisation.localiser import Localise, Localiser
-from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 

@@ -15,8 +15,7 @@ from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.point_map import cut_tiles
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, Drive, MapvoteError, Scan
-from mapvote.localisation.ndt import PosePrior
+from mapvote.core.types import F32, Drive, MapvoteError, PosePrior, Scan
 
 
 def test_the_repr_of_a_map_and_of_a_tile_is_one_line() -> None:

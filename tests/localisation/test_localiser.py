@@ -9,9 +9,9 @@ from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Scan
+from mapvote.core.types import F64, PosePrior, Scan
 from mapvote.localisation.localiser import LOOKS, WAIT_SCANS, Localiser
-from mapvote.localisation.ndt import NdtMap, PosePrior
+from mapvote.localisation.ndt_map import NdtMap
 from mapvote.localisation.odometry import Fix
 from mapvote.localisation.pose_check import Verdict
 from streets import path, street, sweep, twist_of

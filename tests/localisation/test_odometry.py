@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hand_made import make_map, make_tile, wall
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.types import F64, Registration, Scan
-from mapvote.localisation.map_window import MapWindow, tiles_within
-from mapvote.localisation.ndt import NdtMap, PosePrior
+from mapvote.core.types import F64, PosePrior, Registration, Scan
+from mapvote.localisation.ndt_map import MapWindow, NdtMap
 from mapvote.localisation.odometry import Tracker
 from streets import path, street, sweep, twist_of
 
@@ -257,26 +255,6 @@ def test_a_registration_is_sound_if_it_converged_met_the_map_and_is_certain_in_e
         sigma = np.full(3, 0.01)
         sigma[axis] = 0.16
         assert not tracker.is_sound(registered(sigma)), "along any one direction"
-
-
-def test_the_map_around_a_vehicle_is_built_anew_only_when_it_leaves_the_middle(point_map: PointMap) -> None:
-    around = MapWindow(point_map)
-    ways = [(0.0, 0.0), (24.0, -24.0), (24.1, 0.0), (20.0, 0.0)]
-    middles = [around(np.array([x, y, 1.8])).centre.tolist() for x, y in ways]
-    assert middles == [[0.0, 0.0, 1.8]] * 2 + [[24.1, 0.0, 1.8]] * 2
-
-
-def test_a_window_holds_the_tiles_that_it_touches_and_no_others() -> None:
-    nine = [(r, c) for r in range(3) for c in range(3)]
-    point_map = make_map({tile: make_tile(wall([(1, 1)], [0.0]), index=tile) for tile in nine})
-
-    def touched(x: float, y: float, half_m: float) -> list[tuple[int, int]]:
-        return tiles_within(point_map, np.array([x, y, 0.0]), half_m)
-
-    assert touched(115.2, 115.2, 10.0) == [(1, 1)]
-    assert touched(115.2, 115.2, 39.0) == nine
-    assert touched(115.2, 76.8, 10.0) == [(0, 1), (1, 1)]
-    assert touched(76.8, 115.2, 10.0) == [(1, 0), (1, 1)]
 
 
 def test_on_a_first_scan_the_speed_is_found_by_how_the_scan_is_bent(tracker: Tracker) -> None:

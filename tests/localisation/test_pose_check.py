@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
 from mapvote.localisation import pose_check
-from mapvote.localisation.ndt import Level, NdtMap, build_ndt
+from mapvote.localisation.ndt_map import Level, NdtMap, build_ndt
 from mapvote.localisation.pose_check import Judge, Verdict, height_above_lowest, stands_above_ground
 
 HERE = np.eye(4)

@@ -1,13 +1,16 @@
-"""A scan in the rain is judged by what stands, not by the drops."""
+"""A scan is de-skewed and thinned; in the rain it is judged by what stands, not by the drops."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapvote.core.types import Bool
-from mapvote.localisation.ndt import build_ndt
+from mapvote.core.geometry import exp, inverse, transform
+from mapvote.core.types import Bool, Scan
+from mapvote.localisation.ndt_map import LEVELS, build_ndt
 from mapvote.localisation.pose_check import Judge
-from mapvote.localisation.prepare import solid_sample
+from mapvote.localisation.prepare import deskew, solid_sample, thin_for_levels, twist_between
 
 BEAMS, AZIMUTHS = 32, 1800
 HERE = np.eye(4)
@@ -65,3 +68,27 @@ def test_a_right_pose_fits_in_the_rain_as_it_does_in_the_dry() -> None:
 
 def test_a_scan_without_any_point_has_an_empty_sample() -> None:
     assert solid_sample(np.empty((0, 3), np.float32), 0.2).shape == (0, 3)
+
+
+def test_each_level_gets_one_point_a_voxel_and_no_beam_is_left_out() -> None:
+    beams = np.repeat(np.arange(32.0), 3000).reshape(32, 3000).T.ravel()  # firing by firing
+    turn = np.repeat(np.linspace(0.0, 2 * np.pi, 3000), 32)
+    points = np.stack([20 * np.cos(turn), 20 * np.sin(turn), beams], axis=1)
+    for few, level in zip(thin_for_levels(points), LEVELS, strict=True):
+        assert len(np.unique(few[2])) == 32
+        voxels = np.floor(few / np.float32(level.points_m))
+        assert len(np.unique(voxels, axis=1).T) == few.shape[1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-15, 15), st.floats(-3, 3), st.floats(-0.6, 0.6), st.integers(0, 2**31))
+def test_deskew_undoes_the_motion_of_a_scan(speed: float, sideways: float, yaw_rate: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    still = rng.uniform(-50, 50, (200, 3))
+    time_s = rng.uniform(-0.05, 0.05, 200).astype(np.float32)
+    twist = np.array([speed, sideways, 0.1, 0.02, -0.03, yaw_rate])
+    moments = zip(time_s.astype(np.float64), still, strict=True)
+    seen = np.array([transform(inverse(exp(t * twist)), point[None])[0] for t, point in moments])
+    points = deskew(Scan(0, seen.astype(np.float32), time_s), twist)
+    np.testing.assert_allclose(points, still, atol=2e-3)
+    np.testing.assert_allclose(twist_between(np.eye(4), exp(0.1 * twist), 0.1), twist, atol=1e-9)

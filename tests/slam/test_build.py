@@ -11,10 +11,9 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.core.types import F64, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.ndt_map import MapWindow
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
 from mapvote.slam.pose_graph import DriveTrack

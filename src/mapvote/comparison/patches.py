@@ -18,7 +18,9 @@ from scipy.spatial import KDTree
 from mapvote.core.geometry import exp, exps, hat, inverse, logs
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.core.voxels import voxel_downsample
-from mapvote.localisation.ndt import NdtMap, fitness, refine, thin_for_levels
+from mapvote.localisation.ndt import fitness, refine
+from mapvote.localisation.ndt_map import NdtMap
+from mapvote.localisation.prepare import thin_for_levels
 
 STEP_M, SIDE_M = 15.0, 30.0
 """Patches begin every STEP_M and are SIDE_M wide: neighbours share three quarters of their points."""

@@ -200,6 +200,30 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
+class PosePrior:
+    """What is believed of a pose before looking: independent errors of position and rotation."""
+
+    T_map_lidar: F64
+    sigma_m: float
+    sigma_rad: float
+
+    def __post_init__(self) -> None:
+        check_array(self.T_map_lidar, "T_map_lidar of the prior", (4, 4), np.float64)
+
+    @classmethod
+    def of(cls, drive: Drive, i: int) -> PosePrior | None:
+        """What ``drive`` brings for its scan ``i``, if anything."""
+        if drive.T_map_lidar_prior is None:
+            return None
+        return cls(drive.T_map_lidar_prior[i], drive.prior_sigma_m, float(np.radians(drive.prior_sigma_deg)))
+
+    @property
+    def information(self) -> F64:
+        """(6, 6) inverse covariance."""
+        return np.diag([self.sigma_m**-2] * 3 + [self.sigma_rad**-2] * 3)
+
+
+@dataclass(frozen=True, slots=True)
 class Registration:
     """A pose and how far to trust it (a lost vehicle must never demolish a street)."""
 

@@ -25,10 +25,10 @@ from mapvote.doctor import Finding, Progress, Severity
 from mapvote.doctor.drive_evidence import find_road
 from mapvote.doctor.prior import Similarity, fit_similarity
 from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, likeliest, refine, thin_for_levels
+from mapvote.localisation.ndt import fitness, likeliest, refine
+from mapvote.localisation.ndt_map import LEVELS, MapWindow, NdtMap
 from mapvote.localisation.pose_check import MIN_FIT, Judge
-from mapvote.localisation.prepare import deskew, motion_at, solid_sample
+from mapvote.localisation.prepare import deskew, motion_at, solid_sample, thin_for_levels
 
 Step = TypeVar("Step")
 _PLACES = 6

@@ -16,7 +16,9 @@ from scipy import fft
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F32, F64, I64, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample
-from mapvote.localisation.ndt import NdtMap, build_ndt, fitness, refine, thin_for_levels
+from mapvote.localisation.ndt import fitness, refine
+from mapvote.localisation.ndt_map import NdtMap, build_ndt
+from mapvote.localisation.prepare import thin_for_levels
 
 _CELL_M, _LAYER_M = 1.0, 0.5
 _YAWS = 240

@@ -22,11 +22,11 @@ from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
 from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
+from mapvote.localisation.ndt import refine
+from mapvote.localisation.ndt_map import LEVELS, MapWindow
 from mapvote.localisation.odometry import Tracker
 from mapvote.localisation.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
-from mapvote.localisation.prepare import Sample, deskew, solid_sample
+from mapvote.localisation.prepare import Sample, deskew, solid_sample, thin_for_levels
 
 CELL_M = 1.0
 LAYER_M = 1.0

@@ -17,13 +17,13 @@ from mapvote.config import Settings
 from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, I64, Registration, Scan
+from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
 from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
+from mapvote.localisation.ndt import refine
+from mapvote.localisation.ndt_map import LEVELS, MapWindow
 from mapvote.localisation.odometry import TWIST_AGE_S, Fix, Tracker
 from mapvote.localisation.pose_check import Judge, Verdict
-from mapvote.localisation.prepare import Sample, deskew, motion_at, solid_sample, twist_between
+from mapvote.localisation.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
 
 LOOKS = 3
 """In turn that must hold before the first vote."""

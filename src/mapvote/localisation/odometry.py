@@ -12,8 +12,9 @@ import numpy as np
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
-from mapvote.core.types import F32, F64, Registration, Scan
-from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, best_of, fitnesses, refine
+from mapvote.core.types import F32, F64, PosePrior, Registration, Scan
+from mapvote.localisation.ndt import best_of, fitnesses, refine
+from mapvote.localisation.ndt_map import LEVELS, NdtMap
 from mapvote.localisation.prepare import Sample, deskew, twist_between
 
 _REFINED = 3
@@ -53,7 +54,7 @@ class Tracker:
     """Follows one vehicle. Scans must come in order of time.
 
     ``map_around``: the NDT map to use near a position (3,), for a finished map a
-    :class:`mapvote.localisation.map_window.MapWindow`.
+    :class:`mapvote.localisation.ndt_map.MapWindow`.
     """
 
     def __init__(self, map_around: Callable[[F64], NdtMap], settings: NdtSettings) -> None:

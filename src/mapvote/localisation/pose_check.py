@@ -14,8 +14,9 @@ import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, Bool
-from mapvote.localisation.ndt import SETTLED, NdtGrid, NdtMap, fitness, fitnesses, in_rows, refine
-from mapvote.localisation.ndt_solver import SEVEN
+from mapvote.localisation.ndt import SETTLED, fitness, fitnesses, refine
+from mapvote.localisation.ndt_map import SEVEN, NdtGrid, NdtMap
+from mapvote.localisation.prepare import in_rows
 
 MIN_FIT = 0.6
 """Of what the map leads to expect, from which a pose may be voted with; docs/measurements/localisation.md says how

@@ -13,7 +13,34 @@ from mapvote.core.geometry import inverse, log
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I64, Scan
 from mapvote.core.voxels import slot_of, thin, voxel_key
-from mapvote.localisation.ndt import LEVELS, in_rows, thinned
+from mapvote.localisation.ndt_map import LEVELS
+
+_ENOUGH = 20_000
+"""Points that are thinned at least: of a dense scan every third, fifth .. is used. Odd, so that no beam is left
+out where points are stored firing by firing."""
+
+
+def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F32]:
+    """The scan as each level wants it, (3, m): one point per voxel of the level's ``points_m``."""
+    source = np.ascontiguousarray(points_lidar, dtype=np.float32)
+    chosen = thinned(source)
+    return [in_rows(source[chosen[level.points_m]]) for level in LEVELS]
+
+
+def in_rows(points_lidar: NDArray[np.floating]) -> F32:
+    """(3, n) of points (n, 3): rows of x, y and z, as the kernels want them."""
+    return np.ascontiguousarray(points_lidar.T, dtype=np.float32)
+
+
+def thinned(points_lidar: F32) -> dict[float, I64]:
+    """By size, metres: indices, ascending, of one of (n, 3) points per voxel of each size that the levels want."""
+    sizes = sorted({level.points_m for level in LEVELS})
+    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // _ENOUGH - 1) | 1))
+    chosen = {sizes[0]: few}
+    for size in sizes[1:]:
+        few = few[thin(points_lidar.take(few, axis=0), size)]
+        chosen[size] = few
+    return chosen
 
 
 @kernel

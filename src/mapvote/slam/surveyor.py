@@ -16,11 +16,12 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
-from mapvote.core.types import F64, Drive, MapvoteError, Scan
+from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
-from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
+from mapvote.localisation.ndt import refine
+from mapvote.localisation.ndt_map import LEVELS, NdtMap
 from mapvote.localisation.odometry import ACCELERATION_MPS2, Fix, Tracker
-from mapvote.localisation.prepare import twist_between
+from mapvote.localisation.prepare import in_rows, twist_between
 from mapvote.slam.pose_graph import DriveTrack, fit_to_priors
 
 _MIN_INLIER_SHARE = 0.4

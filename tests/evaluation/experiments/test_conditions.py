@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from hand_made import AtOnce, two_walls
-from mapvote.core.types import Drive, Registration, Scan
+from mapvote.core.types import Drive, PosePrior, Registration, Scan
 from mapvote.formats import open_drive
-from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import read_truth

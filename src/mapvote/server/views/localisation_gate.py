@@ -21,9 +21,9 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import refine, thin_for_levels
-from mapvote.localisation.prepare import deskew, twist_between
+from mapvote.localisation.ndt import refine
+from mapvote.localisation.ndt_map import MapWindow
+from mapvote.localisation.prepare import deskew, thin_for_levels, twist_between
 from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.publish import Gate
 from mapvote.server.views.change_objects import changed_cells

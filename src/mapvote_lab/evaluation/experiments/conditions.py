@@ -30,9 +30,8 @@ from mapvote.codec.sparse_columns import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U64, Bool, CellState, Drive, Scan
+from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U64, Bool, CellState, Drive, PosePrior, Scan
 from mapvote.localisation.localiser import Localise
-from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Movers
 from mapvote_lab.evaluation.truths import Truth

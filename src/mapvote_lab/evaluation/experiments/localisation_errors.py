@@ -12,11 +12,10 @@ import numpy as np
 
 from mapvote.core.geometry import exp
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, I64, Drive
+from mapvote.core.types import F64, I64, Drive, PosePrior
 from mapvote.formats import read_map, write_map
 from mapvote.formats.atomic import whole_folder
-from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.ndt_map import MapWindow
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
 from mapvote_lab.evaluation.experiments.cases import Progress, untold

@@ -21,11 +21,10 @@ from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError
+from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, PosePrior
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.formats.drives.options import parse_scans
 from mapvote.localisation.localiser import GivenPoses
-from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles

@@ -33,14 +33,13 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import PointMap
 from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.reference import LocalMap
-from mapvote.core.types import F64, Drive, Scan
+from mapvote.core.types import F64, Drive, PosePrior, Scan
 from mapvote.core.voxels import voxel_downsample
 from mapvote.detection.voter import NewPoints, Voter
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.formats.atomic import whole_file, whole_folder
 from mapvote.formats.drives.options import parse_scans
 from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
-from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
