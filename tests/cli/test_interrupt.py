@@ -18,7 +18,7 @@ from live.loopback_dds import LOOPBACK, own_domain
 from live_server import mapvote
 from mapvote.cli import app
 from mapvote.server.store.store import Store
-from mapvote.server.views.events import last_events
+from mapvote.server.views.history import last_events
 
 Desk = Callable[..., Path]
 
@@ -84,7 +84,7 @@ VERBS = {
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "export http://localhost:9 new --follow": "import mapvote.client as m; m.MapClient.manifest = wait",
-    "coverage STORE": "import mapvote.server.views.coverage as m; m.wanted_passes = wait",
+    "coverage STORE": "import mapvote.server.views.vehicles as m; m.wanted_passes = wait",
     "policy STORE": "import mapvote.server.store.store as m; m.Store.policy_changes = wait",
     "rollback STORE 1": "import mapvote.server.store.rollback as m; m.rollback = wait",
     "unvote STORE car_1": "import mapvote.server.store.votes as m; m.withdraw = wait",

@@ -12,7 +12,7 @@ from mapvote.cli.operate import keys, policy
 from mapvote.core.types import CellState
 from mapvote.server.store.keys import ballots_standing, issue
 from mapvote.server.store.store import Store
-from mapvote.server.views.events import events_after, newest_event
+from mapvote.server.views.history import events_after, newest_event
 from stores import send
 
 

@@ -27,7 +27,7 @@ from mapvote.server.http.event_routes import as_sse, deliver
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
-from mapvote.server.views.events import Event, Feed, newest_event, without_names
+from mapvote.server.views.history import Event, Feed, newest_event, without_names
 
 if TYPE_CHECKING:
     from mapvote.server.http.services import Services

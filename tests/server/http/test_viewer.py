@@ -20,7 +20,7 @@ from mapvote.core.types import CellState
 from mapvote.server.store import keys
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from mapvote.server.views.consensus import vehicle_standings
+from mapvote.server.views.vehicles import vehicle_standings
 from stores import send
 
 

@@ -21,11 +21,10 @@ from mapvote.server.store.integrity import ballot_name, check, restore_plane, se
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from mapvote.server.views.consensus import vehicle_standings
-from mapvote.server.views.events import last_events
 from mapvote.server.views.explain import evidence
-from mapvote.server.views.history import changes_between
+from mapvote.server.views.history import changes_between, last_events
 from mapvote.server.views.point_lod import Clouds
+from mapvote.server.views.vehicles import vehicle_standings
 from stores import send
 
 CELL = (10, 10)

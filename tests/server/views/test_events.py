@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from hand_made import two_walls
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
-from mapvote.server.views.events import Feed, newest_event
+from mapvote.server.views.history import Feed, newest_event
 
 LISTENERS, SECONDS = 20, 30
 

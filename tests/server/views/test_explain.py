@@ -26,8 +26,8 @@ from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views import explain
-from mapvote.server.views.events import last_events
 from mapvote.server.views.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell
+from mapvote.server.views.history import last_events
 from standing_clock import Clock
 from stores import send
 

@@ -21,7 +21,7 @@ from standardwebhooks import Webhook
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import Known, Parts, Services
-from mapvote.server.views.events import Event, newest_event, take, taken_up_to, without_names
+from mapvote.server.views.history import Event, newest_event, take, taken_up_to, without_names
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0

@@ -61,11 +61,16 @@ from mapvote.server.store.retention import Cleared, clear
 from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
-from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
-from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
 from mapvote.server.views.explain import CellStory, explain_cell
 from mapvote.server.views.geojson import feature_rows, tile_squares
 from mapvote.server.views.history import changes_between, log_of, overview, page_between
+from mapvote.server.views.vehicles import (
+    contradictions,
+    standing_rows,
+    tiles_seen,
+    vehicle_standings,
+    wanted_passes,
+)
 
 _MOST_EVIDENCE = 50
 router = APIRouter()
@@ -194,7 +199,7 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
 @router.get("/v1/coverage/passes", response_model=Places, responses=problems(403), summary="Where to drive next")
 def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
-    return as_json(as_features(wanted_passes(parts.store)))
+    return as_json(wanted_passes(parts.store))
 
 
 @router.get(

@@ -30,9 +30,9 @@ from mapvote.server.http.schemas import (
     problems,
 )
 from mapvote.server.http.services import Parts, Reviewer, name_of
-from mapvote.server.views.coverage import paths
 from mapvote.server.views.explain import evidence
 from mapvote.server.views.point_lod import N_LEVELS
+from mapvote.server.views.vehicles import paths
 
 AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"

@@ -23,8 +23,8 @@ from mapvote.server.errors import Conflict, Forbidden, Held, NotFound, TooLarge,
 from mapvote.server.http.services import Progress
 from mapvote.server.store.integrity import Damage
 from mapvote.server.views.change_objects import Kind, Size
-from mapvote.server.views.consensus import VehicleStanding
 from mapvote.server.views.geojson import as_csv
+from mapvote.server.views.vehicles import VehicleStanding
 
 STATUS: Mapping[type[MapvoteError], int] = {
     Unauthorised: 401,

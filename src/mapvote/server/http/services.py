@@ -31,7 +31,7 @@ from mapvote.server.store.integrity import KINDS
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Store
-from mapvote.server.views.events import Feed
+from mapvote.server.views.history import Feed
 from mapvote.server.views.localisation_gate import gate_by
 from mapvote.server.views.point_lod import Clouds
 

@@ -7,18 +7,19 @@ included. Votes and times come from the decision records in between. Objects are
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
 
-from mapvote.codec.ballot import UNSAID, Odds
+from mapvote.codec.ballot import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.loss_budget import alike_beside, change_probability
+from mapvote.server.store.decisions import Record
 from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]
@@ -33,21 +34,8 @@ _BORDER_M = 2 * CELL_SIZE * 2**0.5
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
-
-
-@dataclass(frozen=True, slots=True)
-class Decided:
-    """What one version decided about one tile, and the ballots that counted."""
-
-    version: int
-    states: U8
-    """(256, 256) CellState or NO_VOTE."""
-    tally: I32
-    """(256, 256, 5) in VOTE_UNITs."""
-    drives: Sequence[tuple[int, U8]] = ()
-    """(end_ns, (256, 256) states) of every ballot that counted."""
-    odds: Odds = field(default_factory=Odds.none)
-    """Confidence of the votes for a change (fusion/loss_budget.py)."""
+Decided = tuple[Record, Sequence[tuple[int, U8]]]
+"""What one version decided about one tile; and of every ballot that counted (end_ns, (256, 256) states)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +240,7 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I
     version, odds = np.zeros(len(flat), dtype=np.int64), np.full(len(flat), UNSAID, dtype=np.int8)
     first = np.full(len(flat), _NEVER)
     last = np.full(len(flat), _UNTIL)
-    for decision in decided:
+    for decision, drives in decided:
         agrees = decision.states.reshape(-1)[flat] == states
         tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
         counted = tally[np.arange(len(flat)), states]
@@ -261,7 +249,7 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I
         against = np.where(agrees, others // VOTE_UNIT, against)
         version = np.where(agrees, decision.version, version)
         odds = np.where(agrees, decision.odds.at(flat), odds)
-        for end_ns, drive in decision.drives:
+        for end_ns, drive in drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)

@@ -25,7 +25,7 @@ from mapvote.server.store.publish import Gate, Round, edited_tile, reasons_to_ho
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.store import Store
-from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
+from mapvote.server.views.change_objects import ChangeObject, change_objects, changed_cells
 from mapvote.server.views.geojson import to_geojson
 from mapvote.server.views.point_lod import came_and_went
 
@@ -73,8 +73,10 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 def _desk_of(store: Store, found: Round) -> Desk:
     version, budget = found.newest.number, found.asked.settings.false_deletions
     tiles = [_before_and_after(store, version, fused) for fused in found.changed]
-    decided = {f.index: _decided(f) for f in found.changed}
-    objects = change_objects([changed_cells(old, new, [decided[old.index]]) for old, new in tiles])
+    decided = [Record(0, fused.states, fused.tally, fused.odds, fused.standings) for fused in found.changed]
+    objects = change_objects(
+        [changed_cells(*pair, [(record, ())]) for pair, record in zip(tiles, decided, strict=True)]
+    )
     pending = to_geojson(
         objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
     )
@@ -93,11 +95,6 @@ def _desk_of(store: Store, found: Round) -> Desk:
     clouds = b"".join(came_and_went(old, new) for old, new in tiles)
     waiting = waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
     return Desk(version, [], pending, waiting, left_out, cells, edited, clouds)
-
-
-def _decided(fused: Fused) -> Decided:
-    record = Record(0, fused.states, fused.tally, fused.odds, fused.standings)
-    return Decided(0, record.states, record.tally, odds=record.odds)
 
 
 def review(

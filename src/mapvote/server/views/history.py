@@ -1,11 +1,15 @@
-"""Changes between versions, coverage of tiles, consistency of vehicles."""
+"""The content of a store and its history: changes between versions, and its log in order, for its listeners (pages,
+integrators, webhooks), who share one poll of the database."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
+from threading import Lock
 from typing import Any
 
 import sqlalchemy as sa
@@ -21,10 +25,13 @@ from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.decisions import Standing, cells_in, records_of
 from mapvote.server.store.integrity import set_aside
+from mapvote.server.store.keys import hash_of
 from mapvote.server.store.queries import (
+    current_number,
     current_version,
     load_blob,
     load_tile,
+    newest_seq,
     oldest_kept,
     tiles_of,
     tiles_that_differ,
@@ -36,7 +43,6 @@ from mapvote.server.store.votes import (
 )
 from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
 from mapvote.server.views.cutout import Cutout, Tiles, of_feature, whole_page
-from mapvote.server.views.events import last_events
 from mapvote.server.views.explain import seen, sound_votes
 from mapvote.server.views.geojson import to_geojson
 
@@ -103,14 +109,12 @@ def changes_between(
         found, damaged = [], []
         for index, *pair in tiles_that_differ(connection, old, new):
             try:
-                tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
-                decided = _decided(connection, index, min(old, new), max(old, new))
+                before, after = (load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair)
+                found.append(changed_cells(before, after, _decided(connection, index, min(old, new), max(old, new))))
             except Unavailable:
                 raise
             except MapvoteError:
                 damaged.append(tile_key(index))
-                continue
-            found.append(changed_cells(tiles[0], tiles[1], decided))
     collection = to_geojson(
         [
             replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
@@ -154,14 +158,12 @@ def tiles_at(store: Store, version: int) -> Tiles:
 
 
 def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) -> list[Decided]:
-    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted."""
+    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted;
+    MapvoteError if a record is damaged."""
     records = records_of(connection, index, after=old, upto=new)
     counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
     sound = sound_votes(connection, index, counted)
-    return [
-        Decided(record.version, record.states, record.tally, _drives(record.standings, sound), record.odds)
-        for record in records
-    ]
+    return [(record, _drives(record.standings, sound)) for record in records]
 
 
 def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
@@ -175,3 +177,103 @@ def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote,
                 states.reshape(-1)[cells_in(cells)] = NO_VOTE
             found.append((vote.end_ns, states))
     return found
+
+
+OF_THE_MAP = ("import", "publish", "rollback", "replay")
+"""Kinds that concern the map alone: actor and reason are open to every reader."""
+OF_VEHICLES = ("ballot", "withdraw")
+"""Kinds that reveal the minute of a drive."""
+_MOST = 500
+POLL_S = 0.9
+"""Least time between two polls of the database."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One line of the log."""
+
+    seq: int
+    at_ns: int
+    kind: str
+    actor: str
+    detail: str
+    version: int
+    """The newest version when the event was read."""
+
+
+def newest_event(store: Store) -> int:
+    """Number of the last event."""
+    with store.database.reading() as connection:
+        return newest_seq(connection)
+
+
+def taken_up_to(store: Store, address: str) -> int:
+    """The last event that the listener at this address took; of a new listener the newest event."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        taken = connection.execute(sa.select(d.c.seq).where(d.c.address == hash_of(address))).scalar_one_or_none()
+        if taken is None:
+            taken = newest_seq(connection)
+            connection.execute(d.insert().values(address=hash_of(address), seq=taken))
+    return int(taken)
+
+
+def take(store: Store, address: str, seq: int) -> None:
+    """Note that a known listener took all events up to this one."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        connection.execute(d.update().where(d.c.address == hash_of(address)).values(seq=seq))
+
+
+def events_after(store: Store, seq: int) -> list[Event]:
+    """The events after ``seq``, oldest first, 500 at most. Writing transactions are serial, so none appears later."""
+    e = schema.events
+    query = sa.select(e.c.seq, e.c.at_ns, e.c.kind, e.c.actor, e.c.detail).where(e.c.seq > seq).order_by(e.c.seq)
+    with store.database.reading() as connection:
+        rows = connection.execute(query.limit(_MOST)).all()
+        version = current_number(connection) if rows else 0
+    return [Event(*row, version) for row in rows]
+
+
+def last_events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
+    """The last events, newest first."""
+    e = schema.events.c
+    query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
+    with store.database.reading() as connection:
+        return [dict(row._mapping) for row in connection.execute(query)]
+
+
+class Feed:
+    """The latest events of one store, kept for all listeners; thread-safe.
+
+    Of the listeners that call :meth:`after` within ``poll_s`` seconds, the first polls the database.
+    """
+
+    def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._poll_s, self._seconds = store, poll_s, seconds
+        self._lock = Lock()
+        self._recent: deque[Event] = deque(maxlen=_MOST)
+        self._newest: int | None = None
+        self._polled_s = -poll_s
+
+    def after(self, seq: int) -> list[Event]:
+        """The events after ``seq``, oldest first, at most 500. Older events than those kept are read from the log."""
+        with self._lock:
+            now = self._seconds()
+            if self._newest is None:
+                self._newest, self._polled_s = newest_event(self._store), now
+            elif now - self._polled_s >= self._poll_s:
+                found = events_after(self._store, self._newest)
+                self._recent.extend(found)
+                self._newest, self._polled_s = (found[-1].seq if found else self._newest), now
+            if seq >= self._newest:
+                return []
+            if self._recent and self._recent[0].seq <= seq + 1:
+                return [event for event in self._recent if event.seq > seq]
+        return events_after(self._store, seq)
+
+
+def without_names(events: Sequence[Event]) -> list[Event]:
+    """Events for readers that may not see vehicles' names: none of ballots, others without actor and detail."""
+    shown = [e for e in events if e.kind not in OF_VEHICLES]
+    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in shown]

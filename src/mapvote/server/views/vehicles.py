@@ -1,4 +1,5 @@
-"""Whether a vehicle contradicts the others significantly more often than they contradict each other.
+"""Vehicles: where they have been, where one should drive next, and whether one contradicts the others significantly
+more often than they contradict each other.
 
 A vote is compared only where other vehicles agree both before it and after it, as a cell that differs before and after
 a drive may have changed. Objects (8-connected cells) are counted, not cells, as neighbouring cells fail together. The
@@ -7,35 +8,33 @@ test is exact for few data, and "undecidable" is one of its results.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 import scipy
+import sqlalchemy as sa
 
+from mapvote.codec.ballot import unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import I64, U8, CellState
+from mapvote.core.types import F32, F64, I64, U8, CellState
+from mapvote.fusion.next_pass import Stretch, Witness, stretches
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
-from mapvote.server.views.explain import said_by, votes_by_tile
-from mapvote.server.views.geojson import collection
+from mapvote.server.views.explain import said_by, seen, votes_by_tile
+from mapvote.server.views.geojson import collection, utc
 from mapvote.server.views.outlines import pieces
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
 Claim = Literal["occupied", "empty"]
 _SAYS_OCCUPIED = (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED)
 _SAYS_EMPTY = (CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY)
-
-
-@dataclass(frozen=True, slots=True)
-class Spoken:
-    """One vehicle's vote on one tile: all its drives folded into one."""
-
-    vehicle: str
-    end_ns: int
-    states: U8
-    """(256, 256) CellState or NO_VOTE."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +82,8 @@ class VehicleStanding:
     """Largest first."""
 
 
-def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
-    """Each vehicle's vote on a tile against the others', one entry per vehicle in order of name.
+def compare(index: TileIndex, votes: Iterable[TileVote]) -> list[Compared]:
+    """Each vehicle's vote on a tile, all its drives as one, against the others'; one entry each, in order of name.
 
     In a cell the others agree if more of them vote one way (occupied or empty now) than the other, and at least one
     of these passed before the vehicle and one after it. Undetermined cells and cells without a vote are left out.
@@ -92,7 +91,7 @@ def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
     ordered = sorted(votes, key=lambda vote: (vote.end_ns, vote.vehicle))
     if not ordered:
         return []
-    states = np.stack([vote.states.reshape(-1) for vote in ordered])
+    states = np.stack([said_by(vote).reshape(-1) for vote in ordered])
     occupied, empty = np.isin(states, _SAYS_OCCUPIED), np.isin(states, _SAYS_EMPTY)
     until_occupied, until_empty = (np.cumsum(claim, axis=0, dtype=np.int32) for claim in (occupied, empty))
     all_occupied, all_empty = until_occupied[-1], until_empty[-1]
@@ -122,11 +121,9 @@ def vehicle_standings(store: Store) -> list[VehicleStanding]:
 
     The state of the world (occupied or empty now) is compared, so votes on an older base count too.
     """
-    compared: list[Compared] = []
     with store.database.reading() as connection:
-        for window, votes in votes_by_tile(connection, store.lattice, policy_in(connection)):
-            spoken = [Spoken(vote.vehicle, vote.end_ns, said_by(vote)) for vote in votes]
-            compared += compare(window.tile_index, spoken)
+        by_tile = votes_by_tile(connection, store.lattice, policy_in(connection))
+        compared = [one for window, votes in by_tile for one in compare(window.tile_index, votes)]
     return standings_of(compared, store.lattice)
 
 
@@ -216,5 +213,113 @@ def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
 
 def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
     """A row per vehicle, without the places."""
-    columns = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
-    return [{name: getattr(s, name) for name in columns} for s in standings]
+    return [{f.name: getattr(s, f.name) for f in fields(s) if f.name != "evidence"} for s in standings]
+
+
+def wanted_passes(store: Store) -> dict[str, Any]:
+    """Stretches of road on which one more pass would decide cells, those with most cells first: GeoJSON lines in map
+    metres, each in the direction to drive, with what the pass would decide there."""
+    found: list[Stretch] = []
+    with store.database.reading() as connection:
+        policy, driven = policy_in(connection), _driven(connection, store)
+        for window, votes in votes_by_tile(connection, store.lattice, policy):
+            witnesses = [Witness(said_by(vote), driven[vote.vehicle]) for vote in votes]
+            found += stretches(window, witnesses, policy.fuse.min_votes)
+    return collection(
+        [
+            (
+                {"type": "LineString", "coordinates": np.round(stretch.path_m, 2).tolist()},
+                {
+                    "row": stretch.tile[0],
+                    "col": stretch.tile[1],
+                    "heading_deg": round(float(np.degrees(stretch.heading_rad))),
+                    "cells": stretch.cells,
+                    "built": stretch.built,
+                    "gone": stretch.gone,
+                },
+            )
+            for stretch in sorted(found, key=lambda one: (-one.cells, one.tile, one.heading_rad))
+        ]
+    )
+
+
+def _driven(connection: sa.Connection, store: Store) -> dict[str, list[F64]]:
+    """By vehicle: the path of each of its standing drives, (n, 2) map metres."""
+    b, p = schema.ballots.c, schema.paths.c
+    query = sa.select(b.vehicle, p.path).join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
+    out = defaultdict[str, list[F64]](list)
+    for vehicle, path in connection.execute(query.order_by(b.seq)):
+        corner = np.array([store.lattice.x0, store.lattice.y0])
+        out[vehicle].append(corner + (unpack_path(path)[:, ::-1] + 0.5) * CELL_SIZE)
+    return out
+
+
+def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:
+    """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
+    ``known``, see :func:`mapvote.server.views.explain.seen`."""
+    b, t = schema.ballots, schema.ballot_tiles
+    last = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
+    last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
+    with store.database.reading() as connection:
+        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
+            tiles_of(connection, current_version(connection).number), (None, 0)
+        )
+        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
+    return [
+        {"row": index[0], "col": index[1], "vehicles": vehicles, "last_seen": utc(seen(last_ns, known))}
+        for index, (last_ns, vehicles) in sorted(tiles.items())
+    ]
+
+
+MOST_PATHS = 500
+"""The last drives."""
+
+
+def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
+    """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
+    ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
+    b, p = schema.ballots.c, schema.paths.c
+    query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
+    query = query.join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
+    if vehicle is not None:
+        query = query.where(b.vehicle == vehicle)
+    with store.database.reading() as connection:
+        rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
+        driven = [unpack_path(row.path) for row in rows]
+        touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
+        known = tiles_of(connection, current_version(connection).number, sorted(touched)) if touched else {}
+
+        @cache
+        def ground(index: TileIndex) -> F32:
+            return load_tile(connection, store.lattice.tile(index), known.get(index)).ground_z
+
+        lines = [_line(store, path, ground) for path in driven]
+    return collection(
+        [
+            (
+                {"type": "LineString", "coordinates": line},
+                {
+                    "vehicle": row.vehicle,
+                    "drive": row.drive,
+                    "start": utc(row.start_ns),
+                    "end": utc(row.end_ns),
+                    "version": row.version,
+                    "length_m": round(float(np.hypot(*np.diff(np.array(line)[:, :2], axis=0).T).sum()), 1),
+                },
+            )
+            for row, line in zip(rows, lines, strict=True)
+        ]
+    )
+
+
+def _line(store: Store, path: I64, ground: Any) -> list[list[float]]:
+    rows, cols = path.T
+    z = np.array(
+        [ground((int(r) // TILE_CELLS, int(c) // TILE_CELLS))[r % TILE_CELLS, c % TILE_CELLS] for r, c in path]
+    )
+    known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
+    first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
+    height = np.where(known >= 0, z[known], first)
+    x, y = store.lattice.x0 + (cols + 0.5) * CELL_SIZE, store.lattice.y0 + (rows + 0.5) * CELL_SIZE
+    line: list[list[float]] = np.round(np.column_stack([x, y, height]), 2).tolist()
+    return line
