@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from msgspec import Struct
 
     from mapvote.config import Settings
-    from mapvote_lab.evaluation.reporting.tables import Sheet
+    from mapvote_lab.evaluation.tables import Sheet
 
 
 def register(app: typer.Typer) -> None:
@@ -125,11 +125,11 @@ def evaluate(
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     from mapvote.config import cache_folder, load_with_sources
+    from mapvote_lab.evaluation.cases import DEFAULT_CASES, PUBLISHED, as_paper, choose_cases
+    from mapvote_lab.evaluation.conditions import Conditions
     from mapvote_lab.evaluation.evaluate import evaluate as run
-    from mapvote_lab.evaluation.experiments.cases import DEFAULT_CASES, PUBLISHED, as_paper, choose_cases
-    from mapvote_lab.evaluation.experiments.conditions import Conditions
-    from mapvote_lab.evaluation.experiments.scene import Scene
-    from mapvote_lab.evaluation.reporting.tables import tables
+    from mapvote_lab.evaluation.scene import Scene
+    from mapvote_lab.evaluation.tables import tables
 
     settings, sources = load_with_sources(config)
     settings = as_paper(settings, scenario, sources, reading)
@@ -144,7 +144,7 @@ def evaluate(
     _show(list(tables(evaluation.result)), evaluation.result, json)
     if figures is not None:
         from mapvote.plots import FORMATS
-        from mapvote_lab.evaluation.reporting.gallery import gallery
+        from mapvote_lab.evaluation.gallery import gallery
 
         with progress("drawing"):
             drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
@@ -155,8 +155,8 @@ def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Pat
     """Tables on the terminal; all numbers into the file ``json``, if one is wanted."""
     from rich.console import Console
 
-    from mapvote_lab.evaluation.reporting.tables import write_text
     from mapvote_lab.evaluation.results import to_json
+    from mapvote_lab.evaluation.tables import write_text
 
     for sheet in sheets:
         Console(width=140).print(sheet.to_rich())
@@ -167,8 +167,8 @@ def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Pat
 
 def _evaluate_court(folder: Path, case: str | None, json: Path | None, settings: Settings) -> None:
     """The court's three sessions, as cast scans by ``case`` and as clouds."""
-    from mapvote_lab.evaluation.experiments.cases import DEFAULT_CASES, choose_cases
-    from mapvote_lab.evaluation.experiments.court import Court, court_table, evaluate_court
+    from mapvote_lab.evaluation.cases import DEFAULT_CASES, choose_cases
+    from mapvote_lab.evaluation.court import Court, court_table, evaluate_court
 
     cases, _ = choose_cases(settings, case or DEFAULT_CASES)
     with stages() as told:
@@ -187,9 +187,9 @@ def _evaluate_real(
 ) -> None:
     """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes.
     ``case``: one of them; None: by the settings."""
-    from mapvote_lab.evaluation.experiments.cases import choose_cases
-    from mapvote_lab.evaluation.experiments.real_bench import bench
-    from mapvote_lab.evaluation.reporting.real_report import real_tables, write_report
+    from mapvote_lab.evaluation.cases import choose_cases
+    from mapvote_lab.evaluation.real_bench import bench
+    from mapvote_lab.evaluation.real_report import real_tables, write_report
 
     method = settings.voting.method
     cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))

@@ -14,12 +14,12 @@ from msgspec.structs import asdict
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
+from mapvote_lab.evaluation import tables
+from mapvote_lab.evaluation.cases import choose_cases
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
-from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.scene import Scene
-from mapvote_lab.evaluation.reporting import tables
-from mapvote_lab.evaluation.reporting.tables import ReportSection, page
 from mapvote_lab.evaluation.results import EvaluationResult, to_json
+from mapvote_lab.evaluation.scene import Scene
+from mapvote_lab.evaluation.tables import ReportSection, page
 
 SLOWER = {"rate_hz": 4.0, "sensor": "vlp16"}
 """Fewer scans and beams than the paper has: a test asks whether it works, not how well."""

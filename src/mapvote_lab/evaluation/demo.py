@@ -29,18 +29,17 @@ from mapvote.server.views.cutout import Cutout
 from mapvote.server.views.history import changes_between, cutouts_between
 from mapvote.slam.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
+from mapvote_lab.evaluation import figures, real_bench
+from mapvote_lab.evaluation.cases import Progress, choose_cases, untold
 from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, vote_by_http
-from mapvote_lab.evaluation.experiments import real_bench
-from mapvote_lab.evaluation.experiments.cases import Progress, choose_cases, untold
-from mapvote_lab.evaluation.experiments.real_street import RealRun, Street, lay_street
-from mapvote_lab.evaluation.experiments.scene import Scene
-from mapvote_lab.evaluation.reporting import figures
-from mapvote_lab.evaluation.reporting.gallery import gallery
-from mapvote_lab.evaluation.reporting.real_report import draw_things
-from mapvote_lab.evaluation.reporting.tables import ReportSection, as_text, page, write_text
+from mapvote_lab.evaluation.gallery import gallery
+from mapvote_lab.evaluation.real_report import draw_things
+from mapvote_lab.evaluation.real_street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.results import to_json
+from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import same_rows
+from mapvote_lab.evaluation.tables import ReportSection, as_text, page, write_text
 from mapvote_lab.simulation.processes import processes
 
 SCANS = 120

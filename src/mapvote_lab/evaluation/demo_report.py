@@ -16,13 +16,13 @@ from mapvote.core.types import F64, Bool
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.plots import save
 from mapvote.server.views.cutout import Cutout, fragment
+from mapvote_lab.evaluation import figures
 from mapvote_lab.evaluation.evaluate import Evaluation, PublishedRound
-from mapvote_lab.evaluation.experiments.scene import Scene
-from mapvote_lab.evaluation.reporting import figures
-from mapvote_lab.evaluation.reporting.gallery import MOVER, ChangedArea, areas_of
-from mapvote_lab.evaluation.reporting.tables import ReportSection, case_name, page, tables
+from mapvote_lab.evaluation.gallery import MOVER, ChangedArea, areas_of
 from mapvote_lab.evaluation.results import EvaluationResult
+from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, ObjectScores, same_rows
+from mapvote_lab.evaluation.tables import ReportSection, case_name, page, tables
 
 CASE = "surfaces"
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""

@@ -22,16 +22,16 @@ from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation.baselines import yardsticks
-from mapvote_lab.evaluation.experiments.cases import Case, Progress, fuse_case, read_kept, swept, untold
-from mapvote_lab.evaluation.experiments.localisation_errors import (
+from mapvote_lab.evaluation.cases import Case, Progress, fuse_case, read_kept, swept, untold
+from mapvote_lab.evaluation.localisation_errors import (
     T_map_world_of,
     in_changed_areas,
     localisation,
     map_shift,
     survey_anew,
 )
-from mapvote_lab.evaluation.experiments.scene import Pass, Scene, pass_folder, passes
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
+from mapvote_lab.evaluation.scene import Pass, Scene, pass_folder, passes
 from mapvote_lab.evaluation.scores import Scores
 from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth
 

@@ -11,8 +11,8 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive
 from mapvote.formats import DriveWriter, open_drive
-from mapvote_lab.evaluation.experiments import sensing
-from mapvote_lab.evaluation.experiments.real_street import Edit, part_of
+from mapvote_lab.evaluation import sensing
+from mapvote_lab.evaluation.real_street import Edit, part_of
 
 SPEED = 10.0
 

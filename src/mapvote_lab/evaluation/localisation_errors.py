@@ -18,9 +18,9 @@ from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.ndt_map import MapWindow
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.experiments.cases import Progress, untold
-from mapvote_lab.evaluation.experiments.scene import Pass, Scene
+from mapvote_lab.evaluation.cases import Progress, untold
 from mapvote_lab.evaluation.results import MapShift, PoseErrors
+from mapvote_lab.evaluation.scene import Pass, Scene
 from mapvote_lab.evaluation.truths import Truth, error_summary, rigid_between
 from mapvote_lab.simulation.routes import ar1
 

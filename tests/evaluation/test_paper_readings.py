@@ -7,10 +7,10 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.detection.paper import OPEN_SENTENCES, read
+from mapvote_lab.evaluation.cases import choose_cases, decided, paper_cases, read_kept
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
-from mapvote_lab.evaluation.experiments.cases import choose_cases, decided, paper_cases, read_kept
-from mapvote_lab.evaluation.experiments.scene import Scene, pass_folder
-from mapvote_lab.evaluation.reporting.tables import as_text
+from mapvote_lab.evaluation.scene import Scene, pass_folder
+from mapvote_lab.evaluation.tables import as_text
 from mapvote_lab.evaluation.truths import Jury
 
 pytestmark = pytest.mark.slow

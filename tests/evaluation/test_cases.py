@@ -15,8 +15,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
-from mapvote_lab.evaluation.experiments.cases import as_paper, choose_cases
-from mapvote_lab.evaluation.experiments.scene import (
+from mapvote_lab.evaluation.cases import as_paper, choose_cases
+from mapvote_lab.evaluation.scene import (
     _DRIVES_FROM,
     _MAP_FROM,
     BALLOTS_FROM,

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import Bool, CellState
-from mapvote_lab.evaluation.experiments.real_bench import (
+from mapvote_lab.evaluation.real_bench import (
     BUILT,
     BUILT_IN_RAIN,
     DEMOLISHED,
@@ -20,8 +20,8 @@ from mapvote_lab.evaluation.experiments.real_bench import (
     precision_near,
     score,
 )
-from mapvote_lab.evaluation.reporting.real_report import real_tables
-from mapvote_lab.evaluation.reporting.tables import Sheet
+from mapvote_lab.evaluation.real_report import real_tables
+from mapvote_lab.evaluation.tables import Sheet
 
 GRID = Grid(Lattice(), 0, 0, 40, 40)
 

@@ -17,12 +17,12 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
+from mapvote_lab.evaluation import figures
 from mapvote_lab.evaluation.baselines import heights_above_ground
+from mapvote_lab.evaluation.cases import YARDSTICKS, ballot_states, paper_cases
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
-from mapvote_lab.evaluation.reporting import figures
-from mapvote_lab.evaluation.reporting.tables import case_name
 from mapvote_lab.evaluation.scores import UNSCORED, reliability, same_rows
+from mapvote_lab.evaluation.tables import case_name
 from mapvote_lab.evaluation.truths import lay_on
 from mapvote_lab.simulation.scenario import load_scenario
 

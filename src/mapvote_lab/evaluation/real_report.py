@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, CellState
 from mapvote.plots import GONE, INK, NEW, STATE_COLOURS, UNSURE, save
-from mapvote_lab.evaluation.experiments.real_bench import (
+from mapvote_lab.evaluation.real_bench import (
     BUILT,
     BUILT_IN_RAIN,
     Asked,
@@ -23,8 +23,8 @@ from mapvote_lab.evaluation.experiments.real_bench import (
     score,
     unchanged_figures,
 )
-from mapvote_lab.evaluation.experiments.real_street import FalseChange, RealRun, is_changed, largest_false_changes
-from mapvote_lab.evaluation.reporting.tables import Sheet, write_text
+from mapvote_lab.evaluation.real_street import FalseChange, RealRun, is_changed, largest_false_changes
+from mapvote_lab.evaluation.tables import Sheet, write_text
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:

@@ -29,8 +29,8 @@ from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.build import BuildReport, build_map
-from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
-from mapvote_lab.evaluation.experiments.scene import SharedPass
+from mapvote_lab.evaluation.cases import Case, fuse_case
+from mapvote_lab.evaluation.scene import SharedPass
 from mapvote_lab.evaluation.scores import NEIGHBOURS, cells_with, determined, pieces, ratio
 from mapvote_lab.evaluation.truths import pose_errors, rigid_between
 

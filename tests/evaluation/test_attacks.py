@@ -12,7 +12,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.fuse import update_map
-from mapvote_lab.evaluation.experiments.conditions import ATTACKS
+from mapvote_lab.evaluation.conditions import ATTACKS
 
 TILE = (0, 0)
 STANDS, FREE, BUILT, GONE = (10, 10), (40, 40), (50, 50), (10, 12)

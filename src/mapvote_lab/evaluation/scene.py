@@ -44,8 +44,8 @@ from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observati
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.experiments.cases import Case, Keeper, Progress, Rule, counting_rule, untold
-from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
+from mapvote_lab.evaluation.cases import Case, Keeper, Progress, Rule, counting_rule, untold
+from mapvote_lab.evaluation.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
@@ -55,8 +55,8 @@ _DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
 _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
 BALLOTS_FROM = (
-    *_MAP_FROM, "vehicle.py", "evaluation/experiments/scene.py",
-    "evaluation/experiments/cases.py",
+    *_MAP_FROM, "vehicle.py", "evaluation/scene.py",
+    "evaluation/cases.py",
 )  # fmt: skip
 
 

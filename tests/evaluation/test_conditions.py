@@ -11,7 +11,7 @@ from hand_made import AtOnce, two_walls
 from mapvote.core.types import Drive, PosePrior, Registration, Scan
 from mapvote.formats import open_drive
 from mapvote.localisation.odometry import Fix
-from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
+from mapvote_lab.evaluation.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.routes import PRIOR_MEMORY_S, ar1

@@ -7,9 +7,9 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.real_bench import built, ground_of, score, survey_site
-from mapvote_lab.evaluation.experiments.real_street import (
+from mapvote_lab.evaluation.cases import choose_cases
+from mapvote_lab.evaluation.real_bench import built, ground_of, score, survey_site
+from mapvote_lab.evaluation.real_street import (
     Edit,
     Street,
     lay_street,
@@ -18,9 +18,9 @@ from mapvote_lab.evaluation.experiments.real_street import (
     unedited,
     vote_on,
 )
-from mapvote_lab.evaluation.experiments.sensing import disturbed, every_other_beam
+from mapvote_lab.evaluation.sensing import disturbed, every_other_beam
 
-KITTI = Path(__file__).parents[4] / "../shared/data/kitti/2011_09_26_0001"
+KITTI = Path(__file__).parents[2] / "../shared/data/kitti/2011_09_26_0001"
 needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="the KITTI scans are not at ../shared/data (licence)")
 
 

@@ -10,7 +10,7 @@ import pytest
 from made_courts import made_court
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError
-from mapvote_lab.evaluation.experiments.court import Court, cast_drive
+from mapvote_lab.evaluation.court import Court, cast_drive
 
 
 def test_cast_scans_end_on_the_first_surface_and_see_nothing_behind_it() -> None:

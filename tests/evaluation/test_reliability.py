@@ -12,7 +12,7 @@ from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Decision
-from mapvote_lab.evaluation.reporting.figures import reliability_diagram
+from mapvote_lab.evaluation.figures import reliability_diagram
 from mapvote_lab.evaluation.scores import binned, reliability
 
 

@@ -31,9 +31,9 @@ from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState, Driv
 from mapvote.formats import read_map
 from mapvote.fusion.fuse import states_over, update_map
 from mapvote.vehicle import vote_drive
-from mapvote_lab.evaluation.experiments.cases import Case, Progress
-from mapvote_lab.evaluation.reporting.tables import Sheet
+from mapvote_lab.evaluation.cases import Case, Progress
 from mapvote_lab.evaluation.scores import cells_with, map_obstacles, pieces
+from mapvote_lab.evaluation.tables import Sheet
 
 SESSIONS = ("robot1", "robot2", "robot3")
 CHANGES: dict[str, tuple[Kind, tuple[float, float, float, float]]] = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
-from mapvote_lab.evaluation.experiments.real_street import Edit
+from mapvote_lab.evaluation.real_street import Edit
 
 RAIN = 0.1
 """Share of the rays that end on drops where rain is asked for."""

@@ -20,10 +20,10 @@ from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
-from mapvote_lab.evaluation.experiments import sensing
-from mapvote_lab.evaluation.experiments.cases import Case, Progress
-from mapvote_lab.evaluation.experiments.cast_things import Site, Thing, with_things
-from mapvote_lab.evaluation.experiments.real_street import (
+from mapvote_lab.evaluation import sensing
+from mapvote_lab.evaluation.cases import Case, Progress
+from mapvote_lab.evaluation.cast_things import Site, Thing, with_things
+from mapvote_lab.evaluation.real_street import (
     Edit,
     RealRun,
     Street,
