@@ -126,7 +126,6 @@ def evaluate(
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     from mapvote.config import cache_folder, load_with_sources
     from mapvote_lab.evaluation.cases import DEFAULT_CASES, PUBLISHED, as_paper, choose_cases
-    from mapvote_lab.evaluation.conditions import Conditions
     from mapvote_lab.evaluation.evaluate import evaluate as run
     from mapvote_lab.evaluation.scene import Scene
     from mapvote_lab.evaluation.tables import tables
@@ -138,7 +137,7 @@ def evaluate(
     if cars is not None:
         overrides["temporary_cars"] = cars
     sentences = "all" if readings else "occluded" if scenario == PUBLISHED else None
-    scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
+    scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, poses)
     with stages() as told:
         evaluation = run(scene, cases, with_yardsticks, told, sentences)
     _show(list(tables(evaluation.result)), evaluation.result, json)
@@ -155,7 +154,7 @@ def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Pat
     """Tables on the terminal; all numbers into the file ``json``, if one is wanted."""
     from rich.console import Console
 
-    from mapvote_lab.evaluation.results import to_json
+    from mapvote_lab.evaluation.scores import to_json
     from mapvote_lab.evaluation.tables import write_text
 
     for sheet in sheets:
@@ -243,8 +242,8 @@ def demo(
         for line in lines:
             print(line)
         return
+    from mapvote_lab.evaluation.demo import CASE, commands, drives_sentence
     from mapvote_lab.evaluation.demo import demo as run
-    from mapvote_lab.evaluation.demo_report import CASE, commands, drives_sentence
 
     with stages() as told:
         evaluation, story = run(out, full=full, keep=keep, progress=told, show=show)

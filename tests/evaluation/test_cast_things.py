@@ -11,7 +11,7 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote_lab.evaluation.cast_things import Site, Thing, voxel_boxes, with_things
-from mapvote_lab.evaluation.sensing import in_rain
+from mapvote_lab.evaluation.real_street import in_rain
 from mapvote_lab.simulation.shapes import box
 
 HEIGHT = 1.8

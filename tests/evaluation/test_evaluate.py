@@ -17,8 +17,8 @@ from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation import tables
 from mapvote_lab.evaluation.cases import choose_cases
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
-from mapvote_lab.evaluation.results import EvaluationResult, to_json
 from mapvote_lab.evaluation.scene import Scene
+from mapvote_lab.evaluation.scores import EvaluationResult, to_json
 from mapvote_lab.evaluation.tables import ReportSection, page
 
 SLOWER = {"rate_hz": 4.0, "sensor": "vlp16"}
@@ -109,8 +109,7 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
 def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     from html import escape
 
-    from mapvote_lab.evaluation.demo import demo
-    from mapvote_lab.evaluation.demo_report import WHY_HARDER
+    from mapvote_lab.evaluation.demo import WHY_HARDER, demo
 
     shown: list[Path] = []
     evaluation, story = demo(tmp_path / "out", show=shown.append)

@@ -15,7 +15,6 @@ from msgspec.structs import asdict
 from hand_made import make_map, make_tile
 from hand_made import wall as tile_wall
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote_lab.evaluation.results import to_json
 from mapvote_lab.evaluation.scores import (
     PAPER_F1,
     PAPER_SCORES,
@@ -28,6 +27,7 @@ from mapvote_lab.evaluation.scores import (
     same_rows,
     score_cells,
     score_objects,
+    to_json,
 )
 
 

@@ -12,13 +12,14 @@ from mapvote_lab.evaluation.real_bench import built, ground_of, score, survey_si
 from mapvote_lab.evaluation.real_street import (
     Edit,
     Street,
+    disturbed,
+    every_other_beam,
     lay_street,
     open_recording,
     split,
     unedited,
     vote_on,
 )
-from mapvote_lab.evaluation.sensing import disturbed, every_other_beam
 
 KITTI = Path(__file__).parents[2] / "../shared/data/kitti/2011_09_26_0001"
 needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="the KITTI scans are not at ../shared/data (licence)")

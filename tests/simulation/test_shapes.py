@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.types import F64
-from mapvote_lab.simulation import buildings, furniture, shapes
+from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import load_scenario
-from mapvote_lab.simulation.terrain import KERB_M, make_terrain
+from mapvote_lab.simulation.world import KERB_M, make_terrain
 
 sizes = st.floats(0.2, 5.0)
 few = settings(max_examples=20)
@@ -93,28 +93,28 @@ def test_samples_lie_on_the_surface_one_to_each_patch() -> None:
 def test_a_building_stands_on_its_plot_and_hangs_over_the_sidewalk_by_two_metres_at_most(seed: int) -> None:
     rng = np.random.default_rng(seed)
     width, depth, height = rng.uniform(5, 20), rng.uniform(6, 12), rng.uniform(4, 14)
-    (x0, x1), (y0, y1), (z0, z1) = bounds(buildings.building(rng, width, depth, height))
+    (x0, x1), (y0, y1), (z0, z1) = bounds(shapes.building(rng, width, depth, height))
     assert -0.7 < x0 < 0.5
     assert width - 0.5 < x1 < width + 0.7
     assert -2.0 < y0 <= 0.0
     assert depth - 0.01 < y1 < depth + 0.7
-    assert z0 == buildings.FOOT_M, "its walls reach below any slope"
+    assert z0 == shapes.FOOT_M, "its walls reach below any slope"
     assert height <= z1 < height + 3.0
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_furniture_is_as_high_as_such_things_are_and_rooted_in_the_ground(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    for make, low, high in ((furniture.tree, 3.0, 7.5), (furniture.pole, 6.5, 9.0), (furniture.sign, 2.0, 3.2)):
+    for make, low, high in ((shapes.tree, 3.0, 7.5), (shapes.pole, 6.5, 9.0), (shapes.sign, 2.0, 3.2)):
         z0, z1 = bounds(make(rng))[2]
         assert z0 == -0.5
         assert low < z1 <= high
-    assert bounds(furniture.street_box(rng))[2][1] <= 2.5
-    assert bounds(furniture.rail(10.0)) == [(-0.06, 10.06), (-0.06, 0.06), (-0.3, 0.8)]
+    assert bounds(shapes.street_box(rng))[2][1] <= 2.5
+    assert bounds(shapes.rail(10.0)) == [(-0.06, 10.06), (-0.06, 0.06), (-0.3, 0.8)]
 
 
 def test_a_gantry_spans_the_road_higher_than_any_lorry() -> None:
-    solid = furniture.gantry(10.0)
+    solid = shapes.gantry(10.0)
     assert bounds(solid)[1] == (-10.15, 10.15)
     over_the_road = solid[np.abs(solid[:, :, 1]).max(axis=1) < 9.0]
     assert bounds(over_the_road)[2][0] > 4.5

@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.types import MapvoteError
 from mapvote_lab.simulation.actors import make_traffic
-from mapvote_lab.simulation.routes import make_routes
+from mapvote_lab.simulation.routes import PRIOR_MEMORY_S, ar1, make_routes
 from mapvote_lab.simulation.scenario import load_scenario, scenario_names
 from mapvote_lab.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
 from mapvote_lab.simulation.world import Body, Role, make_world
@@ -154,3 +154,10 @@ def test_truth_of_single_cells() -> None:
     strict, provenance, _ = label_cells(planes[:2], planes[2], planes[3], rate_hz=10.0)
     assert strict[0].tolist() == [case[4] for case in cases]
     assert provenance[0].tolist() == [case[5] for case in cases]
+
+
+def test_ar1_errors_have_their_deviation_and_their_memory() -> None:
+    errors = ar1(np.full(199_999, 0.1), np.array([0.1, 2.0]), np.random.default_rng(5))
+    np.testing.assert_allclose(errors.std(axis=0), [0.1, 2.0], rtol=0.05)
+    later = round(PRIOR_MEMORY_S / 0.1)
+    assert np.corrcoef(errors[:-later, 0], errors[later:, 0])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.05)

@@ -30,7 +30,6 @@ from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.cases import Progress, paper_cases, untold
-from mapvote_lab.evaluation.results import Cost
 from mapvote_lab.evaluation.scene import (
     BALLOTS_FROM,
     Pass,
@@ -39,7 +38,7 @@ from mapvote_lab.evaluation.scene import (
     key_of,
     sources_digest,
 )
-from mapvote_lab.evaluation.scores import map_obstacles
+from mapvote_lab.evaluation.scores import Cost, map_obstacles
 from mapvote_lab.simulation.processes import processes
 
 LAYERS = 64

@@ -14,9 +14,8 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
 from mapvote.localisation.prepare import deskew, motion_at
-from mapvote_lab.simulation.furniture import sign
 from mapvote_lab.simulation.lidar import Caster
-from mapvote_lab.simulation.shapes import box, cylinder, hedge, join, place
+from mapvote_lab.simulation.shapes import box, cylinder, hedge, join, place, sign
 
 REACH_M = 60.0
 _AGAIN_M = 0.05

@@ -21,8 +21,7 @@ from mapvote import plots as style
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
-from mapvote_lab.evaluation.results import CaseResult
-from mapvote_lab.evaluation.scores import NEIGHBOURS, PAPER_F1, Reliability, cells_with
+from mapvote_lab.evaluation.scores import NEIGHBOURS, PAPER_F1, CaseResult, Reliability, cells_with
 
 WIDTH, HEIGHT = 1400, 800
 

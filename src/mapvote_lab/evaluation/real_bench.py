@@ -20,19 +20,28 @@ from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
-from mapvote_lab.evaluation import sensing
 from mapvote_lab.evaluation.cases import Case, Progress
 from mapvote_lab.evaluation.cast_things import Site, Thing, with_things
 from mapvote_lab.evaluation.real_street import (
+    RAIN_SHARE,
     Edit,
     RealRun,
     Street,
+    biased,
+    disturbed,
+    drifting,
+    every_other_beam,
+    in_rain,
     is_changed,
+    late,
     lay_street,
     met_cells,
+    of_another_street,
     open_recording,
     unedited,
     vote_on,
+    with_fewer_points,
+    without_prior,
 )
 from mapvote_lab.evaluation.scores import NEIGHBOURS, determined, ratio
 
@@ -130,7 +139,7 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
     left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
     asked += [_gone(street, thing, thing.left, still) for thing in left]
     yield dry, asked
-    rain = sensing.in_rain(sensing.RAIN)  # over what was cast: drops hide the things as they hide the street
+    rain = in_rain(RAIN_SHARE)  # over what was cast: drops hide the things as they hide the street
     yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), asked
 
 
@@ -199,16 +208,16 @@ def precision_near(asked: Sequence[Asked], states: U8, grid: Grid) -> float:
 
 
 BLOCKS = (12, 25)
-RAIN = f"rain, {100 * sensing.RAIN:g} % of the rays"
+RAIN = f"rain, {100 * RAIN_SHARE:g} % of the rays"
 BUILT, BUILT_IN_RAIN, DEMOLISHED = "built", f"built in {RAIN}", "demolished"
 CASTS = {(BUILT, BUILT_IN_RAIN): built, (DEMOLISHED,): demolished}
 """The runs that each yields in turn."""
 PRIORS: Mapping[str, Edit] = {
-    "disturbed by 0.5 m, 2 deg": sensing.disturbed(),
-    **{f"late by {s:g} s": sensing.late(s) for s in (0.2, 0.5, 1.0, 2.0)},
-    **{f"off by {m:g} m": sensing.biased(m) for m in (3.0, 10.0)},
-    "drifting by 5 m": sensing.drifting(5.0),
-    "of another street": sensing.of_another_street(),
+    "disturbed by 0.5 m, 2 deg": disturbed(),
+    **{f"late by {s:g} s": late(s) for s in (0.2, 0.5, 1.0, 2.0)},
+    **{f"off by {m:g} m": biased(m) for m in (3.0, 10.0)},
+    "drifting by 5 m": drifting(5.0),
+    "of another street": of_another_street(),
 }
 
 
@@ -320,13 +329,13 @@ def _unchanged(
     jobs = {f"blocks of {BLOCKS[0]} scans": on(lambda: street)}
     jobs |= {f"blocks of {block} scans": on(laid(block)) for block in BLOCKS[1:]}
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
-    jobs["every other beam"] = on(lambda: street, sensing.every_other_beam)
-    jobs["70 % of the points lost"] = on(lambda: street, sensing.with_fewer_points(0.7))
-    jobs[RAIN] = on(lambda: street, sensing.in_rain(sensing.RAIN))
+    jobs["every other beam"] = on(lambda: street, every_other_beam)
+    jobs["70 % of the points lost"] = on(lambda: street, with_fewer_points(0.7))
+    jobs[RAIN] = on(lambda: street, in_rain(RAIN_SHARE))
     if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)
         jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in PRIORS.items()}
-    jobs["no prior"] = on(lambda: street, sensing.without_prior)
+    jobs["no prior"] = on(lambda: street, without_prior)
     return jobs
 
 

@@ -38,14 +38,12 @@ from mapvote.core.voxels import voxel_downsample
 from mapvote.detection.voter import NewPoints, Voter
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.formats.atomic import whole_file, whole_folder
-from mapvote.formats.drives.options import parse_scans
 from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
-from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
+from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
 from mapvote_lab.evaluation.cases import Case, Keeper, Progress, Rule, counting_rule, untold
-from mapvote_lab.evaluation.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
@@ -88,8 +86,8 @@ class Scene:
     settings: Settings
     cache: Path
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    conditions: Conditions = field(default_factory=Conditions)
-    """What the drives are put through besides; see there."""
+    poses: str = "ndt"
+    """"truth": surveys and vehicles know where they are."""
 
     @property
     def folder(self) -> Path:
@@ -101,9 +99,9 @@ class Scene:
     @property
     def work(self) -> Path:
         """What was made of the drives with these settings."""
-        s, c = self.settings, self.conditions
+        s = self.settings
         settings = [part.model_dump_json() for part in (s.ndt, s.moving, s.mapping)]
-        key = key_of(sources_digest(_MAP_FROM), *settings, c.scans, c.true_poses, c.true_ground)
+        key = key_of(sources_digest(_MAP_FROM), *settings, self.poses)
         return self.folder.with_name(f"{self.folder.name}-made") / key
 
     def simulate(self, progress: Progress = untold) -> None:
@@ -123,8 +121,6 @@ class Scene:
             for track in report.tracks:
                 with whole_file(self.work / f"{track.vehicle}.npy") as written, written.open("wb") as file:
                     np.save(file, track.T_map_lidar)
-            if self.conditions.true_ground:
-                point_map = with_true_ground(point_map, self.scenario, self.seed, self.overrides)
             write_map(point_map, self.work / "map")
             give_back_free_pages()
 
@@ -135,15 +131,14 @@ class Scene:
 
     def drive(self, name: str) -> Drive:
         """A drive with its own prior, or with its true poses for a prior."""
-        c = self.conditions
-        prior = str(self.folder / "truth" / name / "poses.txt") if c.true_poses else None
-        drive = open_drive(self.folder / name, scans=c.scans, prior=prior)
-        return replace(drive, prior_sigma_m=0.001, prior_sigma_deg=0.001) if c.true_poses else drive
+        if self.poses == "ndt":
+            return open_drive(self.folder / name)
+        drive = open_drive(self.folder / name, prior=str(self.folder / "truth" / name / "poses.txt"))
+        return replace(drive, prior_sigma_m=0.001, prior_sigma_deg=0.001)
 
     def true_poses(self, name: str) -> F64:
         """(n, 4, 4) where the drive's scans were really taken."""
-        poses = self.truth.poses(name)
-        return poses[parse_scans(self.conditions.scans, len(poses), name)]
+        return self.truth.poses(name)
 
     @property
     def truth(self) -> Truth:
@@ -161,7 +156,7 @@ class Scene:
 
 
 class SharedPass:
-    """A vehicle with a voter for every case. ``localise`` and ``movers``: as a vehicle's own, or an experiment's."""
+    """A vehicle with a voter for every case. ``localise``: as a vehicle's own, or an experiment's."""
 
     def __init__(
         self,
@@ -171,12 +166,11 @@ class SharedPass:
         cases: Sequence[Case],
         *,
         localise: Localise | None = None,
-        movers: Movers | None = None,
     ) -> None:
         self.drive, self.point_map, self.settings = drive, point_map, settings
         self._frontend = Frontend(
             localise or Localiser(point_map, settings, drive.sensor),
-            movers or MovingFilter(drive.sensor, settings.moving),
+            MovingFilter(drive.sensor, settings.moving),
             LocalMap(point_map, settings.voting.window_m),
             sensor=drive.sensor,
         )
@@ -245,13 +239,6 @@ class Pass:
     """Median milliseconds a scan by stage."""
 
 
-def have_voted(scene: Scene, cases: Sequence[Case]) -> bool:
-    """Whether the cache holds the first map and every ballot: no scan is needed."""
-    if not (scene.work / "map").exists():
-        return False
-    return all(pass_folder(scene, cases, name).exists() for name in scene.drive_names("v"))
-
-
 def passes(
     scene: Scene, cases: Sequence[Case], workers: int, progress: Progress = untold, keep: bool = False
 ) -> list[Pass]:  # fmt: skip
@@ -282,21 +269,21 @@ def passes(
 
 def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str, keep: bool = False) -> Path:
     """Where a vehicle's ballots lie in the cache."""
-    made_by = sources_digest(BALLOTS_FROM), scene.conditions
     votes_by = ((c.name, c.voting.model_dump_json(), c.paper.model_dump_json()) for c in cases)
-    key = key_of(*made_by, *votes_by)
+    key = key_of(sources_digest(BALLOTS_FROM), *votes_by)
     return scene.work / f"{'kept' if keep else 'votes'}-{key}" / vehicle
 
 
 def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = False) -> None:
     """One vehicle's drive with a voter for every case; ballots and poses into the cache, whole or not at all."""
     drive, point_map = scene.drive(name), scene.point_map
-    vehicle = SharedPass(
-        drive, point_map, scene.settings, cases,
-        localise=_localise(scene, drive, point_map),
-        movers=TrueMovers(scene.truth, open_drive(scene.folder / name)) if scene.conditions.true_moving else None,
-    )  # fmt: skip
-    keeper = _keeper(scene, drive, point_map) if keep else None
+    localise = None
+    if scene.poses == "truth":
+        assert drive.T_map_lidar_prior is not None
+        localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+    vehicle = SharedPass(drive, point_map, scene.settings, cases, localise=localise)
+    window = scene.truth.grid_on(point_map.lattice)
+    keeper = Keeper(window, drive.sensor, scene.settings.paper.n_min) if keep else None
     for i, scan in enumerate(drive):
         observations = vehicle.observe(scan, PosePrior.of(drive, i))
         if keeper:
@@ -316,24 +303,6 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
         np.save(folder / "poses.npy", poses)
         stages = {stage: 1000.0 * float(np.median(seconds)) for stage, seconds in report.stage_s.items()}
         (folder / "pass.json").write_text(json.dumps(stages))
-
-
-def _keeper(scene: Scene, drive: Drive, point_map: PointMap) -> Keeper:
-    return Keeper(scene.truth.grid_on(point_map.lattice), drive.sensor, scene.settings.paper.n_min)
-
-
-def _localise(scene: Scene, drive: Drive, point_map: PointMap) -> Localise:
-    """By NDT, or by the truth; with noise if the scene's conditions say so."""
-    conditions = scene.conditions
-    if conditions.true_poses:
-        assert drive.T_map_lidar_prior is not None
-        localise: Localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-    else:
-        localise = Localiser(point_map, scene.settings, drive.sensor)
-    if conditions.noise_m or conditions.noise_deg:
-        number = scene.drive_names("v").index(drive.path.name)
-        localise = Shaken(localise, drive.stamps_ns, conditions, (scene.seed, number))
-    return localise
 
 
 def _read_pass(folder: Path, cases: Sequence[Case]) -> Pass:

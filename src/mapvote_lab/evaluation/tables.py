@@ -17,8 +17,16 @@ from rich.table import Table
 from rich.text import Text
 
 from mapvote.formats.atomic import whole_file
-from mapvote_lab.evaluation.results import CaseResult, EvaluationResult
-from mapvote_lab.evaluation.scores import CLASSES, PAPER_F1, PAPER_SCORES, ByClass, Scores, ratio
+from mapvote_lab.evaluation.scores import (
+    CLASSES,
+    PAPER_F1,
+    PAPER_SCORES,
+    ByClass,
+    CaseResult,
+    EvaluationResult,
+    Scores,
+    ratio,
+)
 
 PAPER = "paper"
 """Heading of a column of the paper's own figures, which is drawn faintly."""

@@ -30,12 +30,13 @@ from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I32, NO_VOTE, U8, Bool, CellState, MapvoteError, Reference
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.fusion.fuse import Decision
-from mapvote_lab.evaluation.results import CaseResult, PoseErrors
 from mapvote_lab.evaluation.scores import (
     NEIGHBOURS,
     UNSCORED,
+    CaseResult,
     MapJudge,
     MapScores,
+    PoseErrors,
     Scores,
     cells_with,
     determined_share,

@@ -13,7 +13,7 @@ import numpy as np
 from mapvote.core.types import F32, F64, I32, I64
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import LANES, Scenario
-from mapvote_lab.simulation.terrain import KERB_M, Terrain
+from mapvote_lab.simulation.world import KERB_M, Terrain
 
 STEP_S = 0.25
 _BEYOND_M = 90.0

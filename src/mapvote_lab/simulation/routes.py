@@ -9,7 +9,7 @@ import numpy as np
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, I64
 from mapvote_lab.simulation.scenario import LANES, Scenario
-from mapvote_lab.simulation.terrain import Terrain
+from mapvote_lab.simulation.world import Terrain
 
 RTK_SIGMA_M = 0.02
 RTK_SIGMA_DEG = 0.05

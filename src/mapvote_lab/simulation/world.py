@@ -1,4 +1,4 @@
-"""The street before and after: every body that stands still, laid out by a seed (paper V, Figure 6)."""
+"""The street before and after: the ground, and every body that stands still, laid out by a seed (paper V, Figure 6)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,75 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mapvote.core.types import F32, F64, I32, MapvoteError
-from mapvote_lab.simulation import furniture
-from mapvote_lab.simulation.buildings import FOOT_M, building
+from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import Scenario
-from mapvote_lab.simulation.shapes import box, car, hedge, join, place, van
-from mapvote_lab.simulation.terrain import KERB_M, MARGIN_M, SIDEWALK_M, Terrain, make_terrain
+from mapvote_lab.simulation.shapes import FOOT_M, box, building, car, hedge, join, place, van
+
+KERB_M = 9.2
+"""From the road's axis to the kerb: two lanes of 3.5 m and a parking strip of 2.2 m."""
+SIDEWALK_M = 12.4
+"""From the road's axis to the outer edge of the sidewalk."""
+KERB_HEIGHT_M = 0.15
+MARGIN_M = 80.0
+"""The world goes on beyond the scored window: rays must not fall off its edge."""
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Height over map coordinates: z in metres, smooth apart from the kerbs."""
+
+    axis_y: float
+    crossing_x: float | None
+    length: float
+    crown: float
+    waves: F64
+    """(k, 4) amplitude (m), wave numbers along x and y (1/m), phase."""
+
+    def road_distance(self, x: ArrayLike, y: ArrayLike) -> F64:
+        """Distance from the nearest road axis, metres."""
+        across = np.abs(np.asarray(y, dtype=np.float64) - self.axis_y)
+        if self.crossing_x is None:
+            return across + 0.0 * np.asarray(x)
+        return np.minimum(across, np.abs(np.asarray(x, dtype=np.float64) - self.crossing_x))
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> F64:
+        """z of the ground at map (x, y), broadcast."""
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        distance = self.road_distance(x, y)
+        z = np.where(distance < KERB_M, -self.crown * distance, -self.crown * KERB_M + KERB_HEIGHT_M)
+        z = z + 0.015 * np.clip(distance - KERB_M, 0.0, 25.0)
+        for amplitude, kx, ky, phase in self.waves:
+            z = z + amplitude * np.sin(kx * x + ky * y + phase)
+        return z
+
+    def triangles(self) -> F64:
+        """The ground as a mesh that follows :meth:`height`, kerbs included."""
+        xs = np.arange(-MARGIN_M, self.length + MARGIN_M + 1.0, 2.0)
+        # The gutter is just within the kerb: on it, rounding would decide whether the road or the sidewalk is there.
+        side = np.array([3.5, KERB_M - 0.005, KERB_M + 0.005, SIDEWALK_M])
+        kerb = np.concatenate([-side[::-1], [0.0], side])
+        plots = np.array([18.0, 25.0, 34.2, 45.0, 60.0, 80.0])
+        ys = self.axis_y + np.concatenate([-plots, kerb, plots])
+        if self.crossing_x is not None:
+            xs = np.unique(np.concatenate([xs, self.crossing_x + kerb]))
+            ys = np.concatenate([ys, self.axis_y + np.arange(-78.0, 79.0, 4.0)])
+        ys = np.unique(ys)
+        gx, gy = np.meshgrid(xs, ys)
+        grid = np.stack([gx, gy, self.height(gx, gy)], axis=-1)
+        a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+        return np.concatenate([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
+
+
+def make_terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
+    """Seeded waves whose grades add up to at most ``scenario.max_grade`` along the road."""
+    lengths = np.array([rng.uniform(250, 400), rng.uniform(90, 150)])
+    shares = np.array([0.7, 0.3])
+    kx = 2 * np.pi / lengths
+    waves = np.column_stack([scenario.max_grade * shares / kx, kx, 0.1 * kx, rng.uniform(0, 2 * np.pi, 2)])
+    return Terrain(0.5 * scenario.width_m, scenario.crossing_m, scenario.length_m, scenario.crown, waves)
 
 
 class Role(IntEnum):
@@ -107,7 +169,7 @@ def make_world(scenario: Scenario, seed: int) -> World:
         bodies += _kerbside(scenario, side, terrain, rng)
     middle = Side(0.0, terrain.axis_y, 0.0, 1, ())
     for s in scenario.clutter.gantry_m:
-        bodies.append(Body("gantry", middle.put(furniture.gantry(KERB_M + 0.6), s, 0.0, terrain)))
+        bodies.append(Body("gantry", middle.put(shapes.gantry(KERB_M + 0.6), s, 0.0, terrain)))
     bodies += _parked_cars(scenario, terrain, np.random.default_rng([seed, 2]))
     return World(terrain, tuple(bodies))
 
@@ -193,10 +255,10 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     """Trees, lamps, signs, furniture and guard rails on the sidewalk."""
     clutter = scenario.clutter
     rows = (
-        ("tree", clutter.tree_spacing_m, KERB_M + 0.9, furniture.tree),
-        ("pole", clutter.pole_spacing_m, KERB_M + 0.5, furniture.pole),
-        ("sign", clutter.sign_spacing_m, KERB_M + 0.45, furniture.sign),
-        ("furniture", clutter.furniture_spacing_m, KERB_M + 0.85, furniture.street_box),
+        ("tree", clutter.tree_spacing_m, KERB_M + 0.9, shapes.tree),
+        ("pole", clutter.pole_spacing_m, KERB_M + 0.5, shapes.pole),
+        ("sign", clutter.sign_spacing_m, KERB_M + 0.45, shapes.sign),
+        ("furniture", clutter.furniture_spacing_m, KERB_M + 0.85, shapes.street_box),
     )
     bodies: list[Body] = []
     taken: list[float] = []
@@ -212,7 +274,7 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
         while s < high - 20.0:
             length = 2.0 * rng.integers(3, 9)
             if rng.uniform() < clutter.rail_share:
-                bodies.append(Body("rail", side.put(furniture.rail(length), s, KERB_M + 0.25, terrain)))
+                bodies.append(Body("rail", side.put(shapes.rail(length), s, KERB_M + 0.25, terrain)))
             s += length + rng.uniform(1.0, 4.0)
     return bodies
 
