@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, unpack_all
+from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, unpack_all, wall
 from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane, zstd
 from mapvote.codec.ballot import (
     MOST_OFF_M,
@@ -26,17 +26,17 @@ from mapvote.codec.ballot import (
     pack_odds,
     pack_path,
     pack_points,
+    unpack_offer,
     unpack_path,
     unpack_points,
     unpack_states,
     unpack_sureness,
 )
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.sparse_columns import pack_words, unpack_sparse, unpack_words
 from mapvote.codec.tile_planes import pack_memory, unpack_memory_plane
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.tile import PLANES, Memory
-from mapvote.core.types import F32, I8, U64, CellState, MapvoteError
+from mapvote.core.types import F32, I8, CellState, MapvoteError
 
 SIZE = 1000
 
@@ -72,44 +72,6 @@ def test_a_damaged_frame_or_one_of_another_size_is_refused(bad: bytes) -> None:
         unpack_plane(bad, "<u1", (SIZE,), "plane")
 
 
-def plane_of(marked: dict[int, int]) -> U64:
-    plane = np.zeros(65536, dtype=np.uint64)
-    plane[list(marked)] = np.array(list(marked.values()), dtype=np.uint64)
-    return plane.reshape(256, 256)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.dictionaries(st.integers(0, 65535), st.integers(0, 2**64 - 1), max_size=30))
-def test_words_come_back_as_they_went_in(marked: dict[int, int]) -> None:
-    plane = plane_of(marked)
-    data = pack_words(plane)
-    np.testing.assert_array_equal(unpack_words(data, "gone"), plane)
-    cells, words = unpack_sparse(data, "gone")
-    np.testing.assert_array_equal(cells, np.flatnonzero(plane))
-    np.testing.assert_array_equal(words, plane.reshape(-1)[cells])
-
-
-def test_a_full_plane_and_an_empty_one_travel_too() -> None:
-    for plane in (np.full((256, 256), ~np.uint64(0)), np.zeros((256, 256), np.uint64)):
-        np.testing.assert_array_equal(unpack_words(pack_words(plane), "free"), plane)
-    assert len(unpack_bytes(pack_words(plane), 10, "free")) == 0
-
-
-@pytest.mark.parametrize(
-    "raw",
-    [
-        b"x" * 9,
-        bytes([3, 0, 0, 0]) + bytes([1, 1]) + bytes(14),
-        bytes([255, 1, 255, 0]) + bytes([1, 1]) + bytes(14),
-        bytes([3, 0]) + bytes(8),
-    ],
-    ids=["half a cell", "a cell twice", "beyond the tile", "an empty word"],
-)
-def test_words_that_no_vehicle_wrote_are_refused(raw: bytes) -> None:
-    with pytest.raises(MapvoteError, match="ballot: free is damaged"):
-        unpack_sparse(compress(raw, 1), "free")
-
-
 EDGE = float(np.nextafter(np.float32(76.8), np.float32(0.0)))
 SIDE = st.one_of(st.floats(0.0, EDGE, width=32), st.sampled_from([0.0, EDGE]))
 HEIGHT = st.floats(-1e5, 1e5, width=32)
@@ -132,15 +94,7 @@ def test_a_point_stays_in_its_voxel_and_within_what_rounding_may_move_it_whateve
     np.testing.assert_array_equal(voxels(found)[near], voxels(sent)[near])
     np.testing.assert_allclose(found[near], sent[near], rtol=0, atol=MOST_OFF_M + 1e-4)
     np.testing.assert_array_equal(voxels(found)[:, :2], voxels(sent)[:, :2])
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_what_was_rounded_once_is_never_moved_again(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    sent = rng.uniform((0.0, 0.0, -50.0), (EDGE, EDGE, 150.0), (200, 3)).astype(np.float32)
-    once = unpack_points(pack_points(sent))
-    assert unpack_points(pack_points(once)).tobytes() == once.tobytes()
+    assert unpack_points(pack_points(found[near])).tobytes() == found[near].tobytes(), "it is never moved again"
 
 
 def test_points_of_a_street_take_less_than_half_of_what_float32_takes() -> None:
@@ -166,6 +120,7 @@ def test_points_that_no_vehicle_wrote_are_refused(raw: bytes, why: str) -> None:
         unpack_points(compress(raw, 1))
 
 
+POINTS = unpack_points(pack_points(wall([(3, 3)], [0.5, 0.8, 1.1])))
 CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
 
 
@@ -221,23 +176,27 @@ def test_what_no_vehicle_says_is_one_clear_error(data: bytes, says: str) -> None
         unpack_all(msgspec.structs.replace(sent, tiles=[tile]))
 
 
-def test_odds_are_of_states_and_a_tally_has_none() -> None:
-    with pytest.raises(MapvoteError, match="no states"):
-        unpack_sureness(pack_odds(np.zeros(2, np.int8)), None)
-
-
 def test_a_kilometre_is_told_every_five_metres_in_two_hundred_bytes() -> None:
     driven = np.column_stack([np.arange(0.0, 1000.0, 1.1), np.full(910, -40.0), np.full(910, 1.9)])
     packed = pack_path(list(driven), Lattice())
     cells = unpack_path(packed)
     assert len(packed) < 200
     assert 160 <= len(cells) <= 200
-    (
-        rows,
-        cols,
-    ) = Lattice().cells_of(driven[[0, -1]])
-    assert cells[[0, -1]].tolist() == np.column_stack([rows, cols]).tolist()
+    assert cells[[0, -1]].tolist() == np.column_stack(Lattice().cells_of(driven[[0, -1]])).tolist()
     assert (np.hypot(*np.diff(cells, axis=0)[:-1].T) * 0.3 >= 4.7).all()
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (pack_plane(np.zeros(3, np.int32)), "not a multiple of 8"),
+        (pack_plane(np.zeros((100_001, 2), np.int32)), "larger than"),
+        (b"no frame", "damaged"),
+    ],
+)
+def test_a_path_that_is_not_whole_is_refused(data: bytes, why: str) -> None:
+    with pytest.raises(MapvoteError, match=why):
+        unpack_path(data)
 
 
 def test_nobody_drove_far_from_where_he_voted() -> None:
@@ -245,15 +204,6 @@ def test_nobody_drove_far_from_where_he_voted() -> None:
     check_path(packed, [(0, 0), (0, 1)])
     with pytest.raises(MapvoteError, match="tile 0,2, far from where the drive voted"):
         check_path(packed, [(0, 0)])
-
-
-def test_a_path_that_is_not_whole_is_refused() -> None:
-    with pytest.raises(MapvoteError, match="not a multiple of 8"):
-        unpack_path(pack_plane(np.zeros(3, np.int32)))
-    with pytest.raises(MapvoteError, match="larger than"):
-        unpack_path(pack_plane(np.zeros((100_001, 2), np.int32)))
-    with pytest.raises(MapvoteError, match="damaged"):
-        unpack_path(b"no frame")
 
 
 def test_tiles_that_differ_in_their_memory_alone_are_equal_and_not_unequal() -> None:
@@ -271,3 +221,24 @@ def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: i
     planes = np.where(rng.random((PLANES, *SHAPE)) < share, rng.integers(1, 2**32, (PLANES, *SHAPE)), 0)
     digest, packed = pack_memory(Memory.of(planes.astype(np.uint32)))
     np.testing.assert_array_equal(unpack_memory_plane(packed[digest], digest).planes, planes)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(0, 255), max_size=64))
+def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
+    points, bright = np.repeat(POINTS[:1], len(values), axis=0), np.array(values, dtype=np.uint8)
+    sent = make_ballot(two_walls(), {(0, 0): Say(states_plane(), new_points=points, intensity=bright)})
+    (got,) = unpack_all(decode(encode(sent)))
+    assert got.new_points is not None
+    assert got.new_points.tobytes() == points.tobytes()
+    assert got.measured().tolist() == values
+
+
+def test_a_ballot_without_intensity_has_none_and_every_point_must_have_one() -> None:
+    points, two = pack_points(POINTS), pack_plane(np.zeros(2, np.uint8))
+    assert unpack_offer(points, None)[1] is None
+    for offered, why in ((points, "2 bytes, expected 3"), (None, "none of those")):
+        with pytest.raises(MapvoteError, match=why):
+            unpack_offer(offered, two)
+    with pytest.raises(MapvoteError, match="no states"):
+        unpack_sureness(pack_odds(np.zeros(2, np.int8)), None)

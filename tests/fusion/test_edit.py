@@ -17,9 +17,9 @@ from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, NO_VOTE, CellState
+from mapvote.core.types import F32, CellState
 from mapvote.fusion.edit import add_points, delete_points, words_gone
-from mapvote.fusion.tile_vote import TileVote, silenced
+from mapvote.fusion.tile_vote import TileVote
 
 GRID = Lattice().tile((0, 0))
 SEEDS = st.integers(0, 2**32 - 1)
@@ -181,52 +181,3 @@ def test_in_one_stage_a_mask_of_a_cell_that_may_be_empty_says_nothing_of_one_tha
     assert gone(tile, votes) == 0b1010
     votes[1].tally[CELL] = [3, 0, 0, 1, 0]  # type: ignore[index]
     assert gone(tile, votes) == 0
-
-
-@given(
-    masks=st.lists(st.integers(0, 0b111110), min_size=1, max_size=6),
-    states=st.lists(st.sampled_from([UO, CE, UE, UN]), min_size=6, max_size=6),
-    layers=st.sets(st.integers(1, 5), min_size=1),
-    more=st.integers(0, 0b111110),
-)
-@settings(max_examples=60, deadline=None)
-def test_the_order_of_votes_is_nothing_and_one_mark_more_never_takes_less(
-    masks: list[int], states: list[int], layers: set[int], more: int
-) -> None:
-    tile = make_tile(wall([CELL], [0.3 * layer + 0.15 for layer in sorted(layers)]))
-    votes = says(masks, states[: len(masks)])
-    before = gone(tile, votes)
-    assert gone(tile, votes[::-1]) == before
-    assert gone(tile, says([masks[0] | more, *masks[1:]], states[: len(masks)])) & before == before
-
-
-@settings(max_examples=60)
-@given(st.data())
-def test_the_same_votes_delete_nothing_more_where_their_cells_have_not_changed(data: st.DataObject) -> None:
-    """Votes on a cell are spent once its points change. The other votes delete nothing in a second publish."""
-    block = [(20 + r, 20 + c) for r in range(3) for c in range(3)]
-    heights = {
-        cell: data.draw(st.lists(st.sampled_from([0.45, 0.75, 1.05]), max_size=3, unique=True)) for cell in block
-    }
-    mapped = [cell for cell in block if heights[cell]]
-    if not mapped:
-        return
-    tile = make_tile(np.concatenate([wall([cell], heights[cell]) for cell in mapped]))
-    decided = {cell: data.draw(st.sampled_from([UO, CE, UN, None])) for cell in mapped}
-    votes = []
-    for i in range(3):
-        masks = {cell: data.draw(st.sampled_from([0, 0b10, 0b100, 0b1110])) for cell in mapped}
-        agree = {cell: state for cell, state in decided.items() if state is not None}
-        votes.append(TileVote(f"v{i}", 0, f"d{i}", states=states_plane(agree), gone=Words.of(words_plane(masks))))
-    states = states_plane({cell: state for cell, state in decided.items() if state is not None})
-    first = words_gone(votes, states, 2, tile)
-    if first is None:
-        return
-    deleted = np.asarray(first & tile.obstacle_words)
-    after, _ = delete_points(tile, first)
-    spent = np.flatnonzero(deleted)
-    again = [silenced(vote, spent) for vote in votes]
-    states = states.copy()
-    states.reshape(-1)[spent] = NO_VOTE
-    second = words_gone(again, states, 2, after)
-    assert second is None or not (second & after.obstacle_words).any()

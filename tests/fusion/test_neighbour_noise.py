@@ -62,22 +62,18 @@ def all_but_the_ends(found: set[int], cells: set[int]) -> bool:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_of_a_wall_that_went_at_a_cells_border_only_the_cell_that_it_stood_in_changed(side: int) -> None:
-    there, beyond = wall(BORDER_M + side * 0.04), spill_at(BORDER_M - side * 0.01)
-    points = np.concatenate([there, beyond])
-    found = set(spilled(tile_of(points), [], states_of(points, CE)).tolist())
-    assert all_but_the_ends(found, cells_of(beyond))
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_likewise_of_a_wall_along_the_other_axis_as_near_to_the_tiles_last_column_as_can_be(side: int) -> None:
-    there, beyond = wall(BORDER_M + side * 0.04), spill_at(BORDER_M - side * 0.01)
-    shift = np.float32((TILE_CELLS - 144) * CELL_SIZE)
-    points = np.concatenate([there, beyond])[:, [1, 0, 2]] + np.array([shift, 0, 0], np.float32)
-    spill = beyond[:, [1, 0, 2]] + np.array([shift, 0, 0], np.float32)
-    assert points[:, 0].max() > (TILE_CELLS - 2) * CELL_SIZE
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_a_wall_that_went_at_a_cells_border_only_the_cell_that_it_stood_in_changed(side: int, turned: bool) -> None:
+    """Turned it lies along the other axis, as near to the tile's last column as can be."""
+    there, spill = wall(BORDER_M + side * 0.04), spill_at(BORDER_M - side * 0.01)
+    if turned:
+        shift = np.array([(TILE_CELLS - 144) * CELL_SIZE, 0, 0], np.float32)
+        there, spill = (some[:, [1, 0, 2]] + shift for some in (there, spill))
+        assert there[:, 0].max() > (TILE_CELLS - 2) * CELL_SIZE
+    points = np.concatenate([there, spill])
     found = set(spilled(tile_of(points), [], states_of(points, CE)).tolist())
     assert all_but_the_ends(found, cells_of(spill))
+    assert not len(spilled(tile_of(points), [], states_of(spill, CE))), "the wall's own cell did not change"
 
 
 def test_of_a_wall_that_came_likewise_by_the_points_that_all_vehicles_offer() -> None:
@@ -128,12 +124,6 @@ def test_six_points_make_a_plane_and_five_do_not() -> None:
             points = np.concatenate([there - at, some])
             assert set(spilled(tile_of(points), [], states_of(points, CE)).tolist()) == found
     assert 0 in cells_of(beyond - corner)
-
-
-def test_a_wall_whose_other_cell_did_not_change_keeps_what_did() -> None:
-    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
-    points = np.concatenate([there, beyond])
-    assert not len(spilled(tile_of(points), [], states_of(beyond, CE)))
 
 
 def test_ground_that_lies_in_changed_cells_says_nothing_of_them() -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hand_made import Say, at_least, make_ballot, states_plane, two_walls, unpack_all, wall, words_plane
 from mapvote.codec.sparse_columns import Words, nothing_reached
@@ -45,11 +42,8 @@ def test_of_too_many_vehicles_those_that_passed_last_speak_with_all_their_drives
     policy = FuseSettings(latest_vehicles=2)
     votes = [drive("a", 1, {}), drive("b", 2, {}), drive("c", 3, {}), drive("a", 4, {})]
     assert sorted((v.vehicle, v.end_ns) for v in newest_votes(votes, policy)) == [("a", 1), ("a", 4), ("c", 3)]
-
-
-def test_of_vehicles_that_passed_at_the_same_moment_the_later_name_goes_first() -> None:
-    votes = [drive(name, 5, {}) for name in "bac"]
-    assert sorted(v.vehicle for v in newest_votes(votes, FuseSettings(latest_vehicles=2))) == ["b", "c"]
+    tied = newest_votes([drive(name, 5, {}) for name in "bac"], policy)
+    assert sorted(v.vehicle for v in tied) == ["b", "c"], "at the same moment the later name goes first"
 
 
 @pytest.mark.parametrize(
@@ -60,39 +54,6 @@ def test_a_vote_agrees_where_it_backs_what_was_decided_and_not_where_something_e
     assert vote.agreed(FLAT, decided, CO).tolist() == [0]
     assert vote.agreed(FLAT[::-1].copy(), decided, CO).tolist() == [1]
     assert vote.agreed(FLAT, decided, UO).tolist() == []
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1))
-def test_drives_fold_alike_in_any_order(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    drives = []
-    for i in range(3):
-        states = rng.choice([UO, UE, CO, CE, UN, NO_VOTE], (TILE_CELLS, TILE_CELLS)).astype(np.uint8)
-        gone = Words.of(words_plane({HERE: int(rng.integers(1, 99)), THERE: int(rng.integers(1, 99))}))
-        points = wall([HERE, THERE], [0.45 + i])
-        end_ns = int(rng.integers(2))  # ties go by hash
-        drives.append(TileVote("v", end_ns, f"d{i}", states=states, gone=gone, new_points=points, free=gone))
-    folded = [fold(list(order), WINDOW) for order in itertools.permutations(drives)]
-    for other in folded[1:]:
-        assert other.states is not None
-        assert folded[0].states is not None
-        assert other.states.tobytes() == folded[0].states.tobytes()
-        assert other.gone is not None
-        assert folded[0].gone is not None
-        assert other.gone.words.tobytes() == folded[0].gone.words.tobytes()
-        assert other.new_points is not None
-        assert folded[0].new_points is not None
-        assert sorted(other.new_points.tolist()) == sorted(folded[0].new_points.tolist())
-
-
-def test_points_of_a_cell_come_from_the_drive_that_speaks_there() -> None:
-    early = drive("v", 1, {HERE: CO, THERE: CO}, new_points=wall([HERE, THERE], [0.45]))
-    late = drive("v", 2, {HERE: CO}, new_points=wall([HERE], [1.05]))
-    points = fold([early, late], WINDOW).new_points
-    assert points is not None
-    assert sorted(points[:, 2].tolist()) == pytest.approx([0.45, 1.05])
-    assert len(points) == 2
 
 
 def test_the_vote_of_a_ballot_has_the_planes_that_were_sent_and_no_others() -> None:
@@ -130,26 +91,6 @@ def test_what_a_vote_backs_by_its_states_and_by_its_tally() -> None:
     assert one_stage.supports(CO, FLAT).tolist() == [True, False]
     assert one_stage.determined(FLAT).tolist() == [True, False]
     assert one_stage.spoken().sum() == 2
-
-
-def test_a_vote_without_a_mask_deletes_whole_columns_and_leaves_no_remnants() -> None:
-    vote = drive("v", 1, {HERE: CE, THERE: UO})
-    everywhere = Words.whole(np.isin(np.arange(TILE_CELLS**2), FLAT).reshape(TILE_CELLS, TILE_CELLS))
-    assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
-    assert vote.deletes(everywhere).words.tolist() == [2**64 - 1]
-    assert len(vote.remnants(np.full((TILE_CELLS, TILE_CELLS), UO, dtype=np.uint8)).cells) == 0
-
-
-def test_a_mask_deletes_where_the_cell_is_empty_and_marks_remnants_where_it_stands() -> None:
-    vote = drive("v", 1, {HERE: CE, THERE: UO}, gone=Words.of(words_plane({HERE: 0b1100, THERE: 0b10})))
-    everywhere = Words.whole(np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_))
-    assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
-    assert vote.deletes(everywhere).words.tolist() == [0b1100]
-    standing = np.full((TILE_CELLS, TILE_CELLS), UO, dtype=np.uint8)
-    assert vote.remnants(standing).cells.tolist() == [FLAT[1]]
-    assert vote.remnants(standing).words.tolist() == [0b10]
-    standing[THERE] = CE
-    assert len(vote.remnants(standing).cells) == 0
 
 
 def test_what_is_marked_voter_by_voter_is_what_each_deletes_and_passed() -> None:
@@ -209,6 +150,15 @@ def test_of_two_drives_that_sent_tallies_the_later_one_speaks_where_it_counted_a
     assert one.tally.sum() == 12
 
 
+def test_points_of_a_cell_come_from_the_last_drive_that_speaks_there_and_of_no_other_cell() -> None:
+    silent = [(50, 50)]
+    early = drive("v", 1, {HERE: CO, THERE: CO}, new_points=wall([HERE, THERE, *silent], [0.45]))
+    late = drive("v", 2, {HERE: CO}, new_points=wall([HERE, *silent], [1.05]))
+    points = fold([early, late], WINDOW).new_points
+    assert points is not None
+    assert sorted(points[:, 2].tolist()) == pytest.approx([0.45, 1.05])
+
+
 def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_others_keep_theirs() -> None:
     first, second = np.array([[1.0, 1.0, 0.5]], np.float32), np.array([[5.0, 5.0, 0.5]], np.float32)
     bare = drive("v", 1, {(3, 3): CO}, new_points=first)
@@ -218,12 +168,3 @@ def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_othe
     assert one.intensity is not None
     assert sorted(zip(one.new_points[:, 0].tolist(), one.intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
     assert len(drive("v", 3, {}).measured()) == 0
-
-
-def test_a_new_point_in_a_cell_of_which_nobody_speaks_is_left_out_whoever_sent_it() -> None:
-    silent, spoken = [1.0, 1.0, 0.5], [5.0, 5.0, 0.5]
-    points = np.array([silent, spoken], np.float32)
-    first, second = (drive("v", end, {(16, 16): CO}, new_points=points) for end in (1, 2))
-    one = fold([first, second], WINDOW)
-    assert one.new_points is not None
-    assert one.new_points.tolist() == [spoken]
