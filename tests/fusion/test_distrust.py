@@ -217,7 +217,7 @@ def test_the_difference_of_two_masks_is_that_of_the_rule_in_plain_words() -> Non
 def scattered(states: U8) -> U8:
     """Every cell of it moved by one, at will."""
     rng, at = np.random.default_rng(9), np.indices(SHAPE)
-    return states[tuple((at + rng.integers(-1, 2, (2, *SHAPE))).clip(0, 255))]
+    return np.asarray(states[tuple((at + rng.integers(-1, 2, (2, *SHAPE))).clip(0, 255))])
 
 
 def without_a_hole(states: U8, row: int, state: int) -> U8:
