@@ -14,6 +14,6 @@ setup(
         (f"share/{NAME}/schema", glob("schema/*")),
         (f"share/{NAME}/launch", glob("launch/*")),
     ],
-    install_requires=["setuptools", "mapvote[geo]"],
+    install_requires=["setuptools", "mapvote[geo,ros]"],
     entry_points={"console_scripts": [f"mapvote_map_loader_node = {NAME}.node:main"]},
 )

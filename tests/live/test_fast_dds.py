@@ -12,9 +12,8 @@ from live.loopback_dds import until
 from live.test_dds import cloud
 from mapvote.core.sensors import SENSORS
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
-from mapvote.live.cdr import from_cdr
 from mapvote.live.dds import Network
-from mapvote.live.messages import CLOUD
+from mapvote.live.messages import CLOUD, from_cdr
 
 SOURCE = Path(__file__).with_name("fast_dds_talker.cpp")
 SENT = 20

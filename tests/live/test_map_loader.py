@@ -15,8 +15,8 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import lay_version
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.live.cdr import blank_message, from_cdr, to_cdr
 from mapvote.live.map_loader import DIFFERENTIAL, HASH, HASH_TOPIC, PARTIAL, SELECTED, SERVICES, Cell, MapLoader
+from mapvote.live.messages import blank_message, from_cdr, to_cdr
 
 
 def points(*corners: tuple[float, float], z: float = 1.0) -> F64:

@@ -23,8 +23,8 @@ from rosbags.typesys import Stores, get_typestore
 from live.test_live_drive import SCANS, Live
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import MapvoteError
-from mapvote.live.cdr import from_cdr, stamp_ns
 from mapvote.live.drive import Fixed
+from mapvote.live.messages import from_cdr, stamp_ns
 from mapvote.live.status import (
     DIAGNOSTICS,
     POSE,

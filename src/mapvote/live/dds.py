@@ -20,8 +20,7 @@ import numpy as np
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import first_line, require
-from mapvote.live.cdr import NUMBERS, TYPES, Field, from_cdr
-from mapvote.live.messages import CLOUD, ODOMETRY
+from mapvote.live.messages import CLOUD, ODOMETRY, READ, from_cdr, typestore
 
 _DEPTH = 64
 """Messages that a reader or a writer keeps: six seconds of clouds."""
@@ -103,7 +102,7 @@ class Network:
         self, topic: str, kind: str, *, reliable: bool, transient_local: bool = False, depth: int = _DEPTH
     ) -> Subscription:
         """Messages of ``topic`` from now on. A reader that requests more than its writers offer receives nothing."""
-        qos = self._qos(reliable, transient_local, depth, 0, both=True)
+        qos = self._qos(reliable, transient_local, depth, 0)
         reader = self._sub.DataReader(self._participant, self._topic_of(topic, kind), qos=qos)
         self._waitset.attach(self._core.ReadCondition(reader, _ANY))
         return Subscription(topic, reader)
@@ -119,16 +118,16 @@ class Network:
         patience_s: float = 1.0,
     ) -> Publication:
         """A writer of ``topic``; ``patience_s``: how long it waits for a slow reader, if it is reliable."""
-        qos = self._qos(reliable, transient_local, depth, int(1e9 * patience_s), both=False)
+        qos = self._qos(reliable, transient_local, depth, int(1e9 * patience_s))
         return Publication(self._pub.DataWriter(self._participant, self._topic_of(topic, kind), qos=qos))
 
-    def _qos(self, reliable: bool, transient_local: bool, depth: int, patience_ns: int, *, both: bool) -> Any:
+    def _qos(self, reliable: bool, transient_local: bool, depth: int, patience_ns: int) -> Any:
         policy = self._core.Policy
         return self._core.Qos(
             policy.Reliability.Reliable(patience_ns) if reliable else policy.Reliability.BestEffort,
             policy.Durability.TransientLocal if transient_local else policy.Durability.Volatile,
             policy.History.KeepLast(depth),
-            policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=both),
+            policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
         )
 
     def _topic_of(self, topic: str, kind: str) -> Any:
@@ -141,22 +140,19 @@ class Network:
         """The type for Cyclone DDS, which checks each message by it on arrival."""
         if kind not in self._types:
             package, of, name = kind.split("/")
-            members = {field.name: self._member(field) for field in TYPES[kind]}
+            members = {called: self._member(*of) for called, of in typestore().fielddefs[kind][1]}
             self._types[kind] = self._idl.make_idl_struct(name, f"{package}.{of}.dds_.{name}_", members)
         return self._types[kind]
 
-    def _member(self, field: Field) -> Any:
+    def _member(self, shape: Any, of: Any) -> Any:
+        if shape.name == "NAME":
+            return self._type(of)
         types = require("cyclonedds.idl.types", "ros2", "DDS")
-        one: Any
-        if field.kind == "string":
-            one = str
-        elif field.kind == "bool":
-            one = bool
-        else:
-            one = getattr(types, field.kind) if field.kind in NUMBERS else self._type(field.kind)
-        if field.length is None:
-            return one
-        return types.array[one, field.length] if field.length else types.sequence[one]
+        if shape.name == "BASE":
+            return {"string": str, "bool": bool}.get(of[0]) or getattr(types, of[0])
+        inner, length = of
+        one = self._member(*inner)
+        return types.array[one, length] if length else types.sequence[one]
 
 
 @contextmanager
@@ -242,7 +238,7 @@ class Publication:
         return len(self._writer.get_matched_subscriptions())
 
     def send(self, data: bytes) -> None:
-        """One message in CDR, as :func:`mapvote.live.cdr.to_cdr` makes it. MapvoteError if DDS refuses it."""
+        """One message in CDR, as :func:`mapvote.live.messages.to_cdr` makes it. MapvoteError if DDS refuses it."""
         result = self._write(self._writer._ref, data + bytes(-len(data) % 4))
         if result < 0:
             raise MapvoteError(f"DDS refuses a message of {len(data)} bytes (error {result}); is a reader too slow?")
@@ -281,7 +277,7 @@ def measure_rates(network: Network, seconds: float) -> list[TopicRate]:
     while time.monotonic() < end:
         for one in network.published():
             name = one.topic, one.kind
-            if one.kind in TYPES and name not in readers:
+            if one.kind in READ and name not in readers:
                 durable = one.transient_local
                 readers[name] = network.subscribe(*name, reliable=one.reliable, transient_local=durable, depth=8)
         network.wait(0.05)

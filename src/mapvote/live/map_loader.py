@@ -27,9 +27,8 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.maps.autoware import METADATA, TILES
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.pcd import stream_pcd
-from mapvote.live.cdr import blank_message, define, from_cdr, header_of, to_cdr
 from mapvote.live.dds import Network, Publication, Subscription
-from mapvote.live.messages import MAP_FRAME, cloud_of
+from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
 
 log = logging.getLogger("mapvote.live")
 _DEPTH = 10
@@ -46,24 +45,6 @@ SERVICES = {
 HASH, HASH_TOPIC = "tier4_external_api_msgs/msg/MapHash", "/api/autoware/get/map/info/hash"
 TABLE, TABLE_TOPIC = "autoware_map_msgs/msg/PointCloudMapMetaData", "/map/pointcloud_map_metadata"
 _MSG = "autoware_map_msgs/msg/PointCloudMapCell"
-define("""
-autoware_map_msgs/msg/AreaInfo: float32 center_x, float32 center_y, float32 radius
-autoware_map_msgs/msg/PointCloudMapCellMetaData: float32 min_x, float32 min_y, float32 max_x, float32 max_y
-autoware_map_msgs/msg/PointCloudMapCellMetaDataWithID: string cell_id, PointCloudMapCellMetaData metadata
-autoware_map_msgs/msg/PointCloudMapCellWithID: string cell_id, PointCloud2 pointcloud,
-    PointCloudMapCellMetaData metadata
-autoware_map_msgs/msg/PointCloudMapMetaData: Header header, PointCloudMapCellMetaDataWithID[] metadata_list
-autoware_map_msgs/srv/GetDifferentialPointCloudMap_Request: uint64 guid, int64 seq, AreaInfo area, string[] cached_ids
-autoware_map_msgs/srv/GetDifferentialPointCloudMap_Response: uint64 guid, int64 seq, Header header,
-    PointCloudMapCellWithID[] new_pointcloud_with_ids, string[] ids_to_remove
-autoware_map_msgs/srv/GetPartialPointCloudMap_Request: uint64 guid, int64 seq, AreaInfo area
-autoware_map_msgs/srv/GetPartialPointCloudMap_Response: uint64 guid, int64 seq, Header header,
-    PointCloudMapCellWithID[] new_pointcloud_with_ids
-autoware_map_msgs/srv/GetSelectedPointCloudMap_Request: uint64 guid, int64 seq, string[] cell_ids
-autoware_map_msgs/srv/GetSelectedPointCloudMap_Response: uint64 guid, int64 seq, Header header,
-    PointCloudMapCellWithID[] new_pointcloud_with_ids
-tier4_external_api_msgs/msg/MapHash: string lanelet, string pcd
-""")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +120,7 @@ class MapLoader:
 
     def answer(self, service: str, request: Any) -> dict[str, Any]:
         """What a service of this type answers: the members of its response by name, clouds as messages of
-        :mod:`mapvote.live.cdr`. ``request``: any object with the request's members.
+        :mod:`mapvote.live.messages`. ``request``: any object with the request's members.
 
         The differential one sends the tiles in the area that are not cached, and names the cached ones that are not in
         it or not of this version."""

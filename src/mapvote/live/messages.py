@@ -1,8 +1,13 @@
-"""Clouds, poses and frames as messages of ROS 2, and poses from them."""
+"""Messages of ROS 2 as DDS carries them: CDR bytes, read and written by rosbags (extra ``ros2``); clouds and poses.
+
+A message has its members as attributes. Sequences of numbers are views of the bytes: the points of a cloud are not
+copied.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,12 +15,101 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.types import F64, MapvoteError
-from mapvote.live.cdr import blank_message, header_of
+from mapvote.formats.extras import first_line, require
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+READ = {CLOUD, ODOMETRY, TF, "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "std_msgs/msg/Header"}
+READ |= {f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")}
+READ |= {
+    f"geometry_msgs/msg/{name}{stamped}"
+    for name in ("Point", "Pose", "PoseWithCovariance", "Quaternion", "Transform", "Twist", "Vector3")
+    for stamped in ("", "Stamped")
+}
+"""Types of the topics that are counted and played."""
 MAP_FRAME, BASE_FRAME, LIDAR_FRAME = "map", "base_link", "lidar"
 _DATATYPES = {"<f4": 7, "<u2": 4}
 """Of a sensor_msgs/PointField."""
+_MAP_MSGS = "autoware_map_msgs"
+_AUTOWARE = {
+    f"{_MAP_MSGS}/msg/AreaInfo": "float32 center_x, float32 center_y, float32 radius",
+    f"{_MAP_MSGS}/msg/PointCloudMapCellMetaData": "float32 min_x, float32 min_y, float32 max_x, float32 max_y",
+    f"{_MAP_MSGS}/msg/PointCloudMapCellMetaDataWithID": "string cell_id, CELL metadata",
+    f"{_MAP_MSGS}/msg/PointCloudMapCellWithID": "string cell_id, sensor_msgs/PointCloud2 pointcloud, CELL metadata",
+    f"{_MAP_MSGS}/msg/PointCloudMapMetaData": "Header header, PointCloudMapCellMetaDataWithID[] metadata_list",
+    f"{_MAP_MSGS}/srv/GetDifferentialPointCloudMap_Request": "NUMBERED, AREA, string[] cached_ids",
+    f"{_MAP_MSGS}/srv/GetDifferentialPointCloudMap_Response": "NUMBERED, Header header, TILES, string[] ids_to_remove",
+    f"{_MAP_MSGS}/srv/GetPartialPointCloudMap_Request": "NUMBERED, AREA",
+    f"{_MAP_MSGS}/srv/GetPartialPointCloudMap_Response": "NUMBERED, Header header, TILES",
+    f"{_MAP_MSGS}/srv/GetSelectedPointCloudMap_Request": "NUMBERED, string[] cell_ids",
+    f"{_MAP_MSGS}/srv/GetSelectedPointCloudMap_Response": "NUMBERED, Header header, TILES",
+    "tier4_external_api_msgs/msg/MapHash": "string lanelet, string pcd",
+}
+"""What rosbags does not bring. Requests and responses begin with the client's number and the request's."""
+_SHORT = {
+    "NUMBERED": "uint64 guid, int64 seq",
+    "AREA": f"{_MAP_MSGS}/AreaInfo area",
+    "TILES": f"{_MAP_MSGS}/PointCloudMapCellWithID[] new_pointcloud_with_ids",
+    "CELL": f"{_MAP_MSGS}/PointCloudMapCellMetaData",
+}
+
+
+@cache
+def typestore() -> Any:
+    """Every message type, by its full name such as sensor_msgs/msg/PointCloud2."""
+    types = require("rosbags.typesys", "ros2", "messages of ROS 2")
+    store = types.get_typestore(types.Stores.LATEST)
+    for name, members in _AUTOWARE.items():
+        for short, long in _SHORT.items():
+            members = members.replace(short, long)
+        (found,) = types.get_types_from_msg(members.replace(", ", "\n"), name).values()
+        store.register({name: found})
+    return store
+
+
+def blank_message(kind: str, **members: Any) -> Any:
+    """A message of this type: zeros and empty strings, but for ``members``."""
+    store = typestore()
+    return store.types[kind](**{name: _blank(*of) for name, of in store.fielddefs[kind][1]} | members)
+
+
+def _blank(shape: Any, of: Any) -> Any:
+    if shape.name == "BASE":
+        return "" if of[0] == "string" else 0
+    if shape.name == "NAME":
+        return blank_message(of)
+    (inner, base), length = of
+    return np.zeros(length, base[0]) if inner.name == "BASE" and base[0] != "string" else []
+
+
+def from_cdr(kind: str, data: bytes | memoryview) -> Any:
+    """The message, its members as attributes; numbers of a sequence as an array that is a view of ``data``.
+
+    MapvoteError if the bytes end too early or are in an encoding that ROS 2 does not use.
+    """
+    try:
+        return typestore().deserialize_cdr(memoryview(data), kind)
+    except MapvoteError:
+        raise
+    except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
+        raise MapvoteError(
+            f"{kind}: a message of {len(data)} bytes is cut off, damaged or no plain CDR ({first_line(error)})"
+        ) from error
+
+
+def to_cdr(kind: str, message: Any) -> bytes:
+    """The message in little-endian CDR. Sequences of numbers are given as arrays."""
+    return bytes(typestore().serialize_cdr(message, kind, little_endian=True))
+
+
+def stamp_ns(header: Any) -> int:
+    """The time in a std_msgs/Header, nanoseconds."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def header_of(time_ns: int, frame_id: str) -> Any:
+    """A std_msgs/Header."""
+    time = blank_message("builtin_interfaces/msg/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return blank_message("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
 
 def cloud_of(columns: Mapping[str, NDArray[Any]], stamp_ns: int, frame: str) -> Any:

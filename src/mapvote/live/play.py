@@ -18,9 +18,21 @@ from mapvote.core.geometry import inverse
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.rosbag import Bag, is_rosbag
-from mapvote.live.cdr import TYPES, blank_message, header_of, to_cdr
 from mapvote.live.dds import Network, Publication
-from mapvote.live.messages import BASE_FRAME, CLOUD, LIDAR_FRAME, MAP_FRAME, ODOMETRY, TF, cloud_of, pose_of
+from mapvote.live.messages import (
+    BASE_FRAME,
+    CLOUD,
+    LIDAR_FRAME,
+    MAP_FRAME,
+    ODOMETRY,
+    READ,
+    TF,
+    blank_message,
+    cloud_of,
+    header_of,
+    pose_of,
+    to_cdr,
+)
 
 _DISCOVERY_S = 0.5
 """Between the first reader and the first message, so that every reader has found every topic."""
@@ -79,9 +91,9 @@ def opened(path: Path) -> tuple[list[tuple[str, str]], Callable[[], Iterator[Mes
     bag = Bag(path)
     if not bag.reader.is2:
         raise MapvoteError(f"{path}: a ROS 1 bag, whose messages are no CDR; convert it with rosbags-convert")
-    found = [c for c in bag.reader.connections if c.msgtype in TYPES]
+    found = [c for c in bag.reader.connections if c.msgtype in READ]
     if not found:
-        raise MapvoteError(f"{path}: no topic of a type that can be played: {', '.join(sorted(TYPES))}")
+        raise MapvoteError(f"{path}: no topic of a type that can be played: {', '.join(sorted(READ))}")
 
     def messages() -> Iterator[Message]:
         for connection, time_ns, data in bag.reader.messages(connections=found):

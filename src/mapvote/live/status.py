@@ -16,10 +16,9 @@ import numpy as np
 from mapvote.core.geometry import inverse
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.extras import require
-from mapvote.live.cdr import blank_message, header_of, to_cdr
 from mapvote.live.dds import Network, Publication
 from mapvote.live.drive import Counts, Fixed, LiveDrive
-from mapvote.live.messages import pose_of
+from mapvote.live.messages import blank_message, header_of, pose_of, to_cdr
 from mapvote.live.outbox import Outbox, OutboxReport
 from mapvote.live.road_map import Maps, RoadMap
 from mapvote.live.subscriptions import Subscriptions

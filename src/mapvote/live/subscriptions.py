@@ -19,10 +19,9 @@ from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
-from mapvote.live.cdr import from_cdr, stamp_ns
 from mapvote.live.dds import Chosen, Network
 from mapvote.live.drive import WaitingScan
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr, matrix_of, stamp_ns
 
 log = logging.getLogger("mapvote.live")
 _SWEEP = 0.55
@@ -41,12 +40,12 @@ _TOGETHER_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """A PointCloud2 in CDR."""
+    """A PointCloud2 that arrived."""
 
     lidar: int
     stamp_ns: int
     sent_ns: int
-    data: bytes | memoryview
+    message: Any
 
 
 class Sweeps:
@@ -177,9 +176,9 @@ class Subscriptions:
         for lidar, reader in enumerate(self._points):
             for sent_ns, data in reader.take():
                 with self._some_unusable(CLOUD):
-                    header = from_cdr("std_msgs/msg/Header", data)
-                    self.frames[lidar] = header.frame_id.strip("/")
-                    clouds.append(Cloud(lidar, stamp_ns(header), sent_ns, data))
+                    message = from_cdr(CLOUD, data)
+                    self.frames[lidar] = message.header.frame_id.strip("/")
+                    clouds.append(Cloud(lidar, stamp_ns(message.header), sent_ns, message))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
         self.clouds += len(clouds)
         return self._sweeps.add(clouds)
@@ -212,7 +211,7 @@ class Subscriptions:
         if self.sensor is None and len(firsts) >= _MEASURED:
             steps_ns = np.diff([cloud.stamp_ns for cloud in firsts])
             rate_hz = round(1e9 / float(np.median(steps_ns)), 1)
-            read = [scan_from_point_cloud2(from_cdr(CLOUD, cloud.data), UNKNOWN) for cloud in firsts[:_MEASURED]]
+            read = [scan_from_point_cloud2(cloud.message, UNKNOWN) for cloud in firsts[:_MEASURED]]
             found = estimate_sensor(read, rate_hz)
             self.sensor, self.sensor_told = found.sensor, found.told
         return self.sensor is not None
@@ -226,7 +225,7 @@ class Subscriptions:
         assert sensor is not None
         scans = []
         for cloud in clouds:
-            scan = scan_from_point_cloud2(from_cdr(CLOUD, cloud.data), sensor)
+            scan = scan_from_point_cloud2(cloud.message, sensor)
             if cloud.lidar:
                 if mounts is None:
                     raise MapvoteError(f"/tf_static does not say where {self.frames[cloud.lidar]} sits")
