@@ -1,32 +1,46 @@
-"""What a scan adds to the counts of each voxel, against a plain reference; what a hit speaks for, box by box."""
+"""The rule of evidence: what a scan adds to the counts of each voxel, what they say of it, and what is enough."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given, settings
+import pytest
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import ndimage
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, Reference
+from mapvote.core.types import F64, I32, U64, Bool, CellState, Reference
 from mapvote.detection.evidence import (
     CROSSED,
+    GONE_RAYS,
     HIT,
+    HIT_RAYS,
     HIT_REACH_M,
+    NEW_A_CELL,
+    NEW_ENOUGH,
+    NEW_RAYS,
     PASSED,
     PASSES,
+    SUPPORT,
+    TOGETHER,
     WORDS,
+    Facts,
     count_scan,
+    enough,
     free_words,
+    judge_window,
     least_passed,
     mark_near,
+    weigh_voxels,
 )
-from mapvote.detection.packed_tiles import PLANES, PackedTiles, count_of
+from mapvote.detection.packed_tiles import PLANES, Overlap, PackedTiles, count_of
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 
@@ -142,11 +156,6 @@ def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_t
     assert least_passed(cell_with(bit, passes), bit) == min(asked)
 
 
-def test_rays_that_only_graze_a_roof_never_cross_it_whatever_their_number() -> None:
-    assert least_passed(cell_with(7, (0, FULL, FULL)), 7) == 0
-    assert least_passed(cell_with(7, (FULL, FULL, 0)), 7) == 0
-
-
 def test_free_is_what_two_scans_passed_and_none_hit() -> None:
     planes = np.zeros((3, 1, WORDS), np.uint64)
     planes[2, 0, PASSES + 1] = 0b1110  # passed by two scans
@@ -167,16 +176,13 @@ def test_cells_of_unknown_ground_gather_nothing() -> None:
 SIDE = 7
 
 
-def bare_scan(
-    points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied: np.ndarray | None = None
-) -> Observation:
+def bare_scan(points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied: np.ndarray) -> Observation:
     """A scan over a window of SIDE by SIDE cells whose columns begin at the layers ``base``; no ray is followed."""
     grid = Grid(Lattice(0.05, -0.1), 3, -4, SIDE, SIDE)
     none = np.full(grid.shape, np.inf, np.float32)
     words, counts = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.int32)
     ground_z = (base * CELL_SIZE).astype(np.float32)
-    mapped = words if occupied is None else occupied
-    reference = Reference(grid, ground_z, base, mapped, counts, none, -none, None)
+    reference = Reference(grid, ground_z, base, occupied, counts, none, -none, None)
     obstacle, cell = find_obstacles(points, reference)
     up = np.array([0.0, 0.0, 1.0])
     scan = PlacedScan(0, points, np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
@@ -199,49 +205,148 @@ def by_boxes(here: Observation) -> np.ndarray:
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(0, 40))
-def test_a_hit_speaks_for_every_voxel_whose_box_it_comes_within_reach_of(seed: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
-    low, high = np.array([-1.3, 0.7, -2.0]), np.array([1.1, 3.1, 24.0])
-    here = bare_scan(rng.uniform(low, high, (n, 3)), base, rng.random(n) < 0.2)
-    assert np.array_equal(near_hits(here)[0], by_boxes(here))
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 2**31), st.integers(0, 40))
-def test_a_hit_that_speaks_for_a_mapped_voxel_strikes_no_other(seed: int, n: int) -> None:
+def test_a_hit_speaks_for_every_voxel_that_it_comes_near_and_strikes_another_only_if_none_of_these_is_mapped(
+    seed: int, n: int
+) -> None:
     rng = np.random.default_rng(seed)
     base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
     mapped = rng.integers(0, 2**63, (SIDE, SIDE), np.uint64) & rng.integers(0, 2**63, (SIDE, SIDE), np.uint64)
-    points = rng.uniform([-1.3, 0.7, -2.0], [1.1, 3.1, 12.0], (n, 3))
+    points = rng.uniform([-1.3, 0.7, -2.0], [1.1, 3.1, rng.choice([12.0, 24.0])], (n, 3))
     here = bare_scan(points, base, rng.random(n) < 0.2, mapped)
     struck = np.zeros_like(mapped)
     for k in np.flatnonzero(here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)):
-        alone = bare_scan(points[k : k + 1], base, np.array([False]), mapped)
-        if not (by_boxes(alone) & mapped).any():
+        if not (by_boxes(bare_scan(points[k : k + 1], base, np.array([False]), mapped)) & mapped).any():
             row, col = divmod(int(here.scan.cell[k]), SIDE)
             layer = int(points[k, 2] // CELL_SIZE) - base[row, col]
             struck[row, col] |= np.uint64(1) << np.uint64(np.clip(layer, 0, TOP_BIT))
-    assert np.array_equal(near_hits(here)[1], struck)
+    near, apart = near_hits(here)
+    assert np.array_equal(near, by_boxes(here))
+    assert np.array_equal(apart, struck)
 
 
-def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
-    flat = np.zeros((SIDE, SIDE), np.int32)
-    points = np.array([[0.0, 1.9, 0.1], [0.0, 1.9, 1.0]])
-    assert not any(words.any() for words in near_hits(bare_scan(points, flat, np.array([False, True]))))
+WIDE = 20
+NOTHING = np.zeros((WIDE, WIDE), np.uint64)
+EVEN = np.zeros((WIDE, WIDE), np.int32)
+"""As often hit as passed."""
 
 
-def test_no_hit_speaks_beyond_the_window() -> None:
-    """Hits at all four borders of planes that lie in larger ones, which nobody may touch."""
-    around, inner = np.zeros((2, SIDE + 2, SIDE + 2), np.uint64), np.s_[:, 1:-1, 1:-1]
-    near, apart = around[inner]
-    low, high = 0.01, SIDE * CELL_SIZE - 0.01
-    points = np.array([[x, y, 1.0] for x in (low, 1.0, high) for y in (low, 1.0, high)])
-    cell = (points[:, :2] // CELL_SIZE).astype(np.int32) @ np.array([1, SIDE], dtype=np.int32)
-    chosen, reach = np.ones(len(points), np.bool_), HIT_REACH_M / CELL_SIZE
-    mapped, base = np.zeros((SIDE, SIDE), np.uint64), np.zeros((SIDE, SIDE), np.int32)
-    mark_near(points, cell, chosen, base, mapped, (0.0, 0.0), reach, near, apart)
-    assert set(cell) <= set(np.flatnonzero(near))
-    assert set(cell) == set(np.flatnonzero(apart))
-    around[inner] = 0
-    assert not around.any()
+def words(*marks: tuple[int, int, int]) -> U64:
+    out = NOTHING.copy()
+    for row, col, word in marks:
+        out[row, col] = word
+    return out
+
+
+def alone(voxels: U64, others: Bool | None = None) -> bool:
+    """Whether all cells with ``voxels``, fewer than SUPPORT, are a thing of its own."""
+    cells = voxels != 0
+    found = enough(voxels, 0, np.zeros((WIDE, WIDE), np.bool_) if others is None else others, EVEN)
+    assert not found[~cells].any()
+    return bool(found[cells].all())
+
+
+@pytest.mark.parametrize(
+    ("voxels", "thing", "why"),
+    [
+        (words((5, 5, 0b110)), True, "two on the ground, on top of each other"),
+        (words((5, 5, 0b110), (5, 6, 0b110)), True, "a bollard on the border of two cells"),
+        (words((5, 5, 0b10)), False, "one voxel alone"),
+        (words((5, 5, 0b1010)), False, "two that do not touch"),
+        (words((5, 5, 0b110000)), False, "in the air"),
+        (words((5, 5, 0b110), (6, 6, 0b110000)), False, "a part of it in the air"),
+        (words((5, 5, 0b10), (5, 6, 0b10)), False, "no taller than a kerb"),
+    ],
+)
+def test_two_voxels_on_the_ground_on_top_of_each_other_are_a_thing_and_specks_are_none(
+    voxels: U64, thing: bool, why: str
+) -> None:
+    assert alone(voxels) == thing, why
+
+
+def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
+    others = np.zeros((WIDE, WIDE), np.bool_)
+    others[7, 7] = True
+    assert alone(words((5, 5, 0b110)), others=others)
+    assert not alone(words((6, 6, 0b110)), others=others)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 2**59)), max_size=12),
+    st.sampled_from([0, NEW_A_CELL]),
+)
+def test_what_is_enough_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]], a_cell: int) -> None:
+    voxels = words(*((2 * row, 2 * col, word << 4) for row, col, word in marks))  # no two cells touch, none the ground
+    assert np.array_equal(enough(voxels, a_cell, voxels != 0, EVEN), np.bitwise_count(voxels) >= SUPPORT)
+
+
+@given(st.integers(1, WIDE), st.integers(1, 8))
+def test_what_is_new_needs_more_the_more_cells_it_has_and_at_most_so_much(cells: int, voxels_a_cell: int) -> None:
+    voxels = words(*((5, col, (1 << voxels_a_cell) - 1 << 4) for col in range(cells)))
+    needed = min(SUPPORT + NEW_A_CELL * (cells - 1), NEW_ENOUGH)
+    assert enough(voxels, NEW_A_CELL, voxels != 0, EVEN)[5, 0] == (cells * voxels_a_cell >= needed)
+
+
+def test_a_cell_goes_along_that_touches_what_went_if_rays_passed_half_of_it_and_nothing_stands() -> None:
+    """A row of cells from a pole that went. Of the others rays passed half of what is mapped (P) or less (N); in S
+    something stands."""
+    row = "PPPPPNPP", "NPP", "PSPP"
+    gone_along = "PPPPP", "", "P"
+    for cells, along in zip(row, gone_along, strict=True):
+        facts, occupied = Facts.none((1, 12)), np.zeros((1, 12), np.uint64)
+        occupied[0, : len(cells) + 1] = 0b1111110000
+        facts.gone[0, 0] = facts.passed[0, 0] = 0b1111110000
+        for k, said in enumerate(cells, 1):
+            facts.passed[0, k] = 0b110001111 if said == "N" else 0b111000000
+            facts.stands[0, k] = 0b10000 * (said == "S")
+        rise_m = np.where(occupied != 0, np.float32(3.0), np.float32(np.nan))
+        states = judge_window(facts, occupied, rise_m, 0.5)[0]
+        assert np.flatnonzero(states == CellState.CHANGED_EMPTY).tolist() == list(range(len(along) + 1))
+
+
+def weighed(mapped: int, free: int, **counts: int) -> Facts:
+    """Of one cell whose voxel 5 has these counts; ``passes`` of the voxels above and below it too."""
+    planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
+    for first, name, word in ((CROSSED, "crossed", 0b010), (HIT, "met", 0b010), (PASSES, "passes", 0b111)):
+        for k in range(PLANES):
+            planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) * word << bit - 1)
+    words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
+    out = Facts.none((1, 1))
+    weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
+    return out
+
+
+@given(crossed=st.integers(0, 120), passes=st.integers(0, 120), met=st.integers(0, 20))
+def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, passes: int, met: int) -> None:
+    said = weighed(1, 0, crossed=crossed, passes=passes, met=met)
+    assert (said.gone[0, 0] != 0) == (max(crossed, passes // TOGETHER) >= GONE_RAYS + HIT_RAYS * met)
+    assert (said.stands[0, 0] != 0) == (met > 0 and said.gone[0, 0] == 0)
+    assert not (said.new | said.beyond).any()
+
+
+@given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
+@example(crossed=0, met=1, passes=0)
+def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
+    crossed: int, met: int, passes: int
+) -> None:
+    said = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    new = said.new[0, 0] != 0
+    assert new == (met >= 1 + NEW_RAYS * crossed)
+    assert [said.hits[0, 0], said.balance[0, 0]] == ([met, met - passes] if new else [0, 0])
+    assert not (said.gone | said.stands | said.beyond).any()
+
+
+@given(
+    cells=arrays(np.bool_, (6, 6)),
+    met=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
+    passes=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
+)
+def test_what_was_passed_more_often_than_hit_is_nothing_new(cells: Bool, met: I32, passes: I32) -> None:
+    ground = np.zeros(cells.shape, np.uint64)
+    pole = np.where(cells, np.uint64(2 * (1 << NEW_ENOUGH) - 2), np.uint64(0))
+    facts = Facts.none(cells.shape)._replace(new=pole, balance=np.where(cells, met - passes, 0))
+    came = judge_window(facts, ground, np.full(cells.shape, np.nan, np.float32), 0.5)[0] == CellState.CHANGED_OCCUPIED
+    groups, count = ndimage.label(cells, np.ones((3, 3)))
+    for k in range(1, count + 1):
+        group = groups == k
+        assert came[group].all() if met[group].sum() >= passes[group].sum() else not came[group].any()
+    assert not came[~cells].any()

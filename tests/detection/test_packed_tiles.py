@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from long_street import blocks_say_the_same, long_street
 from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import U64
+from mapvote.core.types import U64, MapvoteError
+from mapvote.detection import packed_tiles
 from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES
-from mapvote.detection.packed_tiles import PackedTiles
+from mapvote.detection.packed_tiles import PackedTiles, Shelf
 from mapvote.detection.surfaces import SurfaceVoter
 
 LATTICE = Lattice()
@@ -70,3 +76,27 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
 @pytest.mark.slow
 def test_blocks_of_tiles_say_what_all_of_them_say_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     blocks_say_the_same(surfaces_after_a_drive(long_street()), monkeypatch)
+
+
+@given(st.lists(st.binary(max_size=40), max_size=20))
+def test_everything_is_found_where_it_was_put(things: list[bytes]) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(packed_tiles, "IN_MEMORY", 64)
+        full = Shelf()
+        places = [full.put(thing) for thing in things]
+        assert [full.read(place) for place in places] == things
+
+
+def test_a_short_drive_asks_the_disk_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", None)
+    full = Shelf()
+    assert full.read(full.put(bytes(1 << 20))) == bytes(1 << 20)
+
+
+def test_where_a_long_drive_cannot_be_kept_it_is_said_how_to_mend_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packed_tiles, "IN_MEMORY", 4)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(MapvoteError, match=r"nowhere: .*make room, or name another folder in TMPDIR"):
+        Shelf().put(b"longer than four")

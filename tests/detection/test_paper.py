@@ -1,8 +1,8 @@
-"""The five states of paper Figure 3, cell by cell, and case 5."""
+"""The five states of paper Figure 3, cell by cell, case 5, and how the paper's open sentences can be read."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 import pytest
@@ -17,15 +17,17 @@ from mapvote.core.grid import CELL_SIZE, Grid, Lattice, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import NO_VOTE, U64, CellState, Reference
+from mapvote.core.types import NO_VOTE, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.detection.paper import (
     BEGINS_ABOVE,
+    OPEN_SENTENCES,
     WORDS,
     PaperVoter,
     cell_words,
     classify_paper,
     reading_table,
+    readings_of,
     sightings,
     votes_in,
 )
@@ -120,15 +122,6 @@ def test_case_5_skips_cells_whose_map_begins_above_the_view_at_that_range() -> N
         assert vote(*cell)[0] == CellState.CHANGED_EMPTY
 
 
-def test_case_5_knows_how_the_sensor_leans() -> None:
-    # 9 m away, 2 deg of pitch lift the view's upper end from 3.50 m to 1.8 + 9 tan(12.67 deg) = 3.82 m, or lower it.
-    view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=3.6)
-    for pitch_deg, invalid in ((0.0, True), (-2.0, False), (2.0, True)):
-        up = from_xyz_rpy(0, 0, 0, 0, np.radians(pitch_deg), 0)[:3, 2]
-        words = cell_words(view, reference, ORIGIN, SENSOR, up_map=up)
-        assert (words[0, -1] & BEGINS_ABOVE != 0) == invalid
-
-
 @given(
     st.tuples(*[st.floats(-4.0, 4.0)] * 3),
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
@@ -147,15 +140,6 @@ def test_a_map_begins_above_the_view_where_plain_trigonometry_says(
     assert (word & BEGINS_ABOVE != 0) == (elevation > np.radians(SENSOR.fov_top_deg))
 
 
-def test_scans_vote_in_a_square_around_the_vehicle_wherever_it_is() -> None:
-    grid = Grid(Lattice(), 0, 0, 100, 140)
-    inside = votes_in(grid, np.array([24.0, 9.0, 3.0]), 6.0)
-    rows, cols = np.nonzero(inside)
-    assert (rows.min(), cols.min()) == (20, 70)
-    assert (rows.max(), cols.max()) == (40, 90), "cells that the square ends in"
-    assert len(rows) == 21 * 21
-
-
 def test_case_5_read_literally_skips_cells_where_the_map_is_higher_than_the_scan() -> None:
     literal: dict[str, Any] = {"tall": True, "tall_rule": "height"}
     assert vote(*one_cell(0, Sight.CLEAR, map_bits=0b10), **literal)[0] == NO_VOTE
@@ -164,10 +148,8 @@ def test_case_5_read_literally_skips_cells_where_the_map_is_higher_than_the_scan
 
 
 def test_bits_of_a_column() -> None:
-    assert span_of(np.uint64(0b0100_1000)) == 0b0111_1000
-    assert span_of(np.uint64(0)) == 0
-    assert span_of(np.uint64(1 << 63)) == 1 << 63
-    assert below_top(np.uint64(0b0100_1000)) == 0b0111_1111
+    for word, span, below in ((0b0100_1000, 0b0111_1000, 0b0111_1111), (0, 0, 0), (1 << 63, 1 << 63, 2**64 - 1)):
+        assert (span_of(np.uint64(word)), below_top(np.uint64(word))) == (span, below)
 
 
 def test_an_occluded_scan_votes_undetermined_or_gives_no_vote() -> None:
@@ -230,27 +212,12 @@ def observed() -> tuple[PointMap, Observation]:
     return point_map, Observation(placed, moving, view, reference)
 
 
-def test_nothing_is_said_of_cells_outside_the_square_that_votes() -> None:
-    _, seen = observed()
-    asked = PaperSettings(window_m=6.0)
-    words = sightings(seen, SENSOR, 5, asked)
-    inside = votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)
-    assert words[inside].any()
-    assert not words[~inside].any()
-    assert sightings(seen, SENSOR, 5)[~inside].any()
-
-
-def seen_twice() -> tuple[PaperVoter, U64]:
-    """Two scans of it."""
+def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     point_map, seen = observed()
     voter = PaperVoter(VotingSettings(), PaperSettings(occluded="votes"), SENSOR, point_map)
+    assert dict(voter.each()) == {}
     for _ in range(2):
         may_be_new = voter.observe(seen)
-    return voter, may_be_new
-
-
-def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
-    voter, may_be_new = seen_twice()
     votes = dict(voter.each())
     assert list(votes) == [(-1, 0), (-1, 1), (0, 0), (0, 1)], "and where it saw nothing it says so"
     left, right = votes[0, 0], votes[0, 1]
@@ -266,7 +233,37 @@ def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     assert (left.gone, left.free) == (None, None), "the paper's vote is of whole cells"
 
 
-def test_asking_for_votes_changes_none_and_before_any_scan_there_are_none() -> None:
-    voter, _ = seen_twice()
-    assert dict(voter.each())[0, 1].tally.tobytes() == dict(voter.each())[0, 1].tally.tobytes()
-    assert list(PaperVoter(VotingSettings(), PaperSettings(), SENSOR, make_map({})).each()) == []
+def test_scans_vote_in_a_square_around_the_vehicle_and_nothing_is_said_of_cells_outside_it() -> None:
+    rows, cols = np.nonzero(votes_in(Grid(Lattice(), 0, 0, 100, 140), np.array([24.0, 9.0, 3.0]), 6.0))
+    assert (rows.min(), cols.min()) == (20, 70)
+    assert (rows.max(), cols.max()) == (40, 90), "cells that the square ends in"
+    assert len(rows) == 21 * 21
+    seen, asked = observed()[1], PaperSettings(window_m=6.0)
+    words = sightings(seen, SENSOR, 5, asked)
+    inside = votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)
+    assert words[inside].any()
+    assert not words[~inside].any()
+    assert sightings(seen, SENSOR, 5)[~inside].any()
+
+
+def test_every_setting_of_the_paper_has_its_sentence_whose_readings_are_those_that_can_be_set() -> None:
+    assert [sentence.setting for sentence in OPEN_SENTENCES] == list(PaperSettings.model_fields)
+    for sentence in OPEN_SENTENCES:
+        assert len(sentence.quotation) > 40
+        field = PaperSettings.model_fields[sentence.setting]
+        assert field.default in sentence.readings
+        if get_origin(field.annotation) is Literal:
+            assert set(sentence.readings) == set(get_args(field.annotation))
+        for value in sentence.readings:
+            assert getattr(PaperSettings.model_validate({sentence.setting: value}), sentence.setting) == value
+
+
+def test_a_sweep_reads_one_sentence_otherwise_at_a_time() -> None:
+    base = PaperSettings()
+    swept = readings_of(base)
+    assert swept["as set"] == base
+    assert swept["occluded votes"] == PaperSettings(occluded="votes")
+    assert len(swept) == 1 + sum(len(s.readings) - 1 for s in OPEN_SENTENCES)
+    for name, paper in swept.items():
+        differs = [key for key in PaperSettings.model_fields if getattr(paper, key) != getattr(base, key)]
+        assert len(differs) == (0 if name == "as set" else 1)

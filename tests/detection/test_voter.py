@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.detection import voter as new_points
+from mapvote.detection import voter
 from mapvote.detection.voter import REACH_M, NewPoints, _beyond, points_in, select
 
 LATTICE = Lattice()
@@ -65,9 +65,6 @@ def test_points_come_back_by_tile_in_ascending_order_and_asking_twice_changes_no
     assert first((0, 0))[:, 2].tolist() == [1.0, 2.0]
     for col in range(-1, 2):
         np.testing.assert_array_equal(again((0, col)), first((0, col)))
-
-
-def test_a_drive_without_new_points_has_none_in_any_tile() -> None:
     assert NewPoints(LATTICE).by_tile()((0, 0)).shape == (0, 3)
 
 
@@ -111,7 +108,7 @@ def test_runs_that_are_sorted_on_the_way_keep_the_first_point_of_each_voxel(monk
     at_once, on_the_way = NewPoints(LATTICE), NewPoints(LATTICE)
     for points in offered:
         at_once.offer(points)
-    monkeypatch.setattr(new_points, "_COMPACT_AT", 100)
+    monkeypatch.setattr(voter, "_COMPACT_AT", 100)
     for points in offered:
         on_the_way.offer(points)
     assert len(on_the_way._runs[0, 0]) > 2
