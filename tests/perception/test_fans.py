@@ -104,23 +104,17 @@ def test_what_rays_pass_is_what_the_rule_says_of_each_cell_and_each_ray(seed: in
     assert (wanted >> np.uint64(40)).any(), "the upper halves of the words are looked at too"
 
 
-def test_what_a_ray_proves_up_to_the_edge_of_a_cell_is_nothing_of_the_cell_behind_the_edge() -> None:
-    end = np.float32(2 * CELL_SIZE)
-    reach, x, y, slope, stop = (np.array([value], np.float32) for value in (9.0, 1.0, 0.0, 0.0, end))
-    rays = Rays(reach, x, y, slope, stop, np.zeros(1, np.int32))
-    passed = np.zeros(5, np.uint64)
-    mark_passed(gather_rays(rays), np.array([0.0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 5), np.int32), passed)
-    assert passed.tolist() == [0b100, 0b100, 0, 0, 0]
-
-
-def test_a_ray_counts_from_the_length_of_a_cell_on_and_marks_if_it_ends_beyond_where_its_fan_begins_to() -> None:
-    def passed(reach_m: float, stop_m: float, fan: int) -> int:
+def test_a_ray_proves_from_a_cells_length_on_to_an_edge_but_not_behind_it_and_marks_where_its_fan_does() -> None:
+    def passed(reach_m: float, stop_m: float, fan: int, x0: float = 0.05) -> int:
+        """How many cells in a row."""
         reach, x, y, slope, stop = (np.array([v], np.float32) for v in (reach_m, 1.0, 0.0, 0.0, stop_m))
         words = np.zeros(100, np.uint64)
         rays = gather_rays(Rays(reach, x, y, slope, stop, np.full(1, fan, np.int32)))
-        mark_passed(rays, np.array([0.05, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 100), np.int32), words)
+        mark_passed(rays, np.array([x0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 100), np.int32), words)
+        assert set(words[words != 0].tolist()) <= {0b100}
         return int((words != 0).sum())
 
     side = float(np.float32(CELL_SIZE))
+    assert passed(9.0, 2 * CELL_SIZE, 0, x0=0.0) == 2
     assert (passed(side, side, 0), passed(side - 1e-4, side, 0)) == (2, 0)
     assert (passed(29.0, FULL_RANGE_M, 1), passed(29.0, FULL_RANGE_M + 0.01, 1)) == (0, 1)

@@ -10,16 +10,30 @@ import pytest
 from scipy import ndimage
 
 from mapvote.config import MovingSettings, VotingSettings
+from mapvote.core.geometry import turn
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F64, I32, Bool
+from mapvote.core.types import F32, F64, Bool
 from mapvote.formats import open_drive
 from mapvote.perception import moving_objects
-from mapvote.perception.moving_objects import REACH_M, MovingFilter, moving_components, voxels
+from mapvote.perception.moving_objects import (
+    NOTHING,
+    REACH_M,
+    U16,
+    LookCounts,
+    MovingFilter,
+    Pixels,
+    Samples,
+    look,
+    moving_components,
+    range_image,
+    room_to_look,
+    voxels,
+)
 from mapvote_lab.simulation import simulate
 
 LIDAR_HEIGHT = 1.9
@@ -128,18 +142,11 @@ def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: f
     assert (voxel_of >= 0).all()
 
 
-def test_what_comes_into_view_is_not_moving() -> None:
-    """A street without movers: walls appear from behind corners and parked cars, and all of it stays."""
+@pytest.mark.parametrize("waiting", [[], [((6.0, -4.0, 10.4, -2.2, 1.5), 0.0)]])
+def test_what_comes_into_view_and_a_car_that_waits_are_not_moving(waiting: list[tuple[Box, float]]) -> None:
+    """Walls appear from behind corners and parked cars, and all of it stays."""
     sensor = coarse("hdl32e")
-    street = Street(sensor, 10.0, 3.0, [])
-    found = np.concatenate(street.run(sensor, MovingSettings()))
-    assert found.mean() < 1e-3
-
-
-def test_a_car_that_waits_is_static_once_its_arrival_is_older_than_the_window() -> None:
-    sensor = coarse("hdl32e")
-    street = Street(sensor, 10.0, 3.0, [((6.0, -4.0, 10.4, -2.2, 1.5), 0.0)])
-    assert not any(mask.mean() > 1e-3 for mask in street.run(sensor, MovingSettings()))
+    assert all(mask.mean() < 1e-3 for mask in Street(sensor, 10.0, 3.0, waiting).run(sensor, MovingSettings()))
 
 
 def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() -> None:
@@ -177,69 +184,35 @@ def test_only_obstacle_points_are_called_moving_and_an_empty_scan_is_no_trouble(
     masks = street.run(sensor, MovingSettings())
     assert masks[7].shape == (0,)
     assert not any((masks[i] & ~street.scans[i][2]).any() for i in range(len(street.scans)))
-    assert MovingFilter(sensor, MovingSettings()).flush() == []
-
-
-def test_stamps_must_increase() -> None:
-    moving = MovingFilter(coarse("hdl32e"), MovingSettings())
-    scan = (np.zeros((0, 3)), np.zeros(3), np.zeros(0, dtype=bool))
-    moving.push(*scan, 5)
+    moving = MovingFilter(sensor, MovingSettings())
+    assert moving.flush() == []
+    moving.push(*street.scans[7])
     with pytest.raises(ValueError, match="stamps must increase"):
-        moving.push(*scan, 5)
+        moving.push(*street.scans[7])
 
 
 SIDE = 10
 
 
-def plane(inner: Bool) -> Bool:
-    """(SIDE, SIDE) with a rim of nothing."""
-    return np.pad(inner, 1)
-
-
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(9))
 def test_cells_move_by_components_as_scipy_labels_them(seed: int) -> None:
+    """Voxels over one cell count together, and what is mostly static parts what touches it from what moves."""
     rng = np.random.default_rng(seed)
-    place = np.flatnonzero(plane(rng.random((SIDE - 2, SIDE - 2)) < 0.5))
-    brief = rng.random(len(place)) < 0.5
-    moves, wanted = np.zeros(len(place), np.bool_), np.ones(len(place), np.bool_)
+    place = rng.choice(np.flatnonzero(np.pad(rng.random((SIDE - 2, SIDE - 2)) < 0.35, 1)), 90)
+    seen = rng.random(len(place)) < 0.8
+    brief = seen & (rng.random(SIDE * SIDE)[place] + rng.normal(0, 0.2, len(place)) < 0.5)
+    cells, of = np.unique(place, return_inverse=True)
+    n_seen, n_brief = np.bincount(of, seen), np.bincount(of, brief)
+    moves, wanted = np.zeros(len(cells), np.bool_), np.ones(len(cells), np.bool_)
     for share in (0.5, 0.6):
         held = np.zeros(SIDE * SIDE, np.bool_)
-        held[place[wanted]] = True
-        label = ndimage.label(held.reshape(SIDE, SIDE), structure=np.ones((3, 3)))[0].ravel()[place]
-        found = [bool(k and brief[label == k].sum() >= max(2, share * (label == k).sum())) for k in label]
-        moves |= found
-        wanted = ~moves & brief
-    np.testing.assert_array_equal(
-        moving_components(place, SIDE, np.ones(len(place), np.bool_), brief, 2, 0.5, 0.6), moves
-    )
-
-
-def moving(at: list[tuple[int, int]], brief: list[bool], voxel_of: I32, min_voxels: int = 4) -> list[bool]:
-    rows, cols = np.array(at).T
-    seen = np.ones(len(at), np.bool_)
-    found = moving_components(rows * SIDE + cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6)
-    return list(np.append(found, False)[voxel_of].tolist())
-
-
-def test_the_voxels_over_one_cell_count_together_and_all_their_points_move() -> None:
-    walker, post = [(2, 3)] * 4, [(7, 7)] * 4
-    points = np.array([-1, 0, 3, 3, 4, 7], np.int32)
-    assert moving(walker + post, [True] * 4 + [False] * 4, points) == [False, True, True, True, False, False]
-    assert moving(post + walker, [False] * 4 + [True] * 4, points) == [False, False, False, False, True, True]
-    assert not any(moving(walker + post, [True] * 4 + [False] * 4, points, min_voxels=5))
-
-
-def test_two_things_with_a_free_cell_between_them_move_each_by_itself() -> None:
-    car, wall = [(r, c) for r in (2, 3) for c in (2, 3)], [(r, 5) for r in range(1, 9)]
-    brief = [True] * len(car) + [False] * len(wall)
-    assert moving(car + wall, brief, np.arange(len(brief), dtype=np.int32)) == brief
-
-
-def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wall_was_brief_too() -> None:
-    touched, wall, walker = [(4, 4)] * 4, [(4, c) for c in range(1, 9)] * 3, [(5, 4)] * 4
-    brief = [True] + [False] * (len(touched) - 1 + len(wall)) + [True] * len(walker)
-    moves = moving(touched + wall + walker, brief, np.arange(len(brief), dtype=np.int32))
-    assert moves == [False] * (len(touched) + len(wall)) + [True] * len(walker)
+        held[cells[wanted]] = True
+        label = ndimage.label(held.reshape(SIDE, SIDE), structure=np.ones((3, 3)))[0].ravel()[cells]
+        total, moving = np.bincount(label, n_seen), np.bincount(label, n_brief)
+        moves |= ((moving >= 4) & (moving >= share * total))[label] & (label > 0)
+        wanted = ~moves & (2 * n_brief >= n_seen)
+    np.testing.assert_array_equal(moving_components(place, SIDE, seen, brief, 4, 0.5, 0.6), moves[of])
+    assert 0 < moves.sum() < len(moves)
 
 
 @pytest.mark.parametrize("count", [0, 50, 20_000])
@@ -257,6 +230,86 @@ def test_voxels_are_numbered_by_their_first_points_however_many_there_are(count:
     expected = np.full(len(points), -1)
     expected[chosen] = np.argsort(in_order)[number.ravel()]
     np.testing.assert_array_equal(voxel_of, expected)
+
+
+PIXELS = Pixels(90, 60, np.float32(-0.6), np.float32(50.0))
+MARGIN_M, HEIGHT_M, ENOUGH = 0.5, 0.12, 2
+
+
+def aimed(offsets: F32) -> tuple[F32, np.ndarray, np.ndarray]:
+    """(horizontal range (n,), azimuth pixel, slope pixel) of places (n, 3) from the sensor."""
+    x, y, z = offsets.T
+    rho = np.sqrt(x * x + y * y)
+    azimuth = np.array([turn.py_func(a, b) for a, b in zip(x, y, strict=True)], dtype=np.float32)
+    a = np.minimum((azimuth * np.float32(PIXELS.turns)).astype(int), PIXELS.turns - 1)
+    return rho, a, np.floor((z / np.maximum(rho, np.float32(0.5)) - PIXELS.slope_min) * PIXELS.per_slope).astype(int)
+
+
+def plain_image(points: F64, origin: F64) -> U16:
+    rho, a, b = aimed((points - origin).astype(np.float32))
+    image = np.full((PIXELS.turns, PIXELS.slopes), NOTHING)
+    seen = (rho >= 0.5) & (b >= 0) & (b < PIXELS.slopes)
+    range_2mm = np.minimum(rho * np.float32(500.0) + np.float32(0.5), 65534).astype(np.uint16)
+    for aside in (-1, 0, 1):
+        np.minimum.at(image, ((a[seen] + aside) % PIXELS.turns, b[seen]), range_2mm[seen])
+    return image
+
+
+def plain_look(offsets: F32, image: U16, counts: LookCounts) -> list[int]:
+    """Which samples still wait."""
+    waiting = []
+    for i, (rho, a, b) in enumerate(zip(*aimed(offsets), strict=True)):
+        around = int(min(max(HEIGHT_M * PIXELS.per_slope / max(rho, np.float32(0.5)), 2.0), 8.0))
+        if rho >= 0.5 and b >= around and b + around < PIXELS.slopes:
+            below, above = image[a, b - around : b].min(), image[a, b + 1 : b + around + 1].min()
+            r, own = int(min(below, above, image[a, b])), round(float(rho) * 500.0)
+            if r != NOTHING and r > own + 250:
+                counts.free[i] += 1
+                counts.sides[i] |= (below < NOTHING) + 2 * (above < NOTHING)
+            elif r != NOTHING and r >= own - 250:
+                counts.hit[i] += 1
+        free, hit = counts.free[i], counts.hit[i]
+        if not ((free == 0 and hit >= ENOUGH) or (hit == 0 and free >= ENOUGH and counts.sides[i] == 3)):
+            waiting.append(i)
+    return waiting
+
+
+def no_counts(n: int) -> LookCounts:
+    return LookCounts(np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.uint8))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_image_holds_the_nearest_return_of_each_direction_and_of_those_beside_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    origin = np.array([1000.0, -500.0, 20.0])
+    points = origin + rng.normal(0.0, 1.0, (3000, 3)) * [30.0, 30.0, 3.0]
+    points[:5] = [[0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [500.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
+    points[:5] += origin
+    np.testing.assert_array_equal(range_image(points, origin, PIXELS), plain_image(points, origin))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places = (rng.normal(0.0, 1.0, (400, 3)) * [12.0, 12.0, 1.0]).astype(np.float32)
+    counts, expected, wait = no_counts(400), no_counts(400), np.arange(400)
+    x, y, z = places.T.copy()
+    samples, n = Samples(x, y, z, np.arange(400, dtype=np.int32)), 400
+    for _ in range(5):
+        sensor = rng.normal(0.0, 2.0, 3)
+        seen = sensor + rng.normal(0.0, 1.0, (4000, 3)) * [15.0, 15.0, 2.0]
+        image = range_image(seen, sensor, PIXELS)
+        rule = MARGIN_M, HEIGHT_M, ENOUGH
+        n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
+        some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
+        left = plain_look(places[wait] - sensor.astype(np.float32), image, some)
+        expected.free[wait], expected.hit[wait], expected.sides[wait] = some
+        wait = wait[left]
+        np.testing.assert_array_equal(samples.of[:n], wait)
+        for found, plane in zip(counts, expected, strict=True):
+            np.testing.assert_array_equal(found, plane)
+    assert 0 < n < 400
+    assert counts.free.sum() > 50
 
 
 def labels(street: Path, vehicle: str, stride: int) -> tuple[Bool, Bool]:
