@@ -10,9 +10,8 @@ import pytest
 from scipy import ndimage
 
 from mapvote.config import MovingSettings, VotingSettings
-from mapvote.core.geometry import turn
 from mapvote.core.columns import GROUND_MARGIN_M
-from mapvote.core.geometry import transform
+from mapvote.core.geometry import transform, turn
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
