@@ -51,7 +51,7 @@ def after(
     point_map: PointMap,
     points: F64 = AWAY,
     scans: int = 8,
-    passed: Callable[[int, U64], None] = lambda scan, words: None,
+    passed: Callable[[int, U64], object] = lambda scan, words: None,
 ) -> TileVotes:
     """What a drive says that saw ``points`` in so many scans; ``passed`` takes away of what the rays passed."""
     voter = SurfaceVoter(VotingSettings(), point_map)
