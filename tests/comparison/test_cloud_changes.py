@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from made_courts import CARS, court_clouds, made_court
-from mapvote.comparison.cloud_changes import CloudChange, compare_cells, differences
-from mapvote.comparison.difference_report import difference_geojson, difference_page
+from mapvote.comparison.cloud_changes import (
+    CloudChange,
+    compare_cells,
+    difference_geojson,
+    difference_page,
+    differences,
+)
 from mapvote.comparison.register import brought_into
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from made_courts import made_court
-from mapvote.comparison.patches import parts_of
-from mapvote.comparison.register import register_maps
+from mapvote.comparison.register import parts_of, register_maps
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError

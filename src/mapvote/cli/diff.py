@@ -40,8 +40,13 @@ def diff(
     """
     import json
 
-    from mapvote.comparison.cloud_changes import compare_cells, differences
-    from mapvote.comparison.difference_report import difference_geojson, difference_page, difference_rows
+    from mapvote.comparison.cloud_changes import (
+        compare_cells,
+        difference_geojson,
+        difference_page,
+        difference_rows,
+        differences,
+    )
     from mapvote.comparison.register import brought_into
     from mapvote.formats import read_map
     from mapvote.formats.atomic import whole_file

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.comparison.patches import Patches
-from mapvote.comparison.register import Registered, register_maps, with_free_space_of
+from mapvote.comparison.register import Patches, Registered, register_maps, with_free_space_of
 from mapvote.core.geometry import inverse, poses_at, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points

@@ -8,7 +8,7 @@ direction. Such rays are not measured, so they decide no change. A bent part cas
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,10 +21,10 @@ from mapvote.comparison.register import Registered, register_maps
 from mapvote.config import Settings
 from mapvote.core.columns import dilated, rebased
 from mapvote.core.geometry import poses_at, rows_from, transform
-from mapvote.core.grid import Grid, TileIndex, window_around
+from mapvote.core.grid import Grid, Lattice, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
+from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState, MapvoteError
 from mapvote.core.voting import one_hot
 from mapvote.detection.voter import NewPoints, TileVotes
 from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
@@ -82,11 +82,11 @@ def vote_of_session(
     if trajectory is not None:
         driven = transform(registered.T_a_b, trajectory)
         free = _free_words(with_free_space(session_map, driven), compared.window)
-    voter = _SessionVoter(point_map, compared, free, changes, registered)
+    votes = _votes(point_map.lattice, compared, free, changes, registered)
     offered = NewPoints(point_map.lattice)
     offered.offer(registered.points)
     report = _report(registered, driven, end_ns)
-    ballot = write_ballot(vehicle, session, point_map, settings, report, voter, offered)
+    ballot = write_ballot(vehicle, session, point_map, settings, report, votes, offered)
     return SessionVote(ballot, registered, changes, driven is not None)
 
 
@@ -101,58 +101,34 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
     return DriveReport([end_ns] * len(poses), lost, sigmas_m, list(poses), priors=[None] * len(poses))
 
 
-class _SessionVoter:
-    """The votes of a comparison, tile by tile."""
-
-    def __init__(
-        self,
-        point_map: PointMap,
-        compared: CellComparison,
-        free: U64,
-        changes: list[CloudChange],
-        registered: Registered,
-    ) -> None:
-        """``free`` (rows, cols): column words of the session's free space over the window of the comparison."""
-        self._map, self._compared, self._free = point_map, compared, free
-        self._changes, self._registered = changes, registered
-
-    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
-        found = self._compared
-        mine, other = found.a, found.b
-        known = np.asarray(self._rigid())
-        there = rebased(other.words, other.base - mine.base)
-        near = dilated(there, mine.base, 1)
-        states = np.full(mine.low.shape, NO_VOTE, dtype=np.uint8)
-        states[other.own_ground & ~other.stands & ~mine.stands] = CellState.UNCHANGED_EMPTY
-        states[mine.words & near != 0] = CellState.UNCHANGED_OCCUPIED
-        gone, new = np.zeros_like(mine.words), np.zeros_like(mine.words)
-        for change in self._changes:
-            if change.kind == "gone":
-                gone[change.cells] = _hanging_together(mine.words[change.cells]) & ~near[change.cells]
-                states[change.cells] = np.where(gone[change.cells] != 0, np.uint8(CellState.CHANGED_EMPTY), NO_VOTE)
-            elif change.kind == "new":
-                new[change.cells] = there[change.cells] & ~mine.words[change.cells]
-                states[change.cells] = CellState.CHANGED_OCCUPIED
-        states[~known] = NO_VOTE
-        free = rebased(self._free, other.base - mine.base) & ~near & ~mine.words
-        for tile in found.window.tiles():
-            window = self._map.lattice.tile(tile)
-            cut = window.slices_in(found.window)
-            if (only is None or tile in only) and (states[cut] != NO_VOTE).any():
-                yield tile, _tile_votes(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
-
-    def votes(self) -> dict[TileIndex, TileVotes]:
-        return dict(self.each())
-
-    def observe(self, seen: object) -> U64:
-        raise MapvoteError("a session votes as a whole")
-
-    def _rigid(self) -> Bool:
-        """(rows, cols) where a part of the session lies that one motion registers to the map."""
-        window = self._compared.window
-        x, y = window.centres()
-        xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        return self._registered.compared(xy).reshape(window.shape) & ~self._compared.left_out
+def _votes(
+    lattice: Lattice, found: CellComparison, session_free: U64, changes: list[CloudChange], registered: Registered
+) -> Iterator[tuple[TileIndex, TileVotes]]:
+    """Tile by tile; ``session_free`` (rows, cols): column words of the session's free space over the window of the
+    comparison. Only where a part of the session lies that one motion registers to the map."""
+    mine, other = found.a, found.b
+    x, y = found.window.centres()
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    known = registered.compared(xy).reshape(found.window.shape) & ~found.left_out
+    there = rebased(other.words, other.base - mine.base)
+    near = dilated(there, mine.base, 1)
+    states = np.full(mine.low.shape, NO_VOTE, dtype=np.uint8)
+    states[other.own_ground & ~other.stands & ~mine.stands] = CellState.UNCHANGED_EMPTY
+    states[mine.words & near != 0] = CellState.UNCHANGED_OCCUPIED
+    gone, new = np.zeros_like(mine.words), np.zeros_like(mine.words)
+    for change in changes:
+        if change.kind == "gone":
+            gone[change.cells] = _hanging_together(mine.words[change.cells]) & ~near[change.cells]
+            states[change.cells] = np.where(gone[change.cells] != 0, np.uint8(CellState.CHANGED_EMPTY), NO_VOTE)
+        elif change.kind == "new":
+            new[change.cells] = there[change.cells] & ~mine.words[change.cells]
+            states[change.cells] = CellState.CHANGED_OCCUPIED
+    states[~known] = NO_VOTE
+    free = rebased(session_free, other.base - mine.base) & ~near & ~mine.words
+    for tile in found.window.tiles():
+        cut = lattice.tile(tile).slices_in(found.window)
+        if (states[cut] != NO_VOTE).any():
+            yield tile, _tile_votes(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
 
 
 def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
