@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -115,7 +115,7 @@ class Vehicle:
             self.point_map,
             self.settings,
             self._frontend.cut(),
-            self._voter,
+            self._voter.each(),
             self._new_points,
         )
         self.drive_id = next_drive_id
@@ -138,8 +138,8 @@ class Vehicle:
         ``only``: of these tiles, so that the ballot of a drive that goes on can be kept piece by piece. Raises
         MapvoteError if no scan has voted.
         """
-        state = self.point_map, self.settings, self.report, self._voter, self._new_points
-        return write_ballot(self.name, self.drive_id, *state, only)
+        state = self.point_map, self.settings, self.report, self._voter.each(only), self._new_points
+        return write_ballot(self.name, self.drive_id, *state)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,12 +206,10 @@ def write_ballot(
     point_map: PointMap,
     settings: Settings,
     report: DriveReport,
-    voter: Voter,
+    votes_of_tiles: Iterable[tuple[TileIndex, TileVotes]],
     new_points: NewPoints,
-    only: Collection[TileIndex] | None = None,
 ) -> Ballot:
-    """The ballot of one voter, counted under ``settings``; ``only``: of these tiles. Raises MapvoteError if no scan has
-    voted."""
+    """The ballot of one voter, counted under ``settings``. Raises MapvoteError if no scan has voted."""
     voted = len(report.sigmas_m)
     if voted == 0:
         if len(report.lost) < report.scans:
@@ -221,7 +219,7 @@ def write_ballot(
             "is the drive on this map, and its prior in the map's frame?"
         )
     points, two_stage = new_points.by_tile(), settings.voting.two_stage
-    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in voter.each(only)]
+    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in votes_of_tiles]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,

@@ -175,22 +175,11 @@ class SharedPass:
             sensor=drive.sensor,
         )
         self._voters: dict[Rule, Voter] = {}
-        self._observing: list[tuple[str, Voter]] = []
-        """The same voters, each with its method."""
-        for case in cases:
-            self._enrol(case)
-        self._new_points = {
-            method: NewPoints(point_map.lattice, beyond=method != "paper")
-            for method in {method for method, _ in self._observing}
-        }
-
-    def _enrol(self, case: Case) -> None:
-        key = counting_rule(case)
-        if key in self._voters:
-            return
-        settings = self.settings.model_copy(update=dict(zip(("voting", "paper"), key, strict=True)))
-        self._voters[key] = make_voter(settings, self.drive.sensor, self.point_map)
-        self._observing.append((case.voting.method, self._voters[key]))
+        for rule in dict.fromkeys(map(counting_rule, cases)):
+            own = settings.model_copy(update=dict(zip(("voting", "paper"), rule, strict=True)))
+            self._voters[rule] = make_voter(own, drive.sensor, point_map)
+        methods = {voting.method for voting, _ in self._voters}
+        self._new_points = {m: NewPoints(point_map.lattice, beyond=m != "paper") for m in methods}
 
     @property
     def report(self) -> DriveReport:
@@ -209,8 +198,8 @@ class SharedPass:
         for seen in observations:
             with self.report.timed("vote"):
                 may_be_new = {method: np.zeros(seen.view.grid.shape, dtype=np.uint64) for method in self._new_points}
-                for method, voter in self._observing:
-                    may_be_new[method] |= voter.observe(seen)
+                for (voting, _), voter in self._voters.items():
+                    may_be_new[voting.method] |= voter.observe(seen)
                 for method, words in may_be_new.items():
                     self._new_points[method].gather(seen, words)
         return observations
@@ -220,7 +209,7 @@ class SharedPass:
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
-            self._voters[counting_rule(case)], self._new_points[case.voting.method],
+            self._voters[counting_rule(case)].each(), self._new_points[case.voting.method],
         )  # fmt: skip
 
 
