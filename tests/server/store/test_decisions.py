@@ -103,23 +103,18 @@ def test_of_a_spent_and_of_a_reviewed_cell_the_record_says_so(store: Store, cloc
     assert [found[seq].why_not(WALL[2][0] * 256 + WALL[2][1]) for seq in last] == [""] * 2
 
 
-def test_a_copy_names_the_ballot_that_counted_for_both(store: Store, clock: Clock) -> None:
-    a, liar, b = (
-        cast(store, clock, name, way=way) for name, way in (("a", "north"), ("liar", "north"), ("b", "south"))
+def test_a_copy_names_the_ballot_that_counted_for_both_and_a_damaged_one_is_told(store: Store, clock: Clock) -> None:
+    a, liar, b, rotten = (
+        cast(store, clock, name, way=way)
+        for name, way in (("a", "north"), ("liar", "north"), ("b", "south"), ("rotten", ""))
     )
+    t = schema.ballot_tiles
+    with store.database.writing() as connection:
+        connection.execute(t.update().where(t.c.ballot == rotten).values(states=b"rot"))
     assert publish(store).published
     found = {s.ballot: (s.why, s.alike) for s in records(store)[0].standings}
     assert sorted([found[a], found[liar]]) == [("", 0), ("copy", a if found[a] == ("", 0) else liar)]
-    assert found[b] == ("", 0)
-
-
-def test_a_damaged_ballot_is_in_the_record_as_damaged(store: Store, clock: Clock) -> None:
-    seqs = [cast(store, clock, name) for name in "abc"]
-    t = schema.ballot_tiles
-    with store.database.writing() as connection:
-        connection.execute(t.update().where(t.c.ballot == seqs[0]).values(states=b"rot"))
-    assert publish(store).published
-    assert [s.why for s in records(store)[0].standings] == ["damaged", "", ""]
+    assert (found[b], found[rotten]) == (("", 0), ("damaged", 0))
 
 
 def test_every_reason_has_words_and_a_cell_is_found_whatever_its_number() -> None:

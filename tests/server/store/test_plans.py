@@ -76,10 +76,6 @@ def test_the_test_sees_a_scan(store: Store) -> None:
     assert len(scans(store, count)) == 1
 
 
-def test_a_publish_reads_what_changed(store: Store) -> None:
-    assert scans(store, lambda: publish(store)) == []
-
-
 def test_a_ballot_is_taken_in_without_reading_the_others(store: Store) -> None:
     intake = Intake(store)
     vote(store, intake, "d3", (10, 12))
@@ -90,12 +86,8 @@ def test_a_ballot_is_taken_in_without_reading_the_others(store: Store) -> None:
     assert scans(store, lambda: send(intake, ballot)) == []
 
 
-def test_what_changed_since_a_version_is_found_without_the_rest(store: Store) -> None:
+def test_a_publish_a_manifest_since_a_version_and_changes_between_two_read_what_changed(store: Store) -> None:
     store.manifest()
-    publish(store)
+    assert scans(store, lambda: publish(store)) == []
     assert scans(store, lambda: store.manifest(since=1)) == []
-
-
-def test_changes_between_two_versions_read_what_they_changed(store: Store) -> None:
-    publish(store)
     assert scans(store, lambda: changes_between(store, 1, store.current())) == []

@@ -74,6 +74,13 @@ def test_a_dry_run_says_what_would_go_and_takes_nothing(store: Store, clock: Clo
     assert gone == [said.planes, said.decisions, said.ballots]
     again = clear(store, dry_run=False)
     assert (again.versions, again.planes, again.decisions, again.ballots, again.size) == (0, 0, 0, 0, 0)
+    with store.database.reading() as connection:
+        b = schema.ballots
+        taken = connection.execute(sa.select(b.c.bytes > 0).order_by(b.c.seq)).scalars().all()
+    assert (taken[0], taken[-1]) == (False, True), "a vehicle gets its quota back"
+    assert len(taken) == 16, "that they voted stays"
+    replay(store, "a", dry_run=False)
+    assert store.versions()[-1].target == 7, "a replay begins at the oldest version that is left"
 
 
 @pytest.mark.contract
@@ -106,25 +113,6 @@ def test_it_goes_on_as_if_nothing_had_been_cleared(store: Store, clock: Clock, t
     come_and_go(other, other_clock, 10)
     assert cleared == [pack_tile(tile) for tile in other.point_map().tiles.values()]
     other.close()
-
-
-def test_a_replay_begins_at_the_oldest_version_that_is_left(store: Store, clock: Clock) -> None:
-    come_and_go(store, clock, 8)
-    whole = replay(store, "a", dry_run=True)
-    clear(store, dry_run=False)
-    done = replay(store, "a", dry_run=False)
-    assert store.versions()[-1].target == 7
-    assert done.published == bool(whole.tiles) or done.published
-
-
-def test_a_vehicle_gets_its_quota_back(store: Store, clock: Clock) -> None:
-    come_and_go(store, clock, 8)
-    clear(store, dry_run=False)
-    with store.database.reading() as connection:
-        b = schema.ballots
-        taken = connection.execute(sa.select(b.c.bytes > 0).order_by(b.c.seq)).scalars().all()
-    assert (taken[0], taken[-1]) == (False, True)
-    assert len(taken) == 16, "that they voted stays"
 
 
 def test_the_policy_clears_by_itself_and_keeps_everything_unless_told(store: Store, clock: Clock) -> None:

@@ -125,12 +125,20 @@ def test_a_tally_is_read_as_a_tally(store: Store) -> None:
     tally = np.zeros((256, 256, 5), dtype=np.uint16)
     tally[CELL] = [1, 0, 0, 7, 2]
     cast(store, "a", say=Say(tally=tally), method="paper")
-    question = asked(store, round=RoundPolicy(method="paper", stage="one-stage"))
-    (vote,) = counting(store, question)
-    assert vote.states is None
+    (vote,) = counting(store, asked(store, round=RoundPolicy(method="paper", stage="one-stage")))
     assert vote.tally is not None
     assert vote.tally[CELL].tolist() == [1, 0, 0, 7, 2]
-    assert (vote.gone, vote.new_points, vote.free) == (None, None, None)
+    assert (vote.states, vote.gone, vote.new_points, vote.free) == (None, None, None, None)
+
+
+def test_a_ballot_waits_for_its_minimum_age_and_pushes_no_other_out_of_the_window(store: Store, clock: Clock) -> None:
+    cast(store, "a")
+    received = clock.now
+    clock.now += 10**9
+    cast(store, "b", day=60)
+    assert judged(store, asked(store, received_by_ns=received - 1)) == {"a": "young", "b": "young"}
+    assert judged(store, asked(store, received_by_ns=received)) == {"a": "", "b": "young"}
+    assert judged(store, asked(store, without=("a",))) == {"b": ""}, "who is left out is not even named"
 
 
 def test_a_round_is_asked_as_of_any_moment(store: Store) -> None:
@@ -143,25 +151,6 @@ def test_a_round_is_asked_as_of_any_moment(store: Store) -> None:
     withdraw(store, "b", by="test")
     assert list(judged(store, asked(store))) == ["a"]
     assert list(judged(store, asked(store, mark=second))) == ["a", "b"], "what was then stays what was then"
-
-
-def test_only_votes_on_this_tile_are_asked_for(store: Store) -> None:
-    cast(store, "a", tiles=(BESIDE,))
-    assert judged(store, asked(store)) == {}
-    assert counting(store, asked(store)) == []
-
-
-def test_a_vehicle_that_is_left_out_is_not_even_named(store: Store) -> None:
-    cast(store, "a")
-    cast(store, "b")
-    assert judged(store, asked(store, without=("a",))) == {"b": ""}
-
-
-def test_a_ballot_waits_for_its_minimum_age(store: Store, clock: Clock) -> None:
-    cast(store, "a")
-    received = clock.now
-    assert judged(store, asked(store, received_by_ns=received - 1)) == {"a": "young"}
-    assert judged(store, asked(store, received_by_ns=received)) == {"a": ""}
 
 
 def test_a_version_is_asked_of_again_with_the_minimum_age_that_it_had(store: Store) -> None:
@@ -195,21 +184,15 @@ def test_votes_outside_the_window_do_not_count(store: Store) -> None:
     assert [vote.vehicle for vote in counting(store, asked(store, fuse=FuseSettings(latest_vehicles=1)))] == ["c"]
 
 
-def test_the_window_is_of_the_votes_that_are_ready(store: Store, clock: Clock) -> None:
-    """One that waits for its age pushes no other out."""
-    cast(store, "a")
-    received = clock.now
-    clock.now += 10**9
-    cast(store, "b", day=60)
-    found = judged(store, asked(store, received_by_ns=received))
-    assert found == {"a": "", "b": "young"}
-
-
 def test_a_vote_counts_in_the_cells_that_have_not_changed_since(store: Store) -> None:
     cast(store, "a")
+    cast(store, "elsewhere", tiles=(BESIDE,))
     memory = Memory.none().with_changed(np.array([CELL[0] * 256 + CELL[1]]), 2)
+    tile = replace(store.point_map().tiles[HERE], memory=memory)
     (vote,) = counting(store, asked(store), memory=memory)
-    assert spoken(vote) == [OTHER]
+    with store.database.reading() as connection:
+        (lately,) = recent_votes(connection, tile, asked(store))
+    assert spoken(vote) == spoken(lately) == [OTHER]
 
 
 def review(store: Store, verdict: reviews.Verdict, cell: tuple[int, int] = CELL) -> int:
@@ -220,8 +203,14 @@ def review(store: Store, verdict: reviews.Verdict, cell: tuple[int, int] = CELL)
 
 
 def test_what_reviewers_hold_is_silent_for_all_until_they_let_go(store: Store) -> None:
-    cast(store, "a")
+    first = cast(store, "a")
+    accepted = review(store, "accepted")
+    beside = {BESIDE: np.ones((256, 256), dtype=np.bool_)}
+    reviews.decide(store, "held", {"id": "y", "properties": {"kind": "built"}}, beside, by="bert")
+    assert [spoken(vote) for vote in counting(store, asked(store))] == [[CELL, OTHER]], "accepted, or of another tile"
+    reviews.undo(store, accepted, by="anna")
     seq = review(store, "held")
+    assert [spoken(vote) for vote in counting(store, asked(store, mark=first))] == [[CELL, OTHER]], "as of before"
     last = cast(store, "b")
     assert [spoken(vote) for vote in counting(store, asked(store))] == [[OTHER], [OTHER]]
     reviews.undo(store, seq, by="anna")
@@ -242,20 +231,6 @@ def test_what_reviewers_reject_only_later_drives_can_say_again(store: Store) -> 
     cast(store, "a", drive="another", day=1)
     drives = [spoken(vote) for vote in counting(store, asked(store)) if vote.vehicle == "a"]
     assert sorted(drives) == [[CELL, OTHER], [OTHER]]
-
-
-def test_what_was_accepted_or_is_about_another_tile_silences_nothing(store: Store) -> None:
-    cast(store, "a")
-    review(store, "accepted")
-    cells = {BESIDE: np.ones((256, 256), dtype=np.bool_)}
-    reviews.decide(store, "held", {"id": "y", "properties": {"kind": "built"}}, cells, by="bert")
-    assert [spoken(vote) for vote in counting(store, asked(store))] == [[CELL, OTHER]]
-
-
-def test_a_verdict_counts_from_its_own_moment_on(store: Store) -> None:
-    seq = cast(store, "a")
-    review(store, "held")
-    assert [spoken(vote) for vote in counting(store, asked(store, mark=seq))] == [[CELL, OTHER]]
 
 
 def recent(store: Store, question: Electorate) -> list[str]:
@@ -282,15 +257,6 @@ def test_the_recent_past_knows_no_ballot_that_is_not_ready(store: Store, clock: 
     question = asked(store, received_by_ns=received, set_aside=(ballot_name(damaged, *HERE),))
     assert recent(store, question) == ["a"]
     assert recent(store, asked(store, without=("a", "b", "c", "d"))) == []
-
-
-def test_in_the_recent_past_spent_cells_are_silent_too(store: Store) -> None:
-    cast(store, "a")
-    memory = Memory.none().with_changed(np.array([CELL[0] * 256 + CELL[1]]), 2)
-    tile = replace(store.point_map().tiles[HERE], memory=memory)
-    with store.database.reading() as connection:
-        (vote,) = recent_votes(connection, tile, asked(store))
-    assert spoken(vote) == [OTHER]
 
 
 def test_votes_are_read_in_the_order_asked_for_and_no_tile_has_too_many(store: Store) -> None:
