@@ -39,7 +39,7 @@ TESTS = {
     "fusion/change_time": "fusion/test_change_time.py fusion/test_rules_of_fusion.py",
     **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/surfaces"), "detection"),
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
-    "server/store/publish": "server/store/test_publish_limits.py server/store/test_store.py server/views/test_rounds.py",
+    "server/store/publish": "server/store/test_publish_limits.py server/views/test_rounds.py",
 }
 """The tests that must notice; of the other modules those of the same name."""
 SWAPS = {
