@@ -124,10 +124,11 @@ def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float =
     return T
 
 
-def poses_at(positions: F64) -> F64:
-    """(n, 4, 4) of positions (n, 3), turned by nothing."""
+def poses_at(positions: ArrayLike, rotations: ArrayLike | None = None) -> F64:
+    """(n, 4, 4) of positions (n, 3), turned by rotations (n, 3, 3), or by nothing."""
+    positions = np.asarray(positions, dtype=np.float64)
     T = np.tile(np.eye(4), (len(positions), 1, 1))
-    T[:, :3, 3] = positions
+    T[:, :3, 3], T[:, :3, :3] = positions, np.eye(3) if rotations is None else rotations
     return T
 
 

@@ -26,7 +26,7 @@ from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
-from mapvote.formats.maps.tiling import map_of
+from mapvote.formats.maps.tiling import in_map_metres, map_of
 from mapvote.slam.clean_map import lone_points
 
 Pieces = Callable[[], Iterator[NDArray[np.floating]]]
@@ -256,7 +256,7 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
             return [Finding("error", what, mend)], None
         found.append(Finding("note", f"{what}: import leaves them out"))
     fields = {name: column[finite] for name, column in cloud.fields.items()}
-    cloud = replace(cloud, points=cloud.points[finite], fields=fields).in_metres(where)
+    (cloud,) = in_map_metres(where, iter([replace(cloud, points=cloud.points[finite], fields=fields)]))
     found += check_cloud(in_memory(cloud.points))
     if any_error(found):
         return in_order(found), None

@@ -104,7 +104,7 @@ def read_cloud(path: Path | str) -> tuple[F64, dict[str, NDArray[Any]]]:
         tiles = read_map_folder(path).tiles
         cloud = joined([Cloud(tiles[index].points_map, fields=tiles[index].fields) for index in sorted(tiles)])
     else:
-        cloud = joined(stream_cloud(path)).in_metres(str(path))
+        cloud = joined(in_map_metres(str(path), stream_cloud(path)))
     return cloud.points.astype(np.float64, copy=False), dict(cloud.fields)
 
 

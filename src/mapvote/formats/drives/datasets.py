@@ -32,6 +32,7 @@ from mapvote.core.types import F64, I64, Drive, MapvoteError
 from mapvote.formats.drives.options import DriveOptions, map_frame
 from mapvote.formats.drives.point_fields import log
 from mapvote.formats.drives.scan_folder import (
+    KITTI,
     NUSCENES,
     BinLayout,
     ScanFolder,
@@ -63,8 +64,6 @@ from mapvote.formats.maps.pcd import read_pcd_table
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
 _NUSCENES_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """R_nuscenes_lidar: their y is our x."""
-NuscenesTable = dict[str, dict[str, Any]]
-BOREAS_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "time")
 MULRAN_MOUNT = geometry.from_xyz_rpy(1.7042, -0.021, 1.8047, *np.deg2rad([0.0001, 0.0003, 179.6654]))
 """The dataset's calib_base2ouster.txt."""
 NEWER_COLLEGE_MOUNT = geometry.from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
@@ -84,9 +83,12 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
     stamps_ns: I64 = of_scans(read_times_ns(table), files, table)
 
+    sequence = path.resolve()
+    poses = sequence.parent.parent / "data_poses" / sequence.name / "poses.txt"
+
     def prior() -> Trajectory | F64 | None:
-        if options.prior is None and has_kitti_360_poses(path):
-            return kitti_360_poses(path, files, stamps_ns)
+        if options.prior is None and poses.is_file():
+            return _kitti_360_poses(poses, files, stamps_ns)
         return _oxts_prior(path, files, stamps_ns, options)
 
     folder = ScanFolder(files, stamps_ns, layout_of(files, options).read, prior, "oxts", zero_is_no_return=False)
@@ -112,24 +114,14 @@ def _oxts_prior(path: Path, files: list[Path], stamps_ns: I64, options: DriveOpt
     return Trajectory(stamps_ns, T_map_lidar, of_vehicle=False, frame=frame)
 
 
-def _pose_file(path: Path) -> Path:
-    return path.resolve().parents[1] / "data_poses" / path.resolve().name / "poses.txt"
-
-
-def has_kitti_360_poses(path: Path) -> bool:
-    """Whether ``path`` is data_3d_raw/SEQUENCE of KITTI-360 with its poses beside."""
-    return len(path.resolve().parents) > 1 and _pose_file(path).is_file()
-
-
-def kitti_360_poses(path: Path, files: list[Path], stamps_ns: I64) -> Trajectory:
+def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajectory:
     """The poses of the scans that have one, by the numbers in the scans' names; between them they are interpolated.
 
     Some frames at the start of a sequence have no pose: MapvoteError says which scans to choose.
     """
-    file = _pose_file(path)
     rows = read_numbers(file, 13)
     T_world_imu = rigid_motions(rows[:, 1:], str(file))
-    T_imu_lidar = _T_imu_lidar(path.resolve().parents[1] / "calibration")
+    T_imu_lidar = _T_imu_lidar(file.parents[2] / "calibration")
     numbers = np.array([number_of(f) for f in files])
     first = np.searchsorted(numbers, rows[:, 0])
     known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
@@ -176,9 +168,9 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
     files = [path / row["filename"] for row in rows]
     stamps = np.array([row["timestamp"] * 1000 for row in rows], dtype=np.int64)
     poses, mounts = _nuscenes_table(tables / "ego_pose.json"), _nuscenes_table(tables / "calibrated_sensor.json")
-    T_base_lidar = _nuscenes_pose(mounts[rows[0]["calibrated_sensor_token"]])
+    T_base_lidar = _nuscenes_poses([mounts[rows[0]["calibrated_sensor_token"]]])[0]
     T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ _NUSCENES_AXES
-    T_map_base = np.stack([_nuscenes_pose(poses[row["ego_pose_token"]]) for row in rows])
+    T_map_base = _nuscenes_poses([poses[row["ego_pose_token"]] for row in rows])
     folder = ScanFolder(files, stamps, read, lambda: T_map_base @ T_base_lidar, T_base_lidar=T_base_lidar)
     return open_scan_folder(path, options, folder)
 
@@ -204,18 +196,16 @@ def _scene(path: Path, tables: Path, wanted: str | None) -> list[dict[str, Any]]
     return there
 
 
-def _nuscenes_table(file: Path) -> NuscenesTable:
+def _nuscenes_table(file: Path) -> dict[str, dict[str, Any]]:
     try:
         return {row["token"]: row for row in msgspec.json.decode(file.read_bytes())}
     except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
         raise MapvoteError(f"{file}: not a table of nuScenes ({error}); unpack the metadata again") from error
 
 
-def _nuscenes_pose(row: dict[str, Any]) -> F64:
-    T = np.eye(4)
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(row["rotation"], scalar_first=True).as_matrix()
-    T[:3, 3] = row["translation"]
-    return T
+def _nuscenes_poses(rows: list[dict[str, Any]]) -> F64:
+    rotations = scipy.spatial.transform.Rotation.from_quat([row["rotation"] for row in rows], scalar_first=True)
+    return geometry.poses_at([row["translation"] for row in rows], rotations.as_matrix())
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,10 +261,6 @@ def _mulran_poses(table: Path) -> Trajectory:
     return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
 
 
-def _newer_college_poses(file: Path) -> Trajectory:
-    return replace(read_trajectory(file), of_vehicle=True)
-
-
 def _newer_college_stamp_ns(file: Path) -> int:
     words = file.stem.split("_")
     if len(words) < 3 or not (words[1].isdigit() and words[2].isdigit()):
@@ -316,16 +302,15 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
     return Dataset((f"{name}/*.bin",), _oxford_rows, "gps/ins.csv", _oxford_poses, T_base_lidar).open(path, options)
 
 
-BOREAS = Dataset(
-    ("lidar/*.bin",), BinLayout(BOREAS_COLUMNS).read, "applanix/lidar_poses.csv", _boreas_poses, beside="applanix"
-)
+_BOREAS_BIN = BinLayout((*KITTI, "laser_number", "time"))
+BOREAS = Dataset(("lidar/*.bin",), _BOREAS_BIN.read, "applanix/lidar_poses.csv", _boreas_poses, beside="applanix")
 """Test sequences keep their poses secret. The times of points count from the scan's."""
 MULRAN = Dataset(("Ouster/*.bin",), BinLayout().read, "global_pose.csv", _mulran_poses, MULRAN_MOUNT)
 NEWER_COLLEGE = Dataset(
     ("raw_format/ouster_scan/cloud_*_*.pcd", "ouster_scan/cloud_*_*.pcd"),
     read_pcd_table,
     "ground_truth/registered_poses.csv",
-    _newer_college_poses,
+    lambda file: replace(read_trajectory(file), of_vehicle=True),
     NEWER_COLLEGE_MOUNT,
     _newer_college_stamp_ns,
 )

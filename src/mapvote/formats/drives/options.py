@@ -21,7 +21,7 @@ from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 
-ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class SaidOfDrive(TypedDict, total=False):
@@ -166,16 +166,12 @@ def parse_scans(scans: str | None, n: int, where: str) -> I64:
     return np.flatnonzero(chosen)
 
 
-def name_from(path: Path) -> str:
-    """A legal vehicle or drive name made from a file's name."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64]
-    return name or "drive"
-
-
-def _checked_id(name: str, what: str, where: str) -> str:
-    if not ID.fullmatch(name):
+def _name(said: str | None, path: Path, what: str) -> str:
+    """A legal name of a vehicle or a drive: what is said, else made from the file's name."""
+    name = said or re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64] or "drive"
+    if not _ID.fullmatch(name):
         raise MapvoteError(
-            f"{where}: {what} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
+            f"{path}: {what} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
         )
     return name
 
@@ -213,16 +209,13 @@ def make_drive(
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
         sensor = replace(sensor, rate_hz=rate_hz)
 
-    def read_chosen(i: int) -> Scan:
-        return read_scan(int(chosen[i]), sensor)
-
     return Drive(
         path=path,
-        vehicle=_checked_id(options.vehicle or name_from(path), "vehicle", where),
-        drive_id=_checked_id(options.drive or name_from(path), "drive", where),
+        vehicle=_name(options.vehicle, path, "vehicle"),
+        drive_id=_name(options.drive, path, "drive"),
         sensor=sensor,
         stamps_ns=stamps_ns[chosen],
-        read_scan=read_chosen,
+        read_scan=lambda i: read_scan(int(chosen[i]), sensor),
         T_map_lidar_prior=None if T_map_lidar_prior is None else T_map_lidar_prior[chosen],
         prior_sigma_m=options.prior_sigma_m,
         prior_sigma_deg=options.prior_sigma_deg,

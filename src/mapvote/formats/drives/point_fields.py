@@ -42,7 +42,6 @@ class BadPoints:
     """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: noticed, without a flood."""
 
     where: str
-    scans: int = 0
     points: int = 0
     seen: set[int] = field(default_factory=set)
 
@@ -50,16 +49,10 @@ class BadPoints:
         if n == 0 or index in self.seen:
             return
         self.seen.add(index)
-        self.scans += 1
         self.points += n
-        if self.scans & (self.scans - 1) == 0:
-            log.warning(
-                "%s: dropped %d points that are not finite or beyond %.0f m, in %d scans so far",
-                self.where,
-                self.points,
-                FAR_M,
-                self.scans,
-            )
+        if len(self.seen) & (len(self.seen) - 1) == 0:
+            what = "%s: dropped %d points that are not finite or beyond %.0f m, in %d scans so far"
+            log.warning(what, self.where, self.points, FAR_M, len(self.seen))
 
 
 def scan_from_fields(
@@ -213,14 +206,19 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
+def stamp_of(message: Any) -> int:
+    """Nanoseconds of the stamp in a message's header."""
+    stamp = message.header.stamp
+    return int(getattr(stamp, "sec", 0)) * 10**9 + int(getattr(stamp, "nanosec", 0))
+
+
 def scan_from_point_cloud2(message: Any, sensor: Sensor) -> Scan:
     """A live sensor_msgs/PointCloud2 as a Scan: of rclpy, rosbags, or any object with its fields.
 
     Its stamp is the message's; a field of times (``TIME_FIELDS``) makes it be de-skewed, ``intensity`` and ``ring`` are
     kept. MapvoteError if the message is cut off, has no x, y, z, or holds no usable point.
     """
-    stamp = message.header.stamp
-    stamp_ns = int(getattr(stamp, "sec", 0)) * 10**9 + int(getattr(stamp, "nanosec", 0))
+    stamp_ns = stamp_of(message)
     where = f"PointCloud2 in {message.header.frame_id or 'no frame'} at {stamp_ns}"
     table = point_cloud_table(where, message)
     return scan_from_fields(where, 0, stamp_ns, table, sensor=sensor, bad_points=BadPoints(where))

@@ -19,7 +19,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame
-from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields
+from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields, stamp_of
 from mapvote.formats.drives.trajectory import Trajectory, prior_of, sorted_trajectory
 from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
@@ -134,7 +134,7 @@ def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None,
         raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(poses) or 'none'}")
 
     def own() -> Trajectory | None:
-        return None if topic is None else bag_trajectory(bag, topic, map_frame(options))
+        return None if topic is None else _trajectory(bag, topic, map_frame(options))
 
     files = [bag.path] * len(stamps_ns)
     return prior_of(bag.path, options, files, stamps_ns, own, topic if topic in poses else None)
@@ -200,14 +200,14 @@ def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
 
 
-def bag_trajectory(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
+def _trajectory(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     """T_map_base of a topic of poses, or of GNSS fixes in the frame of the map; fixes head where the vehicle drives."""
     if topic in bag.topics(*GNSS):
         return _fixes(bag, topic, frame)
     times, poses = [], []
     for _, message in bag.messages(topic):
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-        times.append(_stamp_ns(message))
+        times.append(stamp_of(message))
         poses.append(_matrix(pose.position, pose.orientation))
     stacked = np.stack(poses) if poses else np.zeros((0, 4, 4))
     return sorted_trajectory(np.array(times, dtype=np.int64), stacked, of_vehicle=True, frame=MapFrame())
@@ -215,7 +215,7 @@ def bag_trajectory(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
 
 def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     rows = [
-        (_stamp_ns(m), m.longitude, m.latitude, m.altitude)
+        (stamp_of(m), m.longitude, m.latitude, m.altitude)
         for _, m in bag.messages(topic)
         if m.status.status >= 0 and np.isfinite([m.longitude, m.latitude]).all()
     ]
@@ -277,13 +277,6 @@ def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:
     return ""
 
 
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
 def _matrix(p: Any, q: Any) -> F64:
-    T = np.eye(4)
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = p.x, p.y, p.z
-    return T
+    rotation = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w])
+    return geometry.poses_at([[p.x, p.y, p.z]], rotation.as_matrix())[0]

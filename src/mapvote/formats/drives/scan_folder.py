@@ -310,9 +310,8 @@ def _viewpoints(files: list[Path]) -> F64 | None:
     rows = np.array([_viewpoint_of(f) for f in files])
     if (rows == rows[0]).all():
         return None
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, 3] = rows[:, :3]
-    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
+    rotations = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True)
+    T = geometry.poses_at(rows[:, :3], rotations.as_matrix())
     check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
     return T
 

@@ -79,10 +79,8 @@ def rigid_motions(rows: F64, where: str) -> F64:
 
 def motions_of_rpy(rows: F64) -> F64:
     """(n, 4, 4) of rows x, y, z (metres), roll, pitch, yaw (radians): R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, 3] = rows[:, :3]
-    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
-    return T
+    rotations = scipy.spatial.transform.Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
+    return geometry.poses_at(rows[:, :3], rotations.as_matrix())
 
 
 def check_rigid(T: F64, where: str) -> None:
@@ -115,7 +113,7 @@ def read_calib(file: Path) -> dict[str, F64]:
     return out
 
 
-def read_T_camera_lidar(file: Path) -> F64:
+def _read_T_camera_lidar(file: Path) -> F64:
     """(4, 4) from the line Tr (or Tr_velo_cam, Tr_velo_to_cam) of KITTI odometry's calib.txt."""
     calib = read_calib(file)
     for name in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam"):
@@ -124,12 +122,7 @@ def read_T_camera_lidar(file: Path) -> F64:
     raise MapvoteError(f"{file}: no line 'Tr:' with 12 numbers, the motion from LiDAR to camera")
 
 
-def camera_to_lidar(T_world_camera: F64, T_camera_lidar: F64) -> F64:
-    """KITTI odometry's poses (n, 4, 4), relative to the first camera, as T_map_lidar in the first LiDAR's frame."""
-    return geometry.inverse(T_camera_lidar) @ T_world_camera @ T_camera_lidar
-
-
-def travels_along(T: F64) -> str:
+def _travels_along(T: F64) -> str:
     """The local axis, "+x" ... "-z", along which the vehicle moves by most of its way; "" if it hardly moves (1 m)."""
     steps = np.einsum("nji,nj->ni", T[:-1, :3, :3], np.diff(T[:, :3, 3], axis=0))
     total = steps.sum(axis=0) if len(steps) else np.zeros(3)
@@ -147,14 +140,15 @@ def read_T_map_lidar(file: Path, folder: Path) -> F64:
     """
     poses = read_poses(file)
     calib = folder / "calib.txt"
-    axis = travels_along(poses)
+    axis = _travels_along(poses)
     if axis == "+z" or (calib.is_file() and axis == "" and file.name != "prior.txt"):
         if not calib.is_file():
             raise MapvoteError(
                 f"{file}: these are camera poses (the vehicle moves along z, not x); put KITTI's calib.txt into "
                 f"{folder} to have them converted, or write T_map_lidar rows"
             )
-        return camera_to_lidar(poses, read_T_camera_lidar(calib))
+        T_camera_lidar = _read_T_camera_lidar(calib)
+        return geometry.inverse(T_camera_lidar) @ poses @ T_camera_lidar
     return poses
 
 
@@ -237,14 +231,12 @@ def _radians(angle: F64) -> F64:
 
 def _motions_of_quaternions(file: Path, rows: F64) -> F64:
     """(n, 4, 4) of rows x, y, z, qx, qy, qz, qw."""
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
     off = np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0)
     if not (off < 0.05).all():
         raise MapvoteError(f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion")
-    if len(rows):
-        T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix()
-    T[:, :3, 3] = rows[:, :3]
-    return T
+    if not len(rows):
+        return np.empty((0, 4, 4))
+    return geometry.poses_at(rows[:, :3], scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix())
 
 
 def _header(file: Path) -> list[str] | None:
@@ -363,7 +355,7 @@ def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any
     )
 
 
-def prior_file(folder: Path, options: DriveOptions) -> Path | None:
+def _prior_file(folder: Path, options: DriveOptions) -> Path | None:
     """The file that the options name, here or in ``folder``; else prior.txt, if it exists."""
     if options.prior is None:
         return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
@@ -388,7 +380,7 @@ def prior_of(
     else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
     if options.prior is not None and options.prior.lower() == "none":
         return None, MapFrame()
-    file = None if options.prior is not None and options.prior == own_name else prior_file(path, options)
+    file = None if options.prior is not None and options.prior == own_name else _prior_file(path, options)
     if file is not None and not has_times(file):
         return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
     found = own() if file is None else read_trajectory(file, map_frame(options))

@@ -21,6 +21,7 @@ import scipy
 import yaml
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import poses_at
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.extras import read_text, require
 
@@ -114,7 +115,7 @@ class MapFrame:
                 "the map's coordinates are local and its place on Earth is unknown; import it with --crs EPSG:n, "
                 "or with --projector map_projector_info.yaml"
             )
-        return transformer(self.crs)
+        return _transformer(self.crs)
 
 
 def enu_frame(latitude: float, longitude: float, height: float) -> MapFrame:
@@ -136,7 +137,7 @@ def read_crs(text: str) -> Any:
 
 
 @lru_cache(maxsize=64)
-def transformer(crs: str) -> Any:
+def _transformer(crs: str) -> Any:
     """From longitude, latitude (WGS 84) and height to ``crs``."""
     module = pyproj()
     if crs.startswith(ENU):
@@ -182,31 +183,22 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
         raise MapvoteError("a prior from GNSS needs latitudes within 90 degrees and no holes")
     if frame is None or frame.is_local:
         lon, lat, height = (float(v) for v in lonlat[0])
-        log.warning(
-            "no place on Earth is known for the map: a plane at the first fix (origin = [%.7f, %.7f, %.2f])",
-            lat,
-            lon,
-            height,
-        )
+        what = "no place on Earth is known for the map: a plane at the first fix (origin = [%.7f, %.7f, %.2f])"
+        log.warning(what, lat, lon, height)
         frame = enu_frame(lat, lon, height)
-    T = np.tile(np.eye(4), (len(lonlat), 1, 1))
-    T[:, :3, 3] = frame.from_lonlat(lonlat)
     R_enu_base = scipy.spatial.transform.Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
-    T[:, :3, :3] = frame.axes_at(lonlat) @ R_enu_base
-    return T, frame
+    return poses_at(frame.from_lonlat(lonlat), frame.axes_at(lonlat) @ R_enu_base), frame
 
 
 def yaw_from_track(T: F64) -> F64:
     """The poses (n, 4, 4) with x along the way driven, for receivers without a heading; standing keeps the last."""
-    out = T.copy()
     ahead = np.diff(T[:, :3, 3], axis=0, append=T[-1:, :3, 3])
     moving = np.flatnonzero(np.linalg.norm(ahead[:, :2], axis=1) > 0.05)
     if len(moving) == 0:
-        return out
+        return T
     nearest = moving[np.clip(np.searchsorted(moving, np.arange(len(T)), side="right") - 1, 0, len(moving) - 1)]
     yaw = np.arctan2(ahead[nearest, 1], ahead[nearest, 0])
-    out[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", yaw[:, None]).as_matrix()
-    return out
+    return poses_at(T[:, :3, 3], scipy.spatial.transform.Rotation.from_euler("z", yaw[:, None]).as_matrix())
 
 
 def read_projector(text_or_path: str) -> MapFrame:
@@ -238,7 +230,7 @@ def read_projector(text_or_path: str) -> MapFrame:
 def frame_of(georeference: Mapping[str, str]) -> MapFrame:
     """The frame that a map carries; local if it carries none."""
     projector = georeference.get(PROJECTOR, "")
-    crs = georeference.get("crs") or georeference.get("wkt") or ""
+    crs = georeference.get("crs", "")
     if not crs:
         return frame_of_projector(projector) if projector else MapFrame()
     offset = [float(v) for v in georeference.get("offset", "0,0,0").split(",")]
@@ -256,7 +248,7 @@ def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
     if kind.lower() == LOCAL:
         return MapFrame(LOCAL, heights=heights, projector=text)
     if kind == "MGRS":
-        return replace(mgrs_frame(str(about.get("mgrs_grid", "")), where), heights=heights, projector=text)
+        return replace(_mgrs_frame(str(about.get("mgrs_grid", "")), where), heights=heights, projector=text)
     if kind not in TYPES:
         raise MapvoteError(f"{where}: unknown projector_type {kind!r}; one of {', '.join(TYPES)}")
     try:
@@ -278,7 +270,7 @@ def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
     return MapFrame(utm, (float(corner[0]), float(corner[1]), altitude), heights, text)
 
 
-def mgrs_frame(grid: str, where: str = PROJECTOR) -> MapFrame:
+def _mgrs_frame(grid: str, where: str = PROJECTOR) -> MapFrame:
     """Metres from the lower-left corner of a 100 km square such as 54SUE."""
     try:
         zone, hemisphere, easting, northing = require("mgrs", "geo", where).MGRS().MGRSToUTM(grid)
@@ -286,8 +278,8 @@ def mgrs_frame(grid: str, where: str = PROJECTOR) -> MapFrame:
         raise
     except Exception as error:  # the library raises its own, of several kinds
         raise MapvoteError(f"{where}: {grid!r} is no MGRS grid such as 54SUE") from error
-    corner = tuple(float(np.floor(v / _SQUARE_M) * _SQUARE_M) for v in (easting, northing))
-    return MapFrame(f"EPSG:{(32600 if hemisphere == 'N' else 32700) + int(zone)}", (corner[0], corner[1], 0.0))
+    x0, y0 = (float(np.floor(v / _SQUARE_M) * _SQUARE_M) for v in (easting, northing))
+    return MapFrame(f"EPSG:{(32600 if hemisphere == 'N' else 32700) + int(zone)}", (x0, y0, 0.0))
 
 
 def projector_of(frame: MapFrame) -> str:

@@ -49,16 +49,19 @@ def settle(
     if stated.crs.startswith(ENU):
         return _moved(stated, wanted)
     crs = read_crs(stated.crs)
-    heights = stated.heights or height_name(crs)
-    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    horizontal, vertical = crs.sub_crs_list[:2] if crs.is_compound else (crs, None)
+    heights = stated.heights or (
+        vertical.name if vertical else "above the ellipsoid" if len(crs.axis_info) == 3 else ""
+    )
     if horizontal.is_geographic or horizontal.is_geocentric:
         if wanted is None or wanted.is_local:
             raise MapvoteError(_degrees(where, horizontal, first))
         return _from_degrees(where, horizontal, replace(wanted, heights=wanted.heights or heights))
     to_m, z_to_m = _units(where, crs)
-    metric = replace(stated, crs=short(stated.crs), heights=heights)
+    metric = replace(stated, crs=_short(stated.crs), heights=heights)
     if (to_m, z_to_m) != (1.0, 1.0):
-        metric = replace(metric, crs=short(in_metres(horizontal).to_wkt()))
+        in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
+        metric = replace(metric, crs=_short(in_metres.to_wkt()))
         log.warning("%s: x, y in units of %.10g m, z of %.10g m: converted to metres", where, to_m, z_to_m)
     scale = np.array([to_m, to_m, z_to_m])
     frame, move = _moved(metric, wanted)
@@ -137,48 +140,25 @@ def _units(where: str, crs: Any) -> tuple[float, float]:
     return to_m, z_to_m
 
 
-def height_name(crs: Any) -> str:
-    """What heights of a CRS count from: the name of its vertical part, the ellipsoid, or "" for nothing."""
-    if crs.is_compound:
-        return str(crs.sub_crs_list[1].name)
-    return "above the ellipsoid" if len(crs.axis_info) == 3 else ""
-
-
-def in_metres(crs: Any) -> Any:
-    """The same projection with axes in metres."""
-    return pyproj().CRS.from_json_dict(_with_unit(crs.to_json_dict(), "metre"))
-
-
 def with_units(text: str, plane: str | None, up: str | None) -> str:
     """A CRS with other units than its own for x and y, and for z (names of ``METRES``, None for no other)."""
     crs = read_crs(text)
     if crs.is_geographic:
         return text
     parts = list(crs.sub_crs_list) if crs.is_compound else [crs]
-    told = [plane, up]
     plain = True
-    for i, part in enumerate(parts):
+    for i, (part, unit) in enumerate(zip(parts, (plane, up), strict=False)):
         own = float(part.axis_info[0].unit_conversion_factor)
-        unit = told[i]
         factor = own if unit is None else 1.0 if unit == "metre" else _UNITS[unit]["conversion_factor"]
         if abs(factor - own) > 1e-9:
             parts[i] = pyproj().CRS.from_json_dict(_with_unit(part.to_json_dict(), _UNITS[unit or "metre"]))
             plain = False
     if len(parts) == 1 and up is not None:
-        vertical = pyproj().CRS.from_json_dict(
-            {
-                "type": "VerticalCRS",
-                "name": "height",
-                "datum": {"type": "VerticalReferenceFrame", "name": "unknown"},
-                "coordinate_system": {
-                    "subtype": "vertical",
-                    "axis": [
-                        {"name": "Height", "abbreviation": "H", "direction": "up", "unit": _UNITS[up]},
-                    ],
-                },
-            }
-        )
-        parts.append(vertical)
+        axis = {"name": "Height", "abbreviation": "H", "direction": "up", "unit": _UNITS[up]}
+        system = {"subtype": "vertical", "axis": [axis]}
+        datum = {"type": "VerticalReferenceFrame", "name": "unknown"}
+        vertical = {"type": "VerticalCRS", "name": "height", "datum": datum, "coordinate_system": system}
+        parts.append(pyproj().CRS.from_json_dict(vertical))
         plain = False
     if plain:
         return text
@@ -202,7 +182,7 @@ def _with_unit(node: Any, unit: Any) -> Any:
     return out
 
 
-def short(crs: str) -> str:
+def _short(crs: str) -> str:
     """ "EPSG:n" for a CRS that is exactly that one, else its WKT."""
     known = read_crs(crs)
     code = known.to_epsg(min_confidence=100)

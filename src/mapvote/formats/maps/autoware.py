@@ -16,7 +16,6 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -54,7 +53,12 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     MapvoteError names a tile that is missing, broken, or whose points lie outside it by more than a centimetre.
     """
     file = path / METADATA
-    table = _read_yaml(file)
+    try:
+        table = yaml.safe_load(read_text(file))
+    except (yaml.YAMLError, ValueError) as error:
+        raise MapvoteError(f"{file}: cannot be read ({first_line(error)})") from error
+    if not isinstance(table, dict):
+        raise MapvoteError(f"{file}: not Autoware's metadata; {CONTENT}")
     try:
         size = np.array([float(table.pop("x_resolution")), float(table.pop("y_resolution"))])
         corners = {str(name): np.array([float(v) for v in corner]) for name, corner in table.items()}
@@ -83,13 +87,8 @@ def _warn_of_unlisted(path: Path, listed: set[str]) -> None:
     there = {file.name for folder in (path, path / TILES) for file in folder.glob("*.pcd") if file.is_file()}
     unlisted = sorted(name for name in there - listed if not (kept and FOLLOWED.fullmatch(name)))
     if unlisted:
-        log.warning(
-            "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out",
-            path,
-            METADATA,
-            len(unlisted),
-            unlisted[0],
-        )
+        what = "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out"
+        log.warning(what, path, METADATA, len(unlisted), unlisted[0])
 
 
 def is_autoware_default(path: Path) -> bool:
@@ -137,7 +136,7 @@ def squares(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> Ite
     clouds = CloudPieces.of(cloud)
     if not clouds.n:
         raise MapvoteError(f"{where}: no points to write")
-    warn_of_float32(where, clouds.corners)
+    warn_of_float32(where, clouds)
     spill = Spill(folder_beside(Path(where)))
     blocks: dict[tuple[int, int], list[int]] = {}
     for piece in clouds:
@@ -158,16 +157,6 @@ def metadata(corners: Mapping[str, tuple[int, int]], side_m: int = SIDE_M) -> st
     """The text of pointcloud_map_metadata.yaml: the size of tiles, and the corner of each file."""
     lines = [f"x_resolution: {side_m:.1f}", f"y_resolution: {side_m:.1f}"]
     return "\n".join([*lines, *(f"{name}: [{x}, {y}]" for name, (x, y) in corners.items())]) + "\n"
-
-
-def _read_yaml(file: Path) -> dict[Any, Any]:
-    try:
-        table = yaml.safe_load(read_text(file))
-    except (yaml.YAMLError, ValueError) as error:
-        raise MapvoteError(f"{file}: cannot be read ({first_line(error)})") from error
-    if not isinstance(table, dict):
-        raise MapvoteError(f"{file}: not Autoware's metadata; {CONTENT}")
-    return table
 
 
 class _Laid(msgspec.Struct):

@@ -13,14 +13,11 @@ from numpy.typing import NDArray
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.geo.units import settle
 
 log = logging.getLogger("mapvote.formats")
 
 NEAR_ORIGIN_M = 50_000.0
 """Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
-_SOME = 1_000_000
-"""Points used to distinguish degrees from metres."""
 
 
 KEPT = (
@@ -52,11 +49,6 @@ class Cloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
 
-    def in_metres(self, where: str, wanted: MapFrame | None = None, *, sure: bool = False) -> Cloud:
-        """The cloud in map metres, in the frame ``wanted`` where one is; see ``geo.units.settle``."""
-        frame, convert = settle(where, self.frame, wanted, self.points[:_SOME], sure=sure)
-        return replace(self, points=convert(self.points), frame=frame)
-
 
 def full_scale(values: NDArray[Any]) -> float:
     """The value that means 1.0: the largest of an integer type; of floats 1, or 255 if any is above 1."""
@@ -73,10 +65,8 @@ class CloudPieces:
     frame: MapFrame
     n: int
     """Points of all pieces together."""
-    low: F64
-    """(3,) the lowest coordinates; 0 where there are no points."""
-    high: F64
-    """(3,) the highest."""
+    corners: F64
+    """(2, 3) lowest and highest coordinates; 0 where there are no points."""
     kinds: Mapping[str, np.dtype[Any]]
     """Fields of any piece; where one lacks it its points have 0."""
     full: Mapping[str, float]
@@ -101,14 +91,7 @@ class CloudPieces:
             for name in SCALED:
                 if name in piece.fields:
                     full[name] = max(full.get(name, 0.0), full_scale(piece.fields[name]))
-        if not n:
-            low, high = np.zeros(3), np.zeros(3)
-        return cls(pieces, frame, n, low, high, kinds, full)
-
-    @property
-    def corners(self) -> F64:
-        """(2, 3) lowest and highest coordinates."""
-        return np.array([self.low, self.high])
+        return cls(pieces, frame, n, np.array([low, high]) if n else np.zeros((2, 3)), kinds, full)
 
     def __iter__(self) -> Iterator[Cloud]:
         """The pieces, each with all fields."""
@@ -191,19 +174,10 @@ def lattice_of(points: NDArray[np.floating]) -> Lattice:
     return Lattice(round(float(x0), 1), round(float(y0), 1))
 
 
-def float32_loss_m(points: NDArray[np.floating]) -> float:
-    """The largest rounding of a coordinate if these points (n, 3) are stored as float32, metres."""
-    peak = float(np.abs(points).max()) if len(points) else 0.0
-    return 0.5 * float(np.spacing(np.float32(peak)))
-
-
-def warn_of_float32(where: str, points: NDArray[np.floating]) -> None:
+def warn_of_float32(where: str, cloud: CloudPieces) -> None:
     """Warn when float32 would move points by more than half a millimetre (coordinates beyond 8 km)."""
-    loss_m = float32_loss_m(points)
+    peak_m = float(np.abs(cloud.corners).max())
+    loss_m = 0.5 * float(np.spacing(np.float32(peak_m)))
     if loss_m > 0.0005:
-        log.warning(
-            "%s: coordinates of %.0f m as float32 are rounded by up to %.1f mm; subtract an offset, or use LAS",
-            where,
-            float(np.abs(points).max()),
-            1000 * loss_m,
-        )
+        what = "%s: coordinates of %.0f m as float32 are rounded by up to %.1f mm; subtract an offset, or use LAS"
+        log.warning(what, where, peak_m, 1000 * loss_m)

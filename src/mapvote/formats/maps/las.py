@@ -203,7 +203,7 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
         shift = np.array(clouds.frame.offset_m)  # back to the coordinates that the CRS means
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(read_crs(clouds.frame.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
-    header.offsets = np.floor(0.5 * (clouds.low + clouds.high) + shift)
+    header.offsets = np.floor(clouds.corners.mean(axis=0) + shift)
     compressed = path.suffix.lower() == ".laz"
     with (
         whole_file(path) as partial,

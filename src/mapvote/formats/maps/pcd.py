@@ -147,7 +147,7 @@ def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, double: bool = False) -
     """
     clouds = CloudPieces.of(cloud)
     if not double:
-        warn_of_float32(str(path), clouds.corners)
+        warn_of_float32(str(path), clouds)
     with whole_file(path) as partial:
         save_pcd(partial, clouds, np.float64 if double else np.float32)
 
