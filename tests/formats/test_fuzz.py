@@ -92,10 +92,6 @@ TARGETS = [
 ]
 
 
-def test_there_are_five_hundred() -> None:
-    assert sum(target.times for target in TARGETS) >= 500
-
-
 def _bags(folder: Path) -> None:
     for path, plugin in ((folder / "bag2", StoragePlugin.SQLITE3), (folder / "mcap", StoragePlugin.MCAP)):
         bag = Recorder(path, plugin)
@@ -231,15 +227,9 @@ def put(at: int, kind: str, value: int) -> Callable[[bytearray], None]:
     return lambda content: struct.pack_into(kind, content, at, value)
 
 
-def damage_count(content: bytearray) -> None:
-    """Four billion chunks where there is one."""
-    (table,) = struct.unpack_from("<q", content, LAZ_START)
-    struct.pack_into("<I", content, table + 4, 2**32 - 1)
-
-
-def damage_table(content: bytearray) -> None:
-    """Another length of the one chunk: random bytes where the compressed chunk table is."""
-    content[-6:] = b"\x5a\x13\xc7\x08\xee\x41"
+def many_chunks(content: bytearray) -> None:
+    """Four billion where there is one."""
+    put(struct.unpack_from("<q", content, LAZ_START)[0] + 4, "<I", 2**32 - 1)(content)
 
 
 LASZIP = 429  # the LASzip record in a LAS 1.4 header without other records: compressor, ..., chunk size, items
@@ -249,10 +239,10 @@ DAMAGES: dict[str, Callable[[bytearray], None]] = {
     "flipped": lambda content: content.__setitem__(slice(900, 960), bytes(60)),
     "panics: a chunk for every point": put(LASZIP + 12, "<I", 1),
     "panics: no items": put(LASZIP + 32, "<H", 0),
-    "aborts: four billion chunks": lambda content: put(
-        struct.unpack_from("<q", content, LAZ_START)[0] + 4, "<I", 2**32 - 1
-    )(content),
-    "may abort: chunk table": damage_table,
+    "aborts: four billion chunks": many_chunks,
+    "may abort: another length of the one chunk": lambda content: content.__setitem__(
+        slice(-6, None), b"\x5a\x13\xc7\x08\xee\x41"
+    ),
 }
 
 
@@ -279,7 +269,7 @@ def test_a_damaged_laz_file_is_one_clear_error(tmp_path: Path, laz: bytes, damag
 
 def test_the_command_line_says_one_line_about_a_damaged_laz_file(tmp_path: Path, laz: bytes) -> None:
     content = bytearray(laz)
-    damage_count(content)
+    many_chunks(content)
     path = tmp_path / "bad.laz"
     path.write_bytes(content)
     done = subprocess.run(

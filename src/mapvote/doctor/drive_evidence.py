@@ -16,7 +16,7 @@ import scipy
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
-from mapvote.doctor import Finding, Progress, Severity
+from mapvote.doctor import Finding, Progress
 from mapvote.doctor.scans import Looking, Looks
 from mapvote.localisation.ndt import fitness, likeliest, refine
 from mapvote.localisation.ndt_map import NdtMap
@@ -166,7 +166,7 @@ class DriveEvidence:
     @cached_property
     def scatter_m(self) -> float:
         """Of ranges, of the first LiDAR: rays of another one begin elsewhere, and end on other things."""
-        return float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in self._scans]))
+        return float(np.median([_range_scatter_m(scan.by_lidar()[0][1].points) for scan in self._scans]))
 
     @property
     def can_be_registered(self) -> bool:
@@ -249,7 +249,11 @@ class DriveEvidence:
 
 def find_road(scans: Sequence[F32]) -> Road:
     """The road that several scans show. Another axis than z must hold half as much again: a wall is no road."""
-    near = [_low_points(scan) for scan in scans]
+    near = []
+    for scan in scans:
+        away = np.linalg.norm(scan, axis=1)
+        points = scan[(away < _NEAR_M) & (away > 2.0)].astype(np.float64)
+        near.append(points[:: max(1, len(points) // 3000)])
     planes = [_best_planes(points, np.random.default_rng(k)) for k, points in enumerate(near)]
     share = {name: float(np.mean([one[name][0] for one in planes])) for name in _UPS}
     best = max(share, key=lambda name: share[name])
@@ -260,12 +264,6 @@ def find_road(scans: Sequence[F32]) -> Road:
     depth_m, scatter_m = (float(np.median([one[k] for one in fitted])) for k in (1, 2))
     unsteady_m = 1.4826 * float(np.median([abs(depth - depth_m) for _, depth, _ in fitted]))
     return Road(best, depth_m, share[best], normal / np.linalg.norm(normal), scatter_m, unsteady_m)
-
-
-def _low_points(scan: F32) -> F64:
-    distance = np.linalg.norm(scan, axis=1)
-    points = scan[(distance < _NEAR_M) & (distance > 2.0)].astype(np.float64)
-    return points[:: max(1, len(points) // 3000)]
 
 
 def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float, F64, float]]:
@@ -308,7 +306,7 @@ def _fitted(points: F64, normal: F64, depth_m: float) -> tuple[F64, float, float
     return normal, depth_m, scatter
 
 
-def range_scatter_m(points: F32) -> float:
+def _range_scatter_m(points: F32) -> float:
     """Standard deviation of a range from the surface that the rays beside it show, metres; 0 for a scan of few points.
 
     On a plane the inverse range is linear in the direction: it is fitted to the eight nearest directions. Edges and
@@ -368,9 +366,9 @@ def check_ranges(e: DriveEvidence) -> Iterator[Finding]:
     """Do ranges scatter more than a sound sensor's?"""
     if len(e.readable) > 2 and e.scatter_m > _SCATTER_M:
         what = f"ranges scatter by {e.scatter_m:.2f} m against those of the rays beside them"
+        what += " (sound sensors: 0.01 to 0.04 m)"
         mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
-        grave: Severity = "error" if e.scatter_m > 2.0 * _SCATTER_M else "warning"
-        yield Finding(grave, f"{what} (sound sensors: 0.01 to 0.04 m)", mend)
+        yield Finding("error" if e.scatter_m > 2.0 * _SCATTER_M else "warning", what, mend)
 
 
 def check_road(e: DriveEvidence) -> Iterator[Finding]:
@@ -406,16 +404,15 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
     if tilt_deg > 4.0:
         pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
-        own = f"in the scans: pitch {pitch:.1f}, roll {roll:.1f}"
+        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg (in the scans: pitch {pitch:.1f}, "
         mend = "level the points by that, or put the sensor's tilt into the prior's rotations; on a hill all is well"
-        grave: Severity = "error" if tilt_deg > 8.0 else "warning"
-        yield Finding(grave, f"by prior and scans the road is tilted by {tilt_deg:.1f} deg ({own})", mend)
+        yield Finding("error" if tilt_deg > 8.0 else "warning", f"{what}roll {roll:.1f})", mend)
 
 
 def _check_motion(runs: Sequence[Run], stamps_ns: I64) -> Iterator[Finding]:
     """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
     broken = [run for run in runs if run.usual_fit < _LEAST_FIT]
-    leaps = np.concatenate([~agree_with_time(run, stamps_ns) for run in runs])
+    leaps = np.concatenate([~_agree_with_time(run, stamps_ns) for run in runs])
     speed = [run.length_m / (1e-9 * float(np.diff(stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
     mend = "are the files in order of time (names, times.txt), of one drive, and whole?"
     if len(broken) > 0.5 * len(runs):
@@ -435,7 +432,7 @@ def _check_motion(runs: Sequence[Run], stamps_ns: I64) -> Iterator[Finding]:
     yield Finding("error", what, mend)
 
 
-def agree_with_time(run: Run, stamps_ns: I64) -> Bool:
+def _agree_with_time(run: Run, stamps_ns: I64) -> Bool:
     """(m - 2,) whether the steps of a run follow each other as a vehicle can: no leap of its speed."""
     seconds = np.diff(stamps_ns[run.indices]) * 1e-9
     velocity = np.diff(run.T_first_lidar[:, :3, 3], axis=0) / seconds[:, None]

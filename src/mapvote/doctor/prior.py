@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from mapvote.core.geometry import from_xyz_rpy, inverse, inverses, log
+from mapvote.core.geometry import from_xyz_rpy, inverse, inverses, log, poses_at
 from mapvote.core.types import F64, I64
 from mapvote.doctor.drive_evidence import Run
 
@@ -32,6 +32,7 @@ LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
 SURE, LIKELY = 4.0, 2.0
 """Standard errors: what is more than so many is an error, and may be one."""
 _SURE_OF_TIME = 5.0
+X_FORWARD = "turn the points, or T_base_lidar, so that x is forward"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,22 +64,14 @@ def turned(C: F64) -> Rule:
 
 def _moved(of_positions: Callable[[F64], F64]) -> Rule:
     """Positions (n, 3) elsewhere."""
-
-    def read(T: F64) -> F64:
-        out = T.copy()
-        out[:, :3, 3] = of_positions(T[:, :3, 3])
-        return out
-
-    return read
+    return lambda T: poses_at(of_positions(T[:, :3, 3]), T[:, :3, :3])
 
 
 def _headed(T: F64, yaw: F64) -> F64:
     """The same positions, level, with these headings (n,)."""
-    out = np.tile(np.eye(4), (len(T), 1, 1))
-    c, s = np.cos(yaw), np.sin(yaw)
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
-    out[:, :3, 3] = T[:, :3, 3]
-    return out
+    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    rotations = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]])
+    return poses_at(T[:, :3, 3], rotations.transpose(2, 0, 1))
 
 
 def _heading(T: F64) -> F64:
@@ -104,12 +97,6 @@ def median_angle_deg(angles: F64) -> float:
 def drift_angle_deg(T: F64) -> float:
     """By how much the headings differ from the course of the positions, median, degrees counter-clockwise."""
     return median_angle_deg(_heading(T) - _course(T))
-
-
-def _transposed(T: F64) -> F64:
-    out = T.copy()
-    out[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
-    return out
 
 
 def _from_steps(T: F64) -> F64:
@@ -140,7 +127,7 @@ def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
     }
     prior = f"the prior's headings are off by {yaw_deg} deg, counter-clockwise"
     return (
-        Reading(scans[yaw_deg], "turn the points, or T_base_lidar, so that x is forward", rule, "scans", angle=True),
+        Reading(scans[yaw_deg], X_FORWARD, rule, "scans", angle=True),
         Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule, angle=True),
     )
 
@@ -154,7 +141,9 @@ READINGS = (
         lambda T: np.asarray(CAMERA_TO_LIDAR @ T @ CAMERA_TO_LIDAR.T),
     ),
     Reading(
-        "the prior's rotations are transposed (or its angles clockwise)", "transpose the 3 x 3 rotations", _transposed
+        "the prior's rotations are transposed (or its angles clockwise)",
+        "transpose the 3 x 3 rotations",
+        lambda T: poses_at(T[:, :3, 3], np.swapaxes(T[:, :3, :3], 1, 2)),
     ),
     Reading(
         "the prior's heading is a compass bearing (0 north, clockwise)",
@@ -280,12 +269,9 @@ def at_times(T: F64, stamps_ns: I64, shift_s: float) -> F64:
     """The poses (n, 4, 4) believed ``shift_s`` later than each stamp; held at the ends."""
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     wanted = np.clip(seconds + shift_s, seconds[0], seconds[-1])
-    out = np.tile(np.eye(4), (len(T), 1, 1))
     rotations = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3])
-    out[:, :3, :3] = scipy.spatial.transform.Slerp(seconds, rotations)(wanted).as_matrix()
-    for axis in range(3):
-        out[:, axis, 3] = np.interp(wanted, seconds, T[:, axis, 3])
-    return out
+    positions = np.column_stack([np.interp(wanted, seconds, T[:, axis, 3]) for axis in range(3)])
+    return poses_at(positions, scipy.spatial.transform.Slerp(seconds, rotations)(wanted).as_matrix())
 
 
 def _fit_rule(rule: Callable[[F64], Rule], starts: list[F64], T: F64, runs: Sequence[Run]) -> tuple[F64, F64]:
@@ -365,10 +351,8 @@ class Similarity:
 
     def applied(self, T: F64) -> F64:
         """Poses (n, 4, 4) of the first set as the second has them; of one that was fitted without an own turn."""
-        out = np.tile(np.eye(4), (len(T), 1, 1))
-        out[:, :3, :3] = self.rotation @ T[:, :3, :3]
-        out[:, :3, 3] = self.middle + self.offset_m + self.scale * (T[:, :3, 3] - self.middle) @ self.rotation.T
-        return out
+        positions = self.middle + self.offset_m + self.scale * (T[:, :3, 3] - self.middle) @ self.rotation.T
+        return poses_at(positions, self.rotation @ T[:, :3, :3])
 
 
 def fit_similarity(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from mapvote.core.geometry import poses_at
 from mapvote.core.types import F64, Drive
 from mapvote.doctor import Finding, Severity
 from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
@@ -23,6 +24,7 @@ from mapvote.doctor.prior import (
     LIKELY,
     READINGS,
     SURE,
+    X_FORWARD,
     Number,
     Reading,
     at_times,
@@ -221,9 +223,7 @@ def _reading_of(number: Number, T: F64, runs: Sequence[Run], road: Road) -> Read
         back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
         what = f"the scans {back}are turned by {forward:.1f} deg about z (+-{number.sigma:.1f})"
         what += " from the direction of travel"
-        return Reading(
-            what, "turn the points, or T_base_lidar, so that x is forward", number.poses, "scans", angle=True
-        )
+        return Reading(what, X_FORWARD, number.poses, "scans", angle=True)
     what = f"the prior's headings are off by {value:.1f} deg (+-{number.sigma:.1f}), counter-clockwise"
     return Reading(what, f"turn its rotations by {-value:.1f} deg about z", number.poses, angle=True)
 
@@ -312,14 +312,14 @@ def fit_to_chain(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> ChainFit | N
     fit = fit_similarity(seen, T[chain.indices], position_m=_POSITION_M, rotation_rad=_ROTATION_RAD, own_turn=True)
     strays = float(np.linalg.norm(fit.off_m, axis=1).mean()) / reach_m
     share = float(np.hypot(strays, np.sqrt(2.0) * prior_sigma_m / extent_m))
-    back = np.eye(4)
-    back[:3, :3] = scipy.spatial.transform.Rotation.from_euler("zy", fit.own_deg, degrees=True).inv().as_matrix()
+    own = scipy.spatial.transform.Rotation.from_euler("zy", fit.own_deg, degrees=True)
+    back = turned(poses_at([np.zeros(3)], own.inv().as_matrix())[0])
     yaw_deg, pitch_deg = fit.own_deg
     sigma_deg = float(np.degrees(np.hypot(share, _CHAIN_RAD)))
     return ChainFit(
         Number("scale", fit.scale, fit.scale * float(np.hypot(share, _CHAIN_SCALE)), scaled(1.0 / fit.scale)),
-        Number("turn", yaw_deg, sigma_deg, turned(back)),
-        Number("pitch", -pitch_deg, sigma_deg, turned(back)),
+        Number("turn", yaw_deg, sigma_deg, back),
+        Number("pitch", -pitch_deg, sigma_deg, back),
         float(np.linalg.norm(seen[-1, :3, 3])),
         float(np.sqrt((fit.off_m**2).sum(axis=1).mean())),
     )

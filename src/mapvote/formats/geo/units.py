@@ -49,10 +49,9 @@ def settle(
     if stated.crs.startswith(ENU):
         return _moved(stated, wanted)
     crs = read_crs(stated.crs)
-    horizontal, vertical = crs.sub_crs_list[:2] if crs.is_compound else (crs, None)
-    heights = stated.heights or (
-        vertical.name if vertical else "above the ellipsoid" if len(crs.axis_info) == 3 else ""
-    )
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    own = crs.sub_crs_list[1].name if crs.is_compound else "above the ellipsoid" if len(crs.axis_info) == 3 else ""
+    heights = stated.heights or own
     if horizontal.is_geographic or horizontal.is_geocentric:
         if wanted is None or wanted.is_local:
             raise MapvoteError(_degrees(where, horizontal, first))
