@@ -46,6 +46,36 @@ class Recording:
 
 Change = Callable[..., Any]
 """Of one array, float64."""
+
+
+Span = tuple[float, float]
+
+
+def sound_street(
+    x: Span = (-60, 90),
+    y: Span = (-40, 60),
+    walls: int = 60,
+    beside: Span = (9, 30),
+    longest: float = 12,
+    slope: float = 0,
+) -> F64:
+    """Points on a road, and on walls at odd angles beside it, map metres; seeded."""
+    rng, n = np.random.default_rng(5), 60_000
+    parts = [np.column_stack([rng.uniform(*x, n), rng.uniform(*y, n), rng.normal(0, 0.01, n)])]
+    for _ in range(walls):
+        x0, y0 = rng.uniform(*x), rng.choice([-1, 1]) * rng.uniform(*beside)
+        along, height, heading = rng.uniform(2, longest), rng.uniform(2, 8), rng.uniform(0, np.pi)
+        s, z = rng.uniform(0, along, 900), rng.uniform(0, height, 900)
+        parts.append(np.column_stack([x0 + s * np.cos(heading), y0 + s * np.sin(heading), z]))
+    points = np.concatenate(parts)
+    points[:, 2] += slope * points[:, 0]
+    return points
+
+
+def serious(found: Iterable[Finding]) -> list[str]:
+    return [f.what for f in found if f.severity != "note"]
+
+
 Break = Callable[[Recording], Recording]
 
 
@@ -405,13 +435,12 @@ def verdict(rights: list[str], found: Iterable[Finding]) -> str:
     it cannot be decided; "part": one of two is named; "vague": something is wrong but not what; "wrong": an error names
     something else; "sound"."""
     found = list(found)
-    serious = [f.what for f in found if f.severity != "note"]
-    named = [any(re.search(right, what) for what in serious) for right in rights]
+    named = [any(re.search(right, what) for what in serious(found)) for right in rights]
     if named and all(named):
         return "right"
     if any(named):
         return "part"
-    if not serious:
+    if not serious(found):
         return "open" if any(re.search(right, f.what) for right in rights for f in found) else "sound"
     errors = [f.what for f in found if f.severity == "error"]
     return "wrong" if any(not re.search(VAGUE, what) for what in errors) else "vague"

@@ -5,20 +5,18 @@ The street: a road, two rows of walls with gaps; the car turns gently, so that a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from faults import Recording, broken, kinds_of, verdict
+from faults import Recording, broken, kinds_of, serious, sound_street, verdict
 from mapvote.core import geometry
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose, examine_drive
 from mapvote.doctor.map_fit import MapEvidence, check_on_map, in_another_unit
 from mapvote.doctor.maps import examine_points
@@ -29,20 +27,6 @@ from mapvote_lab.simulation import simulate
 from streets import drive_along, path
 
 N = 24
-
-
-def world() -> F64:
-    """Points on a road, walls and poles, map metres; seeded."""
-    rng = np.random.default_rng(5)
-    road = np.column_stack([rng.uniform(-60, 90, 60_000), rng.uniform(-40, 60, 60_000), rng.normal(0, 0.01, 60_000)])
-    parts = [road]
-    for _ in range(60):
-        x, y = rng.uniform(-60, 90), rng.choice([-1, 1]) * rng.uniform(9, 30)
-        along, height = rng.uniform(2, 12), rng.uniform(2, 8)
-        heading = rng.uniform(0, np.pi)
-        s, z = rng.uniform(0, along, 900), rng.uniform(0, height, 900)
-        parts.append(np.column_stack([x + s * np.cos(heading), y + s * np.sin(heading), z]))
-    return np.concatenate(parts)
 
 
 def poses() -> F64:
@@ -56,7 +40,7 @@ def poses() -> F64:
 @pytest.fixture(scope="module")
 def sound() -> Recording:
     rng = np.random.default_rng(9)
-    points = world()
+    points = sound_street()
     scans = []
     for T in poses():
         local = geometry.transform(geometry.inverse(T), points)
@@ -69,16 +53,12 @@ def sound() -> Recording:
     return Recording(scans, poses(), np.linspace(0.0, 2.3, N), about)
 
 
-def serious(found: Iterable[Finding]) -> list[str]:
-    return [f.what for f in found if f.severity != "note"]
-
-
 def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
     sound.write(tmp_path / "d")
     found = diagnose(tmp_path / "d").findings
     assert serious(found) == []
     assert any("mistakes of the prior show from " in f.what for f in found), found
-    assert serious(diagnose(tmp_path / "d", None, map_from_points(world())).findings) == []
+    assert serious(diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings) == []
 
 
 FAST = {
@@ -116,7 +96,7 @@ def test_what_is_wrong_with_a_drive_is_named_one_fault_and_two(tmp_path: Path, s
 @pytest.mark.parametrize("kind", [kind for kind in kinds_of("maps") if " + " in kind or "shifted" in kind])
 def test_what_is_wrong_with_a_map_shows_by_a_drive(sound: Recording, kind: str) -> None:
     rights, change = kinds_of("maps")[kind]
-    found, point_map = examine_points("map", Cloud(change(world())))
+    found, point_map = examine_points("map", Cloud(change(sound_street())))
     assert point_map is not None
     found += check_on_map(drive_of(sound), poses(), point_map)[0]
     assert verdict(rights, found) == "right", found
@@ -171,7 +151,7 @@ def test_healthy_simulated_drives_and_those_of_kitti_raise_no_alarm(tmp_path: Pa
     ],
 )
 def test_of_a_map_that_is_not_in_metres_the_unit_is_named(sound: Recording, numbers: float, name: str) -> None:
-    points = world()
+    points = sound_street()
     points = points[(np.abs(points[:, :2] - [8.0, 5.0]) < 30.0).all(axis=1)]
     tiles = {}
     for index, mine in cut_tiles(numbers * points, Lattice()):
@@ -186,18 +166,18 @@ def test_of_a_map_that_is_not_in_metres_the_unit_is_named(sound: Recording, numb
 @pytest.mark.slow
 def test_drive_and_map_that_do_not_belong_together(tmp_path: Path, sound: Recording) -> None:
     sound.write(tmp_path / "d")
-    elsewhere = map_from_points(world() + np.array([5000.0, 0, 0]))
+    elsewhere = map_from_points(sound_street() + np.array([5000.0, 0, 0]))
     assert "do not overlap" in serious(diagnose(tmp_path / "d", None, elsewhere).findings)[0]
-    lower = map_from_points(world() - np.array([0, 0, 40.0]))
+    lower = map_from_points(sound_street() - np.array([0, 0, 40.0]))
     assert (
         "shifted by 40.00 m (x -0.00, y +0.00, z -40.00" in serious(diagnose(tmp_path / "d", None, lower).findings)[0]
     )
-    larger = map_from_points(1.04 * world())
+    larger = map_from_points(1.04 * sound_street())
     found = serious(diagnose(tmp_path / "d", None, larger).findings)
     assert any("scaled by 1.0" in what for what in found), found
-    feet = map_from_points(world()[::4] / 0.3048)
+    feet = map_from_points(sound_street()[::4] / 0.3048)
     assert "the map is in feet" in serious(diagnose(tmp_path / "d", None, feet).findings)[0]
-    bare = world()
+    bare = sound_street()
     bare = bare[bare[:, 0] < -30]
     corner = map_from_points(np.concatenate([bare, [[10.0, 5.0, 0.0]]]))
     assert "fits the map nowhere" in serious(diagnose(tmp_path / "d", None, corner).findings)[0]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from faults import kinds_of, verdict
+from faults import kinds_of, serious, sound_street, verdict
 from hand_made import save_pcd
 from mapvote.core import geometry
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
-from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.maps import check_cloud, check_map, examine_points, in_memory
 from mapvote.formats import write_map
@@ -25,33 +24,14 @@ from mapvote.formats.maps.las import write_las
 Change = Callable[[F64], F64]
 
 
-def street() -> F64:
-    """A road with walls at odd angles and poles beside it, map metres; seeded. Scanned evenly, every 0.2 m or so."""
-    rng = np.random.default_rng(5)
-    n = 60_000
-    x, y = rng.uniform(0, 100, n), rng.uniform(-25, 25, n)
-    parts = [np.column_stack([x, y, 0.01 * x + rng.normal(0, 0.01, n)])]
-    for _ in range(50):
-        x0, y0 = rng.uniform(0, 100), rng.choice([-1, 1]) * rng.uniform(8, 22)
-        along, height, heading = rng.uniform(2, 10), rng.uniform(2, 8), rng.uniform(0, np.pi)
-        s, z = rng.uniform(0, along, 900), rng.uniform(0, height, 900)
-        x = x0 + s * np.cos(heading)
-        parts.append(np.column_stack([x, y0 + s * np.sin(heading), 0.01 * x + z]))
-    return np.concatenate(parts)
-
-
 @pytest.fixture(scope="module")
 def points() -> F64:
-    return street()
+    return sound_street((0, 100), (-25, 25), 50, (8, 22), longest=10, slope=0.01)
 
 
 @pytest.fixture(scope="module")
 def sound(points: F64) -> PointMap:
     return map_from_points(points)
-
-
-def serious(found: Iterable[Finding]) -> list[str]:
-    return [f.what for f in found if f.severity != "note"]
 
 
 def test_a_sound_map_is_not_blamed(points: F64, sound: PointMap) -> None:
@@ -106,10 +86,6 @@ def test_house_fronts_behind_each_other_are_not_taken_for_the_ground() -> None:
     assert not [what for what in serious(check_cloud(in_memory(houses))) if "up" in what]
 
 
-def again(*shift_m: float) -> Change:
-    return lambda p: np.concatenate([p, p + np.array(shift_m)])
-
-
 @pytest.mark.parametrize(
     ("shift", "name"),
     [
@@ -118,7 +94,7 @@ def again(*shift_m: float) -> Change:
     ],
 )
 def test_how_far_apart_layers_lie_is_measured(points: F64, shift: tuple[float, ...], name: str) -> None:
-    found = serious(check_map(map_from_points(again(*shift)(points))))
+    found = serious(check_map(map_from_points(np.concatenate([points, points + shift]))))
     assert any(re.search(name, what) for what in found), found
 
 

@@ -1,25 +1,134 @@
-"""Bags of whole vehicles: several LiDARs, GNSS fixes, raw packets."""
+"""ROS bags: point clouds and their times, poses, several LiDARs of one vehicle, GNSS fixes, raw packets."""
 
 from __future__ import annotations
 
+import logging
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial import cKDTree
 
-from bag_recorder import START, Recorder
+from bag_recorder import CLOUD, START, Recorder
 from mapvote.core import geometry
-from mapvote.core.types import MapvoteError
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F32, MapvoteError
 from mapvote.formats import open_drive
+from mapvote.formats.drives.point_fields import point_times_s
 from mapvote.formats.geo.frame import MapFrame
 
+N = 5
+STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * i for i in range(N)]
+STEP = geometry.from_xyz_rpy(12.0, 0.1, 0.0, yaw=0.02)
 HALL = np.random.default_rng(0).uniform([-20, -20, -2], [20, 20, 6], (2000, 3))
 T_BASE = {
     "front": geometry.from_xyz_rpy(2.0, 0.0, 1.0, 0.0, 0.1, 0.0),
     "rear": geometry.from_xyz_rpy(-2.0, 0.3, 1.2, 0, 0, 3.0),
 }
+
+
+def cloud(i: int) -> F32:
+    """300 points all round, farther off than the sensor's nearest."""
+    rng = np.random.default_rng(i)
+    return np.float32(rng.uniform(5, 40, (300, 3)) * rng.choice([-1, 1], (300, 3)))
+
+
+def write_bag(
+    path: Path, storage: StoragePlugin, *, topics: tuple[str, ...] = ("/points",), stamped: bool = True, cut: int = 0
+) -> Path:
+    """A bag of PointCloud2 (x y z intensity, Ouster's t) with poses at twice the rate."""
+    bag = Recorder(path, storage)
+    for i, ns in enumerate(STAMPS):
+        kinds = [*((axis, "<f4") for axis in "xyz"), ("pad", "<u4"), ("intensity", "<f4"), ("t", "<u4")]
+        table = np.zeros(300, dtype=kinds)
+        table["x"], table["y"], table["z"] = cloud(i).T
+        table["intensity"], table["t"] = 51.0, np.arange(300) * 300_000
+        table["x"][7] = np.nan  # a ray that hit nothing
+        for topic in topics:
+            bag.write(topic, CLOUD, ns + 5_000_000, bag.cloud_of(table, ns if stamped else 0, cut=cut))
+    for k in range(2 * N + 1):
+        pose = geometry.interpolate(np.eye(4), STEP, k / 2 - 0.5)
+        ns = STAMPS[0] + 50_000_000 * k
+        bag.pose("/odom", ns - 50_000_000 if stamped else 0, pose, ns)
+    bag.bag.close()
+    return path
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_a_ros2_bag_is_a_drive(tmp_path: Path, storage: StoragePlugin) -> None:
+    drive = open_drive(write_bag(tmp_path / "bag", storage), prior="/odom", sensor="hdl32e")
+    assert drive.stamps_ns.tolist() == STAMPS
+    keep = np.arange(300) != 7
+    for i in (0, 3, 1):  # in any order
+        scan = drive.read_scan(i)
+        assert np.array_equal(scan.points, cloud(i)[keep])
+        assert scan.intensity is not None
+        assert np.allclose(scan.intensity, 0.2)
+        assert scan.time_s is not None
+        assert np.allclose(scan.time_s, np.arange(300)[keep] * 0.0003)
+    assert drive.T_map_lidar_prior is not None
+    assert np.allclose(drive.T_map_lidar_prior[1], STEP, atol=1e-9)
+    assert len(open_drive(tmp_path / "bag", scans="1:4:2")) == 2
+    prior = open_drive(tmp_path / "bag", prior="/odom", mount="1,0,2,0,0,0", sensor="hdl32e").T_map_lidar_prior
+    assert prior is not None
+    assert np.allclose(prior[0, :3, 3], [1, 0, 2], atol=1e-9)
+    for file in (tmp_path / "bag").glob("*.mcap"):  # without its folder
+        assert len(open_drive(file, sensor="hdl32e")) == N
+
+
+def test_bags_that_leave_a_question_open(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = write_bag(tmp_path / "two", StoragePlugin.SQLITE3, topics=("/front", "/rear"))
+    with pytest.raises(MapvoteError, match=r"choose with --topic .*/front \(5\), /rear \(5\)"):
+        open_drive(bag)
+    assert len(open_drive(bag, topic="/rear", sensor="hdl32e")) == N
+    (bag / "drive.toml").write_text("topic = '/front'\nsensor = 'vlp16'\n")
+    assert open_drive(bag).sensor.name == "vlp16"
+    with pytest.raises(MapvoteError, match=r"no PointCloud2 topic /left; there are: /front"):
+        open_drive(bag, topic="/left")
+    with pytest.raises(MapvoteError, match=r"no pose topic /gps; topics with poses: /odom"):
+        open_drive(bag, prior="/gps")
+    with caplog.at_level(logging.WARNING):
+        unstamped = open_drive(write_bag(tmp_path / "u", StoragePlugin.MCAP, stamped=False), sensor="hdl32e")
+    assert "no stamps" in caplog.text
+    assert unstamped.stamps_ns[0] == STAMPS[0] + 5_000_000
+    assert len(unstamped.read_scan(0).points) == 299
+
+
+def test_broken_bags_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MapvoteError, match=r"7190 bytes, but its header says 7200"):
+        open_drive(write_bag(tmp_path / "cut", StoragePlugin.SQLITE3, cut=10))
+    (tmp_path / "cut" / "metadata.yaml").write_text("nonsense")
+    with pytest.raises(MapvoteError, match="not a readable bag"):
+        open_drive(tmp_path / "cut")
+    for module in [m for m in sys.modules if m.partition(".")[0] == "rosbags"]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(MapvoteError, match=r"mapvote\[ros\]"):
+        open_drive(tmp_path / "cut")
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("absolute", [False, True])
+def test_point_times_are_understood_in_every_unit(unit: float, absolute: bool) -> None:
+    truth_s = np.linspace(-0.05, 0.049, 100)
+    if unit == 1e-9:
+        raw: NDArray[Any] = np.round(truth_s * 1e9).astype(np.int64) + (STAMPS[0] if absolute else 0)
+    else:
+        raw = (truth_s + (STAMPS[0] * 1e-9 if absolute else 0.0)) / unit
+    time_s = point_times_s("scan", raw, STAMPS[0], SENSORS["hdl32e"])
+    assert time_s is not None
+    assert np.allclose(time_s, truth_s, atol=1e-6)
+
+
+def test_point_times_that_cannot_be() -> None:
+    assert point_times_s("scan", np.zeros(9), STAMPS[0], SENSORS["hdl32e"]) is None
+    with pytest.raises(MapvoteError, match="two clocks"):
+        point_times_s("scan", 1e9 + np.linspace(0, 0.1, 9), STAMPS[0], SENSORS["hdl32e"])
 
 
 def two_lidars(path: Path, *, static: bool = True, late_ns: int = 4 * 10**7, lost: int = -1) -> Path:
