@@ -35,7 +35,8 @@ T_BASE = {
 def cloud(i: int) -> F32:
     """300 points all round, farther off than the sensor's nearest."""
     rng = np.random.default_rng(i)
-    return np.float32(rng.uniform(5, 40, (300, 3)) * rng.choice([-1, 1], (300, 3)))
+    out: F32 = (rng.uniform(5, 40, (300, 3)) * rng.choice([-1, 1], (300, 3))).astype(np.float32)
+    return out
 
 
 def write_bag(
