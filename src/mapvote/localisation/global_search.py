@@ -16,12 +16,11 @@ import scipy
 
 from mapvote.config import NdtSettings
 from mapvote.core.columns import flat_cells
-from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
-from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
+from mapvote.localisation.coarse_search import LEAST_LEAD, best_and_rival, distinct, place_without_prior
 from mapvote.localisation.ndt import refine
 from mapvote.localisation.ndt_map import LEVELS, MapWindow
 from mapvote.localisation.odometry import Tracker
@@ -320,12 +319,11 @@ class GlobalSearch:
         clouds = [np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // 2000)]) for cloud in clouds]
         refined = [refine(self.map_around(guess[:3, 3]), clouds, guess) for guess in guesses]
         refined.sort(key=lambda result: -result.score)
-        judged = [self._judged(scan, T) for T in _distinct([r.T_map_lidar for r in refined])[:_JUDGED]]
-        if not judged:
+        places = distinct((one.T_map_lidar for one in refined), _SPREAD_RAD)[:_JUDGED]
+        if not places:
             return None
-        judged.sort(key=lambda one: -one[0])
-        rival = max((fit for fit, T in judged[1:] if _differ(T, judged[0][1])), default=0.0)
-        return Found(judged[0][1], judged[0][0], judged[0][0] - rival)
+        fit, T, rival = best_and_rival([self._judged(scan, T) for T in places], _SPREAD_RAD)
+        return Found(T, fit, fit - rival)
 
     def _judged(self, scan: Scan, T: F64) -> tuple[float, F64]:
         ndt_map = self.map_around(T[:3, 3])
@@ -336,16 +334,3 @@ class GlobalSearch:
         T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
         few = solid_sample(points, LEVELS[-1].points_m)
         return self.judge.fit(ndt_map, few, T), T
-
-
-def _differ(T: F64, other: F64) -> bool:
-    between = inverse(T) @ other
-    return bool(np.linalg.norm(between[:2, 3]) > 1.5 or between[0, 0] < np.cos(_SPREAD_RAD))
-
-
-def _distinct(poses: list[F64]) -> list[F64]:
-    out: list[F64] = []
-    for T in poses:
-        if all(_differ(T, other) for other in out):
-            out.append(T)
-    return out
