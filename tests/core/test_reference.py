@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile, wall
-from mapvote.config import Settings, choose_case
 from mapvote.core.grid import TILE_CELLS, Grid
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, above_ground_points, reference_window
-from mapvote.core.types import F64, MapvoteError, Reference
+from mapvote.core.types import F64, Reference
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +62,3 @@ def test_new_things_are_believed_only_over_ground_that_the_map_measured() -> Non
     assert (words[:, :20] == ~np.uint64(0)).all()
     assert (words[:, 20] != 0).all(), "the cell next to measured ground counts too"
     assert not words[:, 22:28].any()
-
-
-def test_the_paper_cases_by_number_and_ours_by_name() -> None:
-    assert choose_case(Settings(), "surfaces").voting.method == "surfaces"
-    second = choose_case(Settings(), "2").voting
-    assert (second.method, second.weighted, second.two_stage, second.skip_tall_cells) == ("paper", False, True, False)
-    with pytest.raises(MapvoteError, match="choose surfaces or one of 1, 2, 3, 4, 5"):
-        choose_case(Settings(), "6")

@@ -21,12 +21,15 @@ def path(height: float, length: float = 80.0) -> F64:
     return np.column_stack([x, np.zeros(len(x)), 0.02 * x + height])
 
 
-def test_on_sound_ground_the_sensor_keeps_its_height() -> None:
+def test_on_sound_ground_the_sensor_keeps_its_height_and_beyond_the_map_nothing_is_known() -> None:
     heights = check_heights(street(), path(1.73))
     assert abs(heights.median_m - 1.73) < 0.02
     assert abs(heights.worst_off_m) < 0.05
     assert heights.complaint == ""
     assert "1.73 m over the ground" in str(heights)
+    assert "unknown under" in str(check_heights(street(), path(1.73, 120.0)))
+    off = check_heights(street(), path(1.73) + np.array([1000.0, 0.0, 0.0]))
+    assert off.complaint == "the map has no ground under the path"
 
 
 def test_a_stretch_where_the_ground_sank_is_named_with_its_place() -> None:
@@ -40,13 +43,6 @@ def test_a_stretch_where_the_ground_sank_is_named_with_its_place() -> None:
     assert 40 < heights.worst_xy[0] < 50
     assert 0.1 < heights.off_share < 0.15
     assert "disagree by more than 0.3 m along" in heights.complaint
-
-
-def test_beyond_the_map_nothing_is_known_and_it_says_so() -> None:
-    off = path(1.73) + np.array([1000.0, 0.0, 0.0])
-    assert np.isnan(street().ground_under(off)).all()
-    assert check_heights(street(), off).complaint == "the map has no ground under the path"
-    assert "unknown under" in str(check_heights(street(), path(1.73, 120.0)))
 
 
 def test_a_drive_over_a_bridge_that_it_passed_below_is_two_levels() -> None:

@@ -39,11 +39,6 @@ def test_equation_1(n: int, exact: float) -> None:
     assert weight_table(True, 2.0, 3.0, 0.5, 5)[n] == pytest.approx(exact * VOTE_UNIT, abs=0.5)
 
 
-def test_below_n_min_a_cell_is_not_occupied() -> None:
-    assert (vote_weight(np.arange(5)) == 0).all()
-    assert weight_table(False, 2.0, 3.0, 0.5, 5).tolist()[3:7] == [0, 0, VOTE_UNIT, VOTE_UNIT]
-
-
 def test_table_i_vehicles_as_printed_by_plain_plurality_of_scans() -> None:
     assert plurality(TABLE_I.astype(np.int32)).tolist() == [CO, CO, UN]
 
@@ -64,16 +59,6 @@ def test_ten_scans_of_the_paper() -> None:
             for _ in range(scans):
                 cast(tally, np.array([[state]], np.uint8), np.array([[VOTE_UNIT]], np.int32))
         assert plurality(tally)[0, 0] == expected
-
-
-@given(tallies)
-def test_the_wire_keeps_small_tallies_exact_and_large_ones_in_proportion(tally: np.ndarray) -> None:
-    np.testing.assert_array_equal(to_wire(tally), tally)
-    big = tally * 100
-    wire = to_wire(big).astype(np.float64)
-    peak = big.max(axis=-1, keepdims=True)
-    scale = np.where(peak > 0, wire.max(axis=-1, keepdims=True) / np.maximum(peak, 1), 0)
-    assert np.abs(wire - big * scale).max() <= 1.0
 
 
 few_votes = st.lists(st.integers(0, 3), min_size=N_STATES, max_size=N_STATES)
@@ -138,12 +123,12 @@ def test_a_vote_is_one_unit_of_its_class_and_silence_none(state: int) -> None:
     assert tally.tolist() == [VOTE_UNIT if state == own else 0 for own in range(N_STATES)]
 
 
-def test_the_table_of_weights_goes_up_to_its_last_entry() -> None:
+def test_the_table_of_weights_goes_up_to_its_last_entry_and_without_weights_a_scan_is_one_vote() -> None:
     table = weight_table(True, 2.0, 3.0, 0.5, 5)
-    assert table.shape == (257,)
-    assert weight_table(True, 2.0, 3.0, 0.5, 5, 7).shape == (8,)
+    assert (table.shape, weight_table(True, 2.0, 3.0, 0.5, 5, 7).shape) == ((257,), (8,))
     assert table[256] == 3 * VOTE_UNIT
     assert table.tolist() == sorted(table.tolist())
+    assert weight_table(False, 2.0, 3.0, 0.5, 5).tolist()[3:7] == [0, 0, VOTE_UNIT, VOTE_UNIT]
 
 
 @settings(max_examples=40)
@@ -157,11 +142,14 @@ def test_the_weight_begins_at_a_and_never_reaches_b(n: int, a: float, more: floa
         assert n > n_min or weight == pytest.approx(a)
 
 
-def test_what_fits_16_bits_is_sent_as_it_is_and_one_more_halves_the_cell() -> None:
-    tally = np.array([[65535, 3, 0, 0, 1], [65536, 4, 0, 0, 1], [131070, 4, 0, 0, 2], [131072, 8, 0, 0, 3]])
-    assert to_wire(tally.astype(np.int32)).tolist() == [
-        [65535, 3, 0, 0, 1],
-        [32768, 2, 0, 0, 0],
-        [65535, 2, 0, 0, 1],
-        [32768, 2, 0, 0, 0],
-    ]
+@given(tallies)
+def test_on_the_wire_what_fits_16_bits_is_exact_and_what_does_not_keeps_its_proportions(tally: np.ndarray) -> None:
+    np.testing.assert_array_equal(to_wire(tally), tally)
+    big = tally * 100
+    wire = to_wire(big).astype(np.float64)
+    peak = big.max(axis=-1, keepdims=True)
+    scale = np.where(peak > 0, wire.max(axis=-1, keepdims=True) / np.maximum(peak, 1), 0)
+    assert np.abs(wire - big * scale).max() <= 1.0
+    edge = np.array([[65535, 3, 0, 0, 1], [65536, 4, 0, 0, 1], [131070, 4, 0, 0, 2], [131072, 8, 0, 0, 3]], np.int32)
+    halves = [[65535, 3, 0, 0, 1], [32768, 2, 0, 0, 0], [65535, 2, 0, 0, 1], [32768, 2, 0, 0, 0]]
+    assert to_wire(edge).tolist() == halves

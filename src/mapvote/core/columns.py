@@ -73,16 +73,8 @@ def fill_columns(
         top_z[r, c] = max(top_z[r, c], z[i])
 
 
-@inlined
-def shifted(word: np.uint64, layers: int) -> np.uint64:
-    """A column seen from a base ``layers`` lower (layers > 0: bits move up, what passes bit 63 is gone)."""
-    if layers >= 64 or layers <= -64:
-        return np.uint64(0)
-    return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
-
-
 def rebased(words: U64, layers: I32) -> U64:
-    """(...) :func:`shifted` of every word by its own number of ``layers`` (...)."""
+    """(...) columns seen from bases ``layers`` (...) lower: if layers > 0 bits move up, and what passes bit 63 is gone."""
     up, down = np.clip(layers, 0, 63).astype(np.uint64), np.clip(-layers, 0, 63).astype(np.uint64)
     return np.where(np.abs(layers) < 64, words << up >> down, np.uint64(0))
 
