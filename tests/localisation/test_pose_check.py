@@ -72,28 +72,19 @@ def test_more_noise_than_the_sensor_has_fits_worse_than_expected() -> None:
     assert Judge(0.4, ALL_POINTS).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
 
 
-def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told() -> None:
-    """Half of the scan stands 12 m above everything: the fit of the other half is what it was."""
-    cloud = clusters(2, 2500, NOISE_M)
+def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the scan stands 12 m above everything: the fit of the other half is what it was, unless more must be
+    known. A scan that meets nothing of the map fits nowhere."""
+    cloud, judge = clusters(2, 2500, NOISE_M), Judge(NOISE_M, ALL_POINTS)
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
-    verdict = Judge(NOISE_M, ALL_POINTS).judge(far_map(), scan, HERE)
+    verdict = judge.judge(far_map(), scan, HERE)
     assert verdict.known == pytest.approx(0.5)
     assert verdict.fit == pytest.approx(1.0, abs=0.02)
-
-
-def test_where_less_is_known_than_asked_for_nothing_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    cloud = clusters(2, 500, NOISE_M)
-    scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
     for least, fits in ((0.49, True), (0.5, True), (0.51, False)):
         monkeypatch.setattr(pose_check, "MIN_KNOWN", least)
-        judge = Judge(NOISE_M, ALL_POINTS)
         assert (judge.fit(far_map(), scan, HERE) > 0.9) == fits
-
-
-def test_a_scan_that_meets_nothing_of_the_map_fits_nowhere() -> None:
-    up = with_ground(clusters(2, 100) + TWELVE_UP)
-    verdict = Judge(NOISE_M, ALL_POINTS).judge(far_map(), up, HERE)
-    assert (verdict.fit, verdict.known) == (0.0, 0.0)
+    lost = judge.judge(far_map(), with_ground(cloud + TWELVE_UP), HERE)
+    assert (lost.fit, lost.known) == (0.0, 0.0)
 
 
 @settings(max_examples=12, deadline=None)
@@ -139,17 +130,14 @@ def test_what_stands_is_found_plumb_however_the_sensor_is_tilted() -> None:
     assert stands_above_ground(lidar, T).nonzero()[0].tolist() == [82, 83]
 
 
-def verdict(fit: float = 1.0, known: float = 1.0, lead: float = 1.0) -> Verdict:
-    return Verdict(fit, known, lead, None)
-
-
-def test_a_verdict_speaks_for_a_pose_if_fit_knowledge_and_lead_are_all_good_enough() -> None:
-    judge = Judge(NOISE_M)
-    assert judge.holds(verdict())
-    assert judge.holds(verdict(0.6, 0.3, 0.05)), "just good enough"
-    assert not judge.holds(verdict(fit=0.59))
-    assert not judge.holds(verdict(known=0.29))
-    assert not judge.holds(verdict(lead=0.04))
+@pytest.mark.parametrize(
+    ("fit", "known", "lead", "holds"),
+    [(1.0, 1.0, 1.0, True), (0.6, 0.3, 0.05, True), (0.59, 1, 1, False), (1, 0.29, 1, False), (1, 1, 0.04, False)],
+)
+def test_a_verdict_speaks_for_a_pose_if_fit_knowledge_and_lead_are_all_good_enough(
+    fit: float, known: float, lead: float, holds: bool
+) -> None:
+    assert Judge(NOISE_M).holds(Verdict(fit, known, lead, None)) == holds
 
 
 def box(x: float, y: float, side: float = 1.5, height: float = 4.0) -> F64:
@@ -199,6 +187,9 @@ def test_the_right_place_leads_clearly(square: NdtMap, quick: bool) -> None:
     assert 0.75 < found.fit < 1.3
     assert found.known > 0.95
     assert found.lead > 0.3
+    few = Judge(0.02, 400).judge(square, seen_from(TRUTH), TRUTH, quick)
+    assert few.fit == pytest.approx(found.fit, abs=0.1)
+    assert few.lead > 0.2, "by a handful of points, too"
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -245,9 +236,3 @@ def test_where_a_street_repeats_itself_no_place_leads(quick: bool) -> None:
     houses_on = found.T_map_lidar_other[0, 3] / 6.0
     assert houses_on == pytest.approx(round(houses_on), abs=0.05)
     assert round(houses_on) != 0
-
-
-def test_a_handful_of_points_is_enough_and_costs_no_more(square: NdtMap) -> None:
-    few = Judge(0.02, 400).judge(square, seen_from(TRUTH), TRUTH)
-    assert few.fit == pytest.approx(JUDGE.judge(square, seen_from(TRUTH), TRUTH).fit, abs=0.1)
-    assert few.lead > 0.2

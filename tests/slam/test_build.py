@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle
-from mapvote.core.point_map import all_points, map_from_points
+from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
@@ -37,17 +37,25 @@ def errors(found: F64, true: F64) -> tuple[float, float]:
     return float(np.median(shift)), float(np.degrees(np.median(turn)))
 
 
+def bent_m(found: F64, true: F64) -> float:
+    """The median shift that no motion of the whole explains."""
+    rigid = rigid_between(found, true)
+    return errors(found, np.array([rigid @ T for T in true]))[0]
+
+
 @pytest.fixture(scope="module")
-def surveyed() -> tuple[F64, BuildReport]:
-    drives = [
-        drive_along(poses, seed, noisy(poses, seed, 0.02, 0.05), sigma_m=0.02, sigma_deg=0.05)
-        for seed, poses in ((1, SURVEY), (2, BACK))
-    ]
-    point_map, report = build_map(drives)
-    return all_points(point_map), report
+def surveyed() -> tuple[PointMap, BuildReport]:
+    return build_map(
+        [
+            drive_along(poses, seed, noisy(poses, seed, 0.02, 0.05), sigma_m=0.02, sigma_deg=0.05)
+            for seed, poses in ((1, SURVEY), (2, BACK))
+        ]
+    )
 
 
-def test_a_precise_prior_holds_the_map_in_its_frame(surveyed: tuple[F64, BuildReport]) -> None:
+def test_a_precise_prior_holds_the_map_in_its_frame_and_drift_is_told_against_it(
+    surveyed: tuple[PointMap, BuildReport],
+) -> None:
     _, report = surveyed
     assert report.held_by_prior
     for track, true in zip(report.tracks, (SURVEY, BACK), strict=True):
@@ -55,28 +63,30 @@ def test_a_precise_prior_holds_the_map_in_its_frame(surveyed: tuple[F64, BuildRe
         shift, turn = errors(track.T_map_lidar, true)
         assert shift < 0.03
         assert turn < 0.1
+        assert track.drift is not None
+        assert 0.0 < track.drift.median_m < 0.08
+        assert track.drift.median_m <= track.drift.max_m
+    assert report.tracks[0].length_m == pytest.approx(24.0, abs=1.0)
 
 
-def test_the_map_lies_on_the_streets_surfaces(surveyed: tuple[F64, BuildReport]) -> None:
-    points, report = surveyed
+def test_the_map_has_one_point_a_voxel_on_the_streets_surfaces_and_none_where_it_is_known_to_be_free(
+    surveyed: tuple[PointMap, BuildReport],
+) -> None:
+    point_map, report = surveyed
+    points = all_points(point_map)
     assert report.points == len(points)
     distance, _ = cKDTree(street(99, 20.0)).query(points)
     assert np.median(distance) < 0.06
     assert np.quantile(distance, 0.99) < 0.25
-
-
-def test_there_is_one_point_per_voxel(surveyed: tuple[F64, BuildReport]) -> None:
-    points, _ = surveyed
     voxels = np.unique(np.floor(points / 0.3).astype(int), axis=0)
     assert len(voxels) >= 0.999 * len(points)  # float32 rounding may carry a point over its voxel's face
-
-
-def test_drift_is_told_against_the_prior(surveyed: tuple[F64, BuildReport]) -> None:
-    drift = surveyed[1].tracks[0].drift
-    assert drift is not None
-    assert 0.0 < drift.median_m < 0.08
-    assert drift.median_m <= drift.max_m
-    assert surveyed[1].tracks[0].length_m == pytest.approx(24.0, abs=1.0)
+    known = 0
+    for tile, content in point_map.tiles.items():
+        assert content.free is not None
+        reference = reference_window(point_map, point_map.lattice.tile(tile))
+        assert not (content.free & reference.occupied).any()
+        known += int(np.bitwise_count(content.free).sum())
+    assert known > 1000
 
 
 def test_without_a_prior_the_first_scan_is_the_frame() -> None:
@@ -96,8 +106,7 @@ def test_coarse_priors_place_the_map_together_and_do_not_bend_it() -> None:
     [track] = report.tracks
     assert not report.held_by_prior
     assert errors(track.T_map_lidar, SURVEY)[0] < 0.6
-    rigid = rigid_between(track.T_map_lidar, SURVEY)
-    assert errors(track.T_map_lidar, np.array([rigid @ T for T in SURVEY]))[0] < 0.05
+    assert bent_m(track.T_map_lidar, SURVEY) < 0.05
     assert track.broken == ()
     assert 0.2 < np.median(track.sigma_m) < 1.2, "25 priors that err alike are hardly better than one of them"
 
@@ -116,8 +125,7 @@ def test_a_gap_in_the_survey_is_bridged() -> None:
     _, report = build_map([gap])
     [track] = report.tracks
     assert track.registered.all()
-    rigid = rigid_between(track.T_map_lidar, poses)
-    assert errors(track.T_map_lidar, np.array([rigid @ T for T in poses]))[0] < 0.1
+    assert bent_m(track.T_map_lidar, poses) < 0.1
 
 
 @pytest.mark.slow
@@ -133,8 +141,10 @@ def test_a_second_survey_may_begin_where_the_first_has_not_been() -> None:
     assert report.tracks[1].registered.all()
 
 
-def test_the_same_drives_give_the_same_map_to_the_last_bit() -> None:
-    one, _ = build_map([drive_along(SURVEY[:6], 8)])
+def test_the_same_drives_give_the_same_map_to_the_last_bit_and_progress_counts_every_scan_of_both_passes() -> None:
+    seen: list[tuple[int, int]] = []
+    one, _ = build_map([drive_along(SURVEY[:6], 8)], progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(k, 12) for k in range(1, 13)]
     two, _ = build_map([drive_along(SURVEY[:6], 8)])
     assert one.map_id == two.map_id
     for tile, content in one.tiles.items():
@@ -143,29 +153,9 @@ def test_the_same_drives_give_the_same_map_to_the_last_bit() -> None:
         assert content.free.tobytes() == np.asarray(two.tiles[tile].free).tobytes()
 
 
-def test_what_is_known_to_be_free_holds_no_points(surveyed: tuple[F64, BuildReport]) -> None:
-    point_map, _ = build_map([drive_along(SURVEY[:8], 9)])
-    known = 0
-    for tile, content in point_map.tiles.items():
-        assert content.free is not None
-        reference = reference_window(point_map, point_map.lattice.tile(tile))
-        assert not (content.free & reference.occupied).any()
-        known += int(np.bitwise_count(content.free).sum())
-    assert known > 1000
-
-
-def test_progress_counts_every_scan_of_both_passes() -> None:
-    seen: list[tuple[int, int]] = []
-    build_map([drive_along(SURVEY[:4], 10)], progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(k, 8) for k in range(1, 9)]
-
-
-def test_nothing_to_map_is_refused() -> None:
+def test_no_drive_and_a_drive_of_unrelated_scans_are_refused() -> None:
     with pytest.raises(MapvoteError, match="nothing to map"):
         build_map([])
-
-
-def test_a_drive_of_unrelated_scans_is_refused() -> None:
     rng = np.random.default_rng(1)
     drive = drive_along(SURVEY[:6], 11)
     chaos = replace(drive, read_scan=lambda i: Scan(i + 1, rng.uniform(-30, 30, (3000, 3)).astype(np.float32)))
@@ -221,14 +211,8 @@ def test_ground_that_the_path_contradicts_is_refused_with_the_place() -> None:
 @pytest.mark.slow
 def test_an_ordinary_prior_that_is_tilted_leaves_path_and_ground_in_agreement(tmp_path: Path) -> None:
     """The first pass of 200 m drifts in height by some tenths of a metre against such priors."""
-    overrides = {
-        "length_m": 200.0,
-        "vehicles": 1,
-        "surveys": ["east inner"],
-        "changes": [],
-        "clutter": {"gantry_m": []},
-    }
-    simulate("street", tmp_path / "street", seed=5, overrides=overrides)
+    street = {"length_m": 200.0, "vehicles": 1, "surveys": ["east inner"], "changes": [], "clutter": {"gantry_m": []}}
+    simulate("street", tmp_path / "street", seed=5, overrides=street)
     drive = open_drive(tmp_path / "street" / "survey_1")
     assert drive.T_map_lidar_prior is not None
     pitched = drive.T_map_lidar_prior @ from_xyz_rpy(0.0, 0.0, 0.0, 0.0, np.radians(0.6), 0.0)
