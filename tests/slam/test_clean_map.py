@@ -25,7 +25,7 @@ from mapvote.slam.clean_map import (
     SEEN_THROUGH,
     TALL_M,
     Mapper,
-    _no_map,
+    _leave_out,
     lone_points,
     mirrored,
     seen_through,
@@ -345,7 +345,7 @@ def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_t
     points, found = np.column_stack([np.ones((n, 2)), z]), np.zeros(n, np.bool_)
     obstacle, scratch = points[:, 2] >= 0.3, np.zeros(16, np.bool_)
     ground_z = np.zeros((4, 4), np.float32)
-    _no_map(points, np.zeros(3), 1e4, np.arange(n) == 0, obstacle, flat, ground_z, scratch, found)
+    _leave_out(points, np.zeros(3), 1e4, np.arange(n) == 0, obstacle, flat, ground_z, scratch, found)
     assert found.tolist() == out
 
 

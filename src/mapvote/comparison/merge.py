@@ -128,7 +128,7 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
         cloud.enter(points)
     driven = [transform(T_first, path) for one, T_first in zip(maps, T, strict=True) for path in one.driven]
     points = cloud.points()[0]
-    roads = [road_under(poses_at(path), np.ones(len(path), dtype=np.bool_), points).points_map for path in driven]
+    roads = [road_under(poses_at(path), np.ones(len(path), dtype=np.bool_), points) for path in driven]
     merged = map_from_points(
         points,
         lattice=first.lattice,

@@ -74,7 +74,7 @@ def fill_columns(
 
 
 def rebased(words: U64, layers: I32) -> U64:
-    """(...) columns seen from bases ``layers`` (...) lower: if layers > 0 bits move up, and what passes bit 63 is gone."""
+    """(...) columns seen from bases ``layers`` (...) lower: where > 0 bits move up, and what passes bit 63 is gone."""
     up, down = np.clip(layers, 0, 63).astype(np.uint64), np.clip(-layers, 0, 63).astype(np.uint64)
     return np.where(np.abs(layers) < 64, words << up >> down, np.uint64(0))
 

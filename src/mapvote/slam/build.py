@@ -74,7 +74,7 @@ def build_map(
     tracks, bent_m = settle_poses(surveyor.tracks)
     cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
     del surveyor  # and with it the largest part of what the first pass took
-    road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud).points_map for track in tracks])
+    road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud) for track in tracks])
     mapper = Mapper(map_from_points(cloud, lattice=lattice, road=road), settings, road)
     _go_through(chain.from_iterable(map(mapper.enter, tracks)), progress, scans, 2 * scans)
     point_map = replace(

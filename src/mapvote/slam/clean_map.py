@@ -56,7 +56,7 @@ from mapvote.core.voxels import BESIDE, VoxelCloud, slot_of, thin, voxel_keys
 from mapvote.detection.evidence import HIT, PASSES, WORDS, count_scan, free_words, least_passed
 from mapvote.detection.packed_tiles import PackedTiles, count_of
 from mapvote.localisation.localiser import GivenPoses
-from mapvote.perception.frontend import Frontend, Observation, PlacedScan
+from mapvote.perception.frontend import Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.pose_graph import DriveTrack
 
@@ -96,8 +96,12 @@ class Mapper:
 
     def _add(self, seen: list[Observation]) -> None:
         for observation in seen:
-            left_out = _left_out(observation.scan, observation.moving, self.settings.mapping.reach_m)
-            self.cloud.enter(observation.scan.points_map, left_out)
+            scan, moving = observation.scan, observation.moving
+            ground_z, left_out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
+            reach2, beside = self.settings.mapping.reach_m**2, np.zeros(ground_z.size, np.bool_)
+            where = scan.points_map, scan.origin_map, reach2
+            _leave_out(*where, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
+            self.cloud.enter(scan.points_map, left_out)
             count_scan(self.evidence, observation)
 
     def finish(self) -> PointMap:
@@ -155,22 +159,17 @@ def _standing(points: F64, ground: PointMap) -> Bool:
     return out
 
 
-def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
-    """Points (n,) that do not enter the map: what moves, what is beyond ``reach_m``, and what is too low to be an
-    obstacle, in or next to cells where something moves: wheels and bumpers, not road."""
-    ground_z, out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
-    beside = np.zeros(ground_z.size, np.bool_)
-    _no_map(scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, ground_z, beside, out)
-    return out
-
-
 @kernel
-def _no_map(
-    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32,
-    beside: Bool, out: Bool,
+def _leave_out(
+    points: F64, origin: F64, reach2: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32, beside: Bool,
+    out: Bool,
 ) -> None:  # fmt: skip
-    """Into ``out`` (n,) which of the points (n, 3) :func:`_left_out` means; ``cell`` (n,) row * cols + col of
-    ``ground_z`` (rows, cols), -1 outside it. ``beside`` (rows * cols,): scratch, all False."""
+    """Into ``out`` (n,) which of the points (n, 3) do not enter the map: what moves, what is beyond the reach, and what
+    is too low to be an obstacle, in or next to cells where something moves: wheels and bumpers, not road.
+
+    ``cell`` (n,) row * cols + col of ``ground_z`` (rows, cols), -1 outside it; ``beside`` (rows * cols,): scratch, all
+    False.
+    """
     rows, cols = ground_z.shape
     for i in range(len(points)):
         if moving[i] and cell[i] >= 0:
@@ -180,7 +179,7 @@ def _no_map(
                     beside[k * cols + j] = True
     for i in range(len(points)):
         x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
-        out[i] = moving[i] | (x * x + y * y > reach_squared)
+        out[i] = moving[i] | (x * x + y * y > reach2)
         if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
             r, c = divmod(cell[i], cols)
             out[i] |= points[i, 2] - ground_z[r, c] > ROAD_M
@@ -382,26 +381,13 @@ def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
-    cells, at = _cells(points, lattice)
-    top = np.full(len(cells), -np.inf)
-    np.maximum.at(top, at, np.nan_to_num(height_m, nan=np.inf))
-    of_cell = np.bincount(at, weights=balance, minlength=len(cells))
-    group, count = _groups(cells)
-    passed = np.bincount(group, weights=of_cell, minlength=count)[group] < 0
-    return np.asarray((passed & (top < TALL_M))[at])
-
-
-def _cells(points: F64, lattice: Lattice) -> tuple[I64, I64]:
-    """((m, 2) row and column of every cell that one of the points (n, 3) is in, (n,) which of them each is in)."""
     rows, cols = lattice.cells_of(points)
     width = int(cols.max()) + 1 - int(cols.min())  # one number a cell: pairs are sorted 20 times as slowly
     flat, at = np.unique((rows - rows.min()) * width + cols - cols.min(), return_inverse=True)
-    return np.column_stack([flat // width, flat % width]), at
-
-
-def _groups(cells: I64) -> tuple[I64, int]:
-    """((n,) the 8-connected group of each of n cells (n, 2), how many there are)."""
-    beside = cKDTree(cells).query_pairs(1.5, output_type="ndarray") if len(cells) else np.zeros((0, 2), np.int64)
-    graph = coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(cells), len(cells)))
-    count, group = connected_components(graph, directed=False)
-    return group.astype(np.int64), int(count)
+    top = np.full(len(flat), -np.inf)
+    np.maximum.at(top, at, np.nan_to_num(height_m, nan=np.inf))
+    beside = cKDTree(np.column_stack([flat // width, flat % width])).query_pairs(1.5, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(flat), len(flat)))
+    group = connected_components(graph, directed=False)[1]
+    passed = np.bincount(group, weights=np.bincount(at, weights=balance))[group] < 0
+    return np.asarray((passed & (top < TALL_M))[at])

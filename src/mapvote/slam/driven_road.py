@@ -35,22 +35,10 @@ _LEAST_SHARE = 0.3
 """Of the track, along which the road must have been measured where it is expected."""
 
 
-@dataclass(frozen=True, slots=True)
-class RoadUnder:
-    """The road under one drive."""
-
-    points_map: F64
-    """(n, 3) map metres, every 0.15 m along the path; none if the points do not show it."""
-    sensor_height_m: float
-    """Of the sensor above it, the drive's median; NaN if unknown."""
-    measured_share: float
-    """Of the path: where points of the road lie under it."""
-
-
-def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> RoadUnder:
-    """The road under a drive at poses (n, 4, 4), those ``registered`` (n,), from the points (m, 3) of the map."""
-    path = _dense(T_map_lidar[:, :3, 3], registered)
-    none = RoadUnder(np.zeros((0, 3)), np.nan, 0.0)
+def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> F64:
+    """(k, 3) the road under a drive at poses (n, 4, 4), those ``registered`` (n,), every 0.15 m along the path, from
+    the points (m, 3) of the map, all map metres; none if these do not show it."""
+    path, none = _dense(T_map_lidar[:, :3, 3], registered), np.zeros((0, 3))
     if len(path) == 0:
         return none
     distance, at = scipy.spatial.cKDTree(path[:, :2]).query(cloud[:, :2], distance_upper_bound=TRACK_M)
@@ -60,14 +48,11 @@ def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> RoadUnder:
     if np.isnan(densest_m):
         return none
     road = np.abs(height - densest_m) < _ROAD_M
-    sensor_height_m = float(np.median(height[road]))
     near = np.zeros(len(path), dtype=np.bool_)
     near[at[road]] = True
     reach = round(1.0 / _STEP_M)
-    share = float((np.convolve(near, np.ones(2 * reach + 1), mode="same") > 0).mean())
-    if share < _LEAST_SHARE:
-        return RoadUnder(np.zeros((0, 3)), sensor_height_m, share)
-    return RoadUnder(path - [0.0, 0.0, sensor_height_m], sensor_height_m, share)
+    measured = np.convolve(near, np.ones(2 * reach + 1), mode="same") > 0
+    return path - [0.0, 0.0, float(np.median(height[road]))] if measured.mean() >= _LEAST_SHARE else none
 
 
 def _densest(heights: F64, layers: F64) -> float:
