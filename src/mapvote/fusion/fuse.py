@@ -48,19 +48,34 @@ class Decision:
     (fusion/neighbour_noise.py)."""
     tally: NDArray[Any]
     """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
-    vehicles: int
-    added: int
-    """Points added to the tile."""
-    deleted: int
-    """Points deleted from the tile."""
+    edits: U8
+    """(256, 256) the states by which the tile's points come and go: others where noise spilled over."""
+    quorum: int
+    heard: Collection[str] = ()
+    """The vehicles whose votes were counted."""
+    votes: Sequence[TileVote] = ()
+    """Their votes; as all that only the edit needs, none once the tile is edited."""
+    denied: Bool | None = None
+    """Changes that wait because the last vehicle that observed them disagrees."""
+    passing: Bool | None = None
+    """New objects that stay out because they are temporary."""
+    past: History | None = None
+    """The votes of a longer time, without copies, read at first use; None if there is no history."""
     copies: Sequence[Copy] = ()
     """Drives that do not count because another vehicle's, which is alike, does."""
     odds: Odds = field(default_factory=Odds.none)
     """The agreed confidence of the voters for each changed cell, see :func:`agreed_odds`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
-    heard: Collection[str] = ()
-    """The vehicles whose votes were counted."""
+    added: int = 0
+    """Points added to the tile."""
+    deleted: int = 0
+    """Points deleted from the tile."""
+
+    @property
+    def vehicles(self) -> int:
+        """How many were counted."""
+        return len(self.heard)
 
 
 def rule_of(method: str) -> Rule:
@@ -97,30 +112,6 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
     return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
 
 
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """The result of the votes on a tile before it is edited: of those that count, one a vehicle."""
-
-    votes: Sequence[TileVote]
-    states: U8
-    """(256, 256) CellState or NO_VOTE."""
-    edits: U8
-    """(256, 256) the states by which the tile's points come and go: others where noise spilled over
-    (fusion/neighbour_noise.py)."""
-    tally: NDArray[Any]
-    quorum: int
-    denied: Bool | None = None
-    """Changes that wait because the last vehicle that observed them disagrees."""
-    passing: Bool | None = None
-    """New objects that stay out because they are temporary."""
-    copies: Sequence[Copy] = ()
-    odds: Odds = field(default_factory=Odds.none)
-    """See :class:`Decision`."""
-    pending: PendingDeletions = field(default_factory=PendingDeletions.none)
-    past: History | None = None
-    """The votes of a longer time, without copies, read at first use; None if there is no history."""
-
-
 def fuse_tile(
     tile: Tile,
     drives: Iterable[TileVote],
@@ -133,20 +124,20 @@ def fuse_tile(
     tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
     it. The rest as in :func:`decide_tile`.
     """
-    heard = decide_tile(tile, drives, rule, settings, history)
-    edited, added, deleted = _edit(tile, heard.votes, heard.edits, heard.quorum)
+    decided = decide_tile(tile, drives, rule, settings, history)
+    edited, added, deleted = _edit(tile, decided.votes, decided.edits, decided.quorum)
     if edited is not tile:
         changed = np.flatnonzero(differing(tile, edited))
         memory = (tile.memory or Memory.none()).with_changed(changed, version)
-        runs = None if heard.past is None else (heard.past, settings.min_votes)
-        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits, runs))
-    names, why = frozenset(vote.vehicle for vote in heard.votes), (heard.copies, heard.odds, heard.pending)
-    return Decision(heard.states, heard.tally, len(names), added, deleted, *why, names), edited
+        runs = None if decided.past is None else (decided.past, settings.min_votes)
+        edited = edited.but(memory=remembered(memory, tile, edited, decided.votes, decided.edits, runs))
+    decided = replace(decided, votes=(), denied=None, passing=None, past=None, added=added, deleted=deleted)
+    return decided, edited
 
 
 def decide_tile(
     tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings, history: History | None = None
-) -> Heard:
+) -> Decision:
     """What the votes decide: counted, then in the order of time, then within the budget of false deletions.
 
     ``drives`` are the votes that count on this tile (``newest_votes`` in fusion/tile_vote.py, ``unspent`` in
@@ -158,9 +149,9 @@ def decide_tile(
     past = None if history is None else cache(partial(_originals_of, history, given, copies, settings))
     silenced = liars_among(copies, drives)
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced, tile)
+    names = frozenset(vote.vehicle for vote in votes)
     if any(vote.states is None for vote in votes):
-        return Heard(votes, states, states, tally, quorum, past=past)
-    names = {vote.vehicle for vote in votes}
+        return Decision(states, tally, states, quorum, names, votes, past=past)
     spoken = [drive for drive in drives if drive.vehicle in names]
     states = lately_changed(states, spoken, tally, quorum) if rule == "columns" else states
     denied = passing = None
@@ -176,7 +167,7 @@ def decide_tile(
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
     told = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
-    return Heard(votes, told, states, tally, quorum, denied, passing, copies, odds, pending, past)
+    return Decision(told, tally, states, quorum, names, votes, denied, passing, past, copies, odds, pending)
 
 
 def _originals_of(

@@ -8,12 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from mapvote.codec.arrays import pack_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.server.store.decisions import Record, pack_states, pack_tally
+from mapvote.server.store.decisions import Record, pack_tally
 from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.views.geojson import to_geojson
 
@@ -115,12 +116,12 @@ def test_votes_and_stamps_come_from_the_drives_that_said_so() -> None:
     tally[0, 0, CellState.CHANGED_OCCUPIED] = 5 * VOTE_UNIT
     tally[0, 1, CellState.CHANGED_OCCUPIED] = 2 * VOTE_UNIT
     drives = [(30 * S, states), (10 * S, states), (99 * S, against)]
-    decided = Record(7, pack_states(states), pack_tally(tally), None, b""), drives
+    decided = Record(7, pack_plane(states), pack_tally(tally), None, b""), drives
     (built,) = compare(before, after, {(0, 0): [decided]})
     assert (built.votes_min, built.votes_median) == (2, 3.5)
     assert (built.first_seen_ns, built.last_seen_ns) == (10 * S, 30 * S)
     assert (built.id, built.versions) == ("built.v7.0.0", [7])
-    overruled = Record(8, pack_states(against), pack_tally(tally), None, b""), drives
+    overruled = Record(8, pack_plane(against), pack_tally(tally), None, b""), drives
     (still,) = compare(before, after, {(0, 0): [decided, overruled]})
     assert (still.id, still.votes_min, still.versions) == (built.id, 2, [7])
 

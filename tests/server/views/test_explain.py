@@ -12,14 +12,13 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
-from mapvote.codec.arrays import unpack_plane
 from mapvote.config import FuseSettings
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
-from mapvote.server.store.decisions import REASONS, unpack_tally_plane
+from mapvote.server.store.decisions import REASONS
 from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.publish import preview, publish
@@ -220,5 +219,6 @@ def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store
     page = evidence(store, (0, 0))
     assert [page[TIE][3], page[CLEAR][3]] == [NO_VOTE, CellState.CHANGED_EMPTY]
     (fused,) = preview(store).fused
-    assert unpack_tally_plane(fused.tally)[TIE].any()
-    assert unpack_plane(fused.states, "<u1", (256, 256), "states")[TIE] == CellState.UNDETERMINED
+    assert fused.record is not None
+    assert fused.record.tally[TIE].any()
+    assert fused.record.states[TIE] == CellState.UNDETERMINED

@@ -15,7 +15,7 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes, unpack_plane
+from mapvote.codec.arrays import compress, raw_plane, unpack_bytes, unpack_plane
 from mapvote.codec.ballot import Odds
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
@@ -95,6 +95,7 @@ class Record:
     """The decision of one version about one tile. Planes are unpacked on demand; MapvoteError if one is damaged."""
 
     version: int
+    """0: none yet."""
     packed_states: bytes
     packed_tally: bytes
     packed_odds: bytes | None
@@ -131,11 +132,6 @@ def records_of(connection: sa.Connection, index: TileIndex, *, after: int = 0, u
     if upto is not None:
         query = query.where(d.c.version <= upto)
     return [Record(*row) for row in connection.execute(query).all()]
-
-
-def pack_states(states: U8) -> bytes:
-    """Quick rather than small: decisions are written once for each published tile."""
-    return pack_plane(states, 1)
 
 
 def pack_tally(tally: NDArray[Any]) -> bytes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import accumulate, groupby
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
+from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import pack_tile
@@ -29,17 +30,10 @@ from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.decisions import Standing, pack_standings, pack_states, pack_tally, packed_cells
+from mapvote.server.store.decisions import Record, Standing, pack_standings, pack_tally, packed_cells
 from mapvote.server.store.integrity import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
-from mapvote.server.store.votes import (
-    Electorate,
-    Judged,
-    Polled,
-    judged_on,
-    poll,
-    recent_votes,
-)
+from mapvote.server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
 
 _GROUP, _ROUND = 8, 8
 """Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
@@ -68,10 +62,8 @@ class Fused:
     """The result of fusing one tile."""
 
     index: TileIndex
-    states: bytes
-    """(256, 256) uint8, a zstd frame, as in a ballot."""
-    tally: bytes
-    """(5, 65536), a zstd frame, see :func:`mapvote.server.store.decisions.pack_tally`."""
+    record: Record | None
+    """The decision; None if the tile itself could not be read."""
     vehicles: int
     points: int
     """Number of points before the edit."""
@@ -92,25 +84,14 @@ class Fused:
     """Damaged planes and ballots, which were left out."""
     copies: Sequence[Copy] = ()
     """Drives that did not count because another vehicle's drive is a copy of them."""
-    odds: bytes | None = None
-    """Log-odds of the changed cells by the vehicles that voted for them, see
-    :func:`mapvote.fusion.loss_budget.pack_agreed`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because their probability of a false deletion exceeds the budget."""
-    standings: bytes = b""
-    """Which of the ballots on the tile counted, and why the others did not, see
-    :func:`mapvote.server.store.decisions.pack_standings`."""
-
-    @property
-    def lost(self) -> bool:
-        """Whether the tile itself could not be read."""
-        return not self.states
 
     @classmethod
     def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
         """The result for a tile that cannot be read."""
         nowhere = np.empty(0, dtype=np.int64)
-        return cls(index, b"", b"", 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
+        return cls(index, None, 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
 
 
 def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
@@ -165,8 +146,13 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     emptied, filled = emptied_and_filled(held.reshape(-1), holds.reshape(-1))
     return Fused(
         index=tile.index,
-        states=pack_states(decision.states),
-        tally=pack_tally(decision.tally),
+        record=Record(
+            0,
+            pack_plane(decision.states, 1),  # quick rather than small
+            pack_tally(decision.tally),
+            pack_agreed(decision.odds, decision.states),
+            pack_standings(standings_of(judged, decision.copies, decision.heard)),
+        ),
         vehicles=decision.vehicles,
         points=len(tile.points),
         added=decision.added,
@@ -178,9 +164,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
         tile=None if task.misread is None else edited,
         copies=decision.copies,
-        odds=pack_agreed(decision.odds, decision.states),
         pending=decision.pending,
-        standings=pack_standings(standings_of(judged, decision.copies, decision.heard)),
     )
 
 
@@ -218,10 +202,6 @@ class Watched(Executor):
     def __init__(self, within: Executor, report: Callable[[int, int], None]) -> None:
         self.within = within
         self._report = report
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run ``fn`` on the other executor."""
-        return self.within.submit(fn, *args, **kwargs)
 
     def map(
         self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1

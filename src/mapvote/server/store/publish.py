@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from threading import Lock
 from weakref import WeakKeyDictionary
 
@@ -30,6 +30,7 @@ from mapvote.core.types import I64, MapvoteError
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of, insert_rows
+from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused, Task, fuse_round
 from mapvote.server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote.server.store.policy import GatePolicy
@@ -37,7 +38,6 @@ from mapvote.server.store.queries import (
     Version,
     add_blobs,
     current_number,
-    current_version,
     end_votes,
     log_event,
     newest_seq,
@@ -45,7 +45,6 @@ from mapvote.server.store.queries import (
     tiles_of,
     tiles_set_between,
     version_of,
-    version_row,
 )
 from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
@@ -178,10 +177,12 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
             seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
             if version.kind != "publish":
                 version = replace(version, mark=seq)
-            connection.execute(schema.versions.insert().values(**version_row(version)))
+            connection.execute(schema.versions.insert().values(**asdict(version)))
             add_blobs(connection, {digest: data for some in new.planes for digest, data in some.items()})
             set_tiles(connection, version.number, new.tiles)
-            rows = [_decision_row(version.number, fused) for fused in new.fused if not fused.lost]
+            rows = [
+                _decision_row(version.number, fused, fused.record) for fused in new.fused if fused.record is not None
+            ]
             if rows:
                 insert_rows(connection, schema.decisions, rows)
             if unvoted is not None:
@@ -193,10 +194,10 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
     return version
 
 
-def _decision_row(number: int, fused: Fused) -> tuple[object, ...]:
+def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
     """In the order of the table's columns."""
-    counts = fused.vehicles, fused.added, fused.deleted
-    return number, *fused.index, fused.states, fused.tally, *counts, fused.odds, fused.standings
+    made = record.packed_states, record.packed_tally, fused.vehicles, fused.added, fused.deleted
+    return number, *fused.index, *made, record.packed_odds, record.packed_standings
 
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
@@ -268,7 +269,7 @@ def _decide(
 ) -> Round:
     """Fuse every tile that the ``last`` round does not answer."""
     with store.database.reading() as connection:
-        newest = current_version(connection)
+        newest = version_of(connection)
         mark = newest_seq(connection)
         asked = electorate_now(connection, now, mark, settings)
         dirty = _dirty(connection, newest, asked)

@@ -28,16 +28,12 @@ def current_number(connection: sa.Connection) -> int:
     return int(connection.execute(sa.select(sa.func.max(schema.versions.c.number))).scalar_one())
 
 
-def current_version(connection: sa.Connection) -> Version:
-    """The newest version."""
-    newest = sa.select(*VERSION_COLUMNS).order_by(schema.versions.c.number.desc()).limit(1)
-    return Version(**connection.execute(newest).one()._mapping)
-
-
-def version_of(connection: sa.Connection, number: int, *, cleared: bool = False) -> Version:
-    """One version; NotFound, naming the newest, if there is none of that number, or (unless ``cleared`` will do) it was
-    cleared away."""
-    row = connection.execute(sa.select(*VERSION_COLUMNS).where(schema.versions.c.number == number)).one_or_none()
+def version_of(connection: sa.Connection, number: int | None = None, *, cleared: bool = False) -> Version:
+    """One version, the newest by default; NotFound, naming the newest, if there is none of that number, or (unless
+    ``cleared`` will do) it was cleared away."""
+    v = schema.versions.c.number
+    asked = sa.select(*VERSION_COLUMNS).order_by(v.desc()).limit(1)
+    row = connection.execute(asked if number is None else asked.where(v == number)).one_or_none()
     if row is None:
         newest = current_number(connection)
         raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
@@ -189,11 +185,6 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
         new = [(digest, planes[digest]) for digest in some if digest not in known]
         if new:
             insert_rows(connection, schema.blobs, new)
-
-
-def version_row(version: Version) -> dict[str, Any]:
-    """A version as the columns of its table."""
-    return {column.name: getattr(version, column.name) for column in VERSION_COLUMNS}
 
 
 def set_tiles(connection: sa.Connection, number: int, tiles: Mapping[TileIndex, TileHashes]) -> None:

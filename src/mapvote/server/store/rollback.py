@@ -20,7 +20,7 @@ from msgspec import structs
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import pack_memory, pack_tile
-from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import Bool
 from mapvote.fusion.fuse import differing
@@ -31,10 +31,9 @@ from mapvote.server.store.fusion_jobs import Task, fuse_round
 from mapvote.server.store.publish import NewTiles, Outcome, write_version
 from mapvote.server.store.queries import (
     Version,
-    current_version,
     load_tile,
-    memory_of,
     newest_seq,
+    tile_as_of,
     tile_of,
     tiles_of,
     version_of,
@@ -49,7 +48,7 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
     NotFound if there is no such version, Conflict if it is the newest or another version is published meanwhile.
     """
     with store.database.reading() as connection:
-        newest = current_version(connection)
+        newest = version_of(connection)
         target = version_of(connection, to)
         if to == newest.number:
             raise Conflict(f"version {to} is the newest: there is nothing to roll back")
@@ -58,7 +57,8 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
         tiles, planes = {}, []
         for index in sorted(now.keys() | then.keys()):
             if now.get(index) != then.get(index):
-                old, new = _of_two(connection, store.lattice.tile(index), number, now.get(index), then.get(index))
+                window = store.lattice.tile(index)
+                old, new = tile_as_of(connection, window, newest.number), load_tile(connection, window, then.get(index))
                 digest, plane = pack_memory(turned_back(number, old, new))
                 tiles[index] = structs.replace(then.get(index) or TileHashes.none(), memory=digest)
                 planes.append(plane)
@@ -71,16 +71,6 @@ def turned_back(version: int, now: Tile, then: Tile) -> Memory:
     """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
     differ, none = np.flatnonzero(differing(now, then)), Memory.none()
     return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
-
-
-def _of_two(
-    connection: sa.Connection, window: Grid, number: int, now: TileHashes | None, then: TileHashes | None
-) -> tuple[Tile, Tile]:
-    """A tile now and then; where there is none now, the memory of one."""
-    old = load_tile(connection, window, now)
-    if now is None:
-        old = replace(old, memory=memory_of(connection, number, window.tile_index))
-    return old, load_tile(connection, window, then)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +201,4 @@ def _content(
     """A tile of a state, whose root has it as ``hashes``."""
     if index in state.edited:
         return _Content(state.edited[index], index not in state.absent)
-    window = store.lattice.tile(index)
-    if hashes is not None:
-        return _Content(load_tile(connection, window, hashes), True)
-    return _Content(replace(Tile.empty(window), memory=memory_of(connection, state.root, index)), False)
+    return _Content(tile_as_of(connection, store.lattice.tile(index), state.root), hashes is not None)

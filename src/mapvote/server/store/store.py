@@ -12,6 +12,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,6 @@ from mapvote.server.store.queries import (
     tiles_of,
     tiles_set_between,
     version_of,
-    version_row,
 )
 
 
@@ -112,7 +112,7 @@ class Store:
                 now = clock()
                 mark = log_event(connection, now, "import", by, point_map.map_id)
                 version = Version(point_map.version or 1, None, "import", None, now, by, "first map", mark, {})
-                connection.execute(schema.versions.insert().values(**version_row(version)))
+                connection.execute(schema.versions.insert().values(**asdict(version)))
                 packed = {}
                 for index, tile in point_map.tiles.items():
                     packed[index], planes = pack_tile(tile)
@@ -185,8 +185,7 @@ class Store:
         NotFound if there is no such version.
         """
         with self.database.reading() as connection:
-            number = current_number(connection) if number is None else number
-            version_of(connection, number)
+            number = version_of(connection, number).number
             if since is not None:
                 version_of(connection, since, cleared=True)
             if since is None:
@@ -209,8 +208,7 @@ class Store:
     def tiles(self, number: int | None = None) -> dict[TileIndex, TileHashes]:
         """The hashes of a version's tiles, the newest version's by default; NotFound if there is no such version."""
         with self.database.reading() as connection:
-            number = current_number(connection) if number is None else number
-            version_of(connection, number)
+            number = version_of(connection, number).number
             return tiles_of(connection, number)
 
     def _changed(
@@ -250,8 +248,7 @@ class Store:
     def point_map(self, number: int | None = None) -> PointMap:
         """A whole version; of one larger than memory tiles are read when they are asked for: keep the store open."""
         with self.database.reading() as connection:
-            number = current_number(connection) if number is None else number
-            version_of(connection, number)
+            number = version_of(connection, number).number
             hashes = tiles_of(connection, number)
             points = points_of(connection, hashes)
             tiles: Mapping[TileIndex, Tile]

@@ -19,7 +19,6 @@ from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
 from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.server.errors import NotFound
-from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
 from mapvote.server.store.publish import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.queries import load_tile, tile_of
@@ -73,7 +72,7 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 def _desk_of(store: Store, found: Round) -> Desk:
     version, budget = found.newest.number, found.asked.settings.false_deletions
     tiles = [_before_and_after(store, version, fused) for fused in found.changed]
-    decided = [Record(0, fused.states, fused.tally, fused.odds, fused.standings) for fused in found.changed]
+    decided = [fused.record for fused in found.changed if fused.record is not None]
     objects = change_objects(
         [changed_cells(*pair, [(record, ())]) for pair, record in zip(tiles, decided, strict=True)]
     )

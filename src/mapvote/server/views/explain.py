@@ -20,7 +20,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
-from mapvote.fusion.fuse import Heard, decide_tile, rule_of
+from mapvote.fusion.fuse import Decision, decide_tile, rule_of
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.server.store import schema
@@ -29,7 +29,7 @@ from mapvote.server.store.fusion_jobs import standings_of
 from mapvote.server.store.integrity import DamagedBallots, ballot_name
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.policy import Policy, policy_in
-from mapvote.server.store.queries import current_version, tile_as_of
+from mapvote.server.store.queries import tile_as_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
     FOREVER,
@@ -128,7 +128,7 @@ class _Now:
     """Of ``judged``, in the next version."""
     said: Mapping[int, TileVote]
     """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
-    decided: Heard
+    decided: Decision
     """The decision of the next version, if it were published now."""
 
 
@@ -141,7 +141,7 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
     row, col = int(rows[0]), int(cols[0])
     index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
-        tile = tile_as_of(connection, store.lattice.tile(index), current_version(connection).number)
+        tile = tile_as_of(connection, store.lattice.tile(index), version_of(connection).number)
         now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
         found = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
         decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
@@ -206,7 +206,7 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
 
     past = history if policy.round.stage == "two-stage" else None
     decided = decide_tile(tile, counting, rule_of(policy.round.method), policy.fuse, past)
-    standings = standings_of(judged, decided.copies, {vote.vehicle for vote in decided.votes})
+    standings = standings_of(judged, decided.copies, decided.heard)
     return _Now(tile, cell, asked, judged, standings, said, decided)
 
 

@@ -28,7 +28,6 @@ from mapvote.server.store.integrity import set_aside
 from mapvote.server.store.keys import hash_of
 from mapvote.server.store.queries import (
     current_number,
-    current_version,
     load_blob,
     load_tile,
     newest_seq,
@@ -54,7 +53,7 @@ def overview(store: Store) -> dict[str, Any]:
     b, t = schema.ballots, schema.ballot_tiles
     standing = sa.select(sa.func.count(), sa.func.count(sa.distinct(b.c.vehicle))).where(b.c.gone_seq.is_(None))
     with store.database.reading() as connection:
-        newest = current_version(connection)
+        newest = version_of(connection)
         ballots, vehicles = connection.execute(standing).one()
         planes, size = connection.execute(
             sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(sa.func.length(schema.blobs.c.data)), 0))

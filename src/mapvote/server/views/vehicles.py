@@ -25,7 +25,7 @@ from mapvote.fusion.next_pass import Stretch, Witness, stretches
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_version, load_tile, tiles_of
+from mapvote.server.store.queries import load_tile, tiles_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.views.explain import said_by, seen, votes_by_tile
 from mapvote.server.views.geojson import collection, utc
@@ -262,7 +262,7 @@ def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:
     last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
     with store.database.reading() as connection:
         tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
-            tiles_of(connection, current_version(connection).number), (None, 0)
+            tiles_of(connection, version_of(connection).number), (None, 0)
         )
         tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
     return [
@@ -287,7 +287,7 @@ def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
         rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
         driven = [unpack_path(row.path) for row in rows]
         touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
-        known = tiles_of(connection, current_version(connection).number, sorted(touched)) if touched else {}
+        known = tiles_of(connection, version_of(connection).number, sorted(touched)) if touched else {}
 
         @cache
         def ground(index: TileIndex) -> F32:
