@@ -77,8 +77,7 @@ class VotingSettings(Section):
 
 
 class PaperSettings(Section):
-    """How the paper's open sentences are read (detection/paper.py has each with its quotation). Surfaces have no
-    part in it."""
+    """How the paper's open sentences are read. Surfaces have no part in it."""
 
     occluded: Literal["votes", "abstains"] = Field(
         default="abstains",
