@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from mapvote.codec.ballot import Ballot
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.localisation.prepare import motion_at
+from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 LENGTH_M = 45.0
 
@@ -87,3 +90,17 @@ def drive_along(
         prior_sigma_m=sigma_m,
         prior_sigma_deg=sigma_deg,
     )
+
+
+def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
+    """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
+    named DRIVE-001, DRIVE-002 and so on."""
+    name, road, k = drive.drive_id, RoadDriven(), 1
+    vehicle.drive_id = stretch_name(name, k)
+    for i, scan in enumerate(drive):
+        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+        if cuts.due(vehicle.report, vehicle.done, road):
+            k, road = k + 1, RoadDriven()
+            yield vehicle.cut(stretch_name(name, k))
+    vehicle.finish()
+    yield vehicle.ballot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -302,20 +302,6 @@ def vote_drive(
             progress(i + 1, len(drive))
     vehicle.finish()
     return vehicle.ballot(), vehicle.report
-
-
-def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
-    """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
-    named DRIVE-001, DRIVE-002 and so on."""
-    name, road, k = drive.drive_id, RoadDriven(), 1
-    vehicle.drive_id = stretch_name(name, k)
-    for i, scan in enumerate(drive):
-        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
-        if cuts.due(vehicle.report, vehicle.done, road):
-            k, road = k + 1, RoadDriven()
-            yield vehicle.cut(stretch_name(name, k))
-    vehicle.finish()
-    yield vehicle.ballot
 
 
 def stretch_name(drive_id: str, k: int) -> str:

@@ -19,8 +19,8 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_map, write_map
-from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
-from streets import path, street, sweep, twist_of
+from mapvote.vehicle import Cuts, Vehicle
+from streets import path, street, sweep, twist_of, vote_in_stretches
 
 pytest.importorskip("cyclonedds")
 SCANS = 40

@@ -15,7 +15,18 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import lay_version
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.live.map_loader import DIFFERENTIAL, HASH, HASH_TOPIC, PARTIAL, SELECTED, SERVICES, Cell, MapLoader
+from mapvote.live.map_loader import (
+    DIFFERENTIAL,
+    HASH,
+    HASH_TOPIC,
+    PARTIAL,
+    SELECTED,
+    SERVICES,
+    TABLE,
+    TABLE_TOPIC,
+    Cell,
+    MapLoader,
+)
 from mapvote.live.messages import blank_message, from_cdr, to_cdr
 
 
@@ -49,23 +60,17 @@ def corner(cells: list[Any]) -> list[tuple[float, float]]:
     return [(square.min_x, square.min_y) for square in squares]
 
 
-def test_an_empty_cache_gets_all_tiles_in_the_area_and_drops_none(loader: MapLoader) -> None:
+def test_a_client_gets_the_tiles_in_its_area_that_it_lacks_and_drops_those_out_of_it(loader: MapLoader) -> None:
     new, removed = asked(loader)
     assert (corner(new), removed) == ([(0, 0), (20, 0)], [])
     cloud = new[0].pointcloud
     assert (cloud.width, cloud.point_step, cloud.header.frame_id) == (2, 12, "map")
     assert np.frombuffer(cloud.data, "<f4").reshape(-1, 3).tolist() == [[3, 3, 1], [4, 4, 1]]
-
-
-def test_what_is_cached_in_the_area_is_kept_and_not_sent_again(loader: MapLoader) -> None:
-    new, removed = asked(loader, asked(loader)[0][0].cell_id)
-    assert (corner(new), removed) == ([(20, 0)], [])
-
-
-def test_cached_ids_out_of_the_area_and_unknown_ones_are_dropped_in_their_order(loader: MapLoader) -> None:
+    kept, removed = asked(loader, new[0].cell_id)
+    assert (corner(kept), removed) == ([(20, 0)], [])
     held = [asked(loader, x=210.0, y=210.0)[0][0].cell_id, "/path/of/another/loader.pcd"]
     new, removed = asked(loader, *held)
-    assert (corner(new), removed) == ([(0, 0), (20, 0)], held)
+    assert (corner(new), removed) == ([(0, 0), (20, 0)], held), "in their order, and unknown ones too"
 
 
 def test_an_area_gets_every_tile_that_it_touches_at_the_border_too_and_none_beside(loader: MapLoader) -> None:
@@ -85,13 +90,6 @@ def test_selected_tiles_come_in_the_order_asked_for_as_often_and_without_unknown
     found = loader.selected(["missing_0.pcd", b, "missing_1.pcd", a, b])
     assert [cell.id for cell in found] == [b, a, b]
     assert [record.message[:12] for record in caplog.records] == ["no tile miss"] * 2
-
-
-def test_the_table_lists_every_square_in_the_map_frame(loader: MapLoader) -> None:
-    table = loader.table(5)
-    assert table.header.frame_id == "map"
-    listed = [(c.metadata.min_x, c.metadata.min_y, c.metadata.max_x, c.metadata.max_y) for c in table.metadata_list]
-    assert sorted(listed) == [(0, 0, 20, 20), (20, 0, 40, 20), (200, 200, 220, 220)]
 
 
 def test_a_tile_that_changed_has_another_id_and_the_old_one_is_dropped(loader: MapLoader, tmp_path: Path) -> None:
@@ -159,6 +157,13 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     one = next(iter(loader.cells))
     selected = client(SELECTED, 8)(9, cell_ids=[one])
     assert [c.cell_id for c in selected.new_pointcloud_with_ids] == [one]
-    late = network.subscribe(HASH_TOPIC, HASH, reliable=True, transient_local=True)
-    ((_, data),) = until(late.take)
-    assert len(from_cdr(HASH, data).pcd) == 64
+    told = {}
+    for topic, kind in ((HASH_TOPIC, HASH), (TABLE_TOPIC, TABLE)):
+        late = network.subscribe(topic, kind, reliable=True, transient_local=True)
+        told[kind] = from_cdr(kind, until(late.take)[0][1])
+    assert len(told[HASH].pcd) == 64
+    assert told[TABLE].header.frame_id == "map"
+    listed = [
+        (c.metadata.min_x, c.metadata.min_y, c.metadata.max_x, c.metadata.max_y) for c in told[TABLE].metadata_list
+    ]
+    assert sorted(listed) == [(0, 0, 20, 20), (20, 0, 40, 20), (200, 200, 220, 220)]

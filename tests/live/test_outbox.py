@@ -63,6 +63,9 @@ def test_a_journal_cut_off_at_any_byte_gives_the_ballot_of_its_whole_records(tmp
         assert (found is None) == (n == 0)
         if found is not None:
             assert (found.scans, [t.tile for t in found.tiles]) == ([5, 9, 12][n - 1], [(0, 0), (0, 1)][: min(n, 2)])
+    journal.path.write_bytes(whole + b"half a record")
+    journal.append(encode(ballot("a", 15)))
+    assert [part.scans for part in records(journal.path)] == [5, 9, 12, 15], "what is written next takes its place"
 
 
 def test_the_ballot_of_a_journal_is_valid_though_its_vehicle_drove_on_beyond_the_tiles_that_were_written(
@@ -80,15 +83,6 @@ def test_the_ballot_of_a_journal_is_valid_though_its_vehicle_drove_on_beyond_the
     check_path(found.path, [(0, 0)])
     columns = unpack_path(found.path)[:, 1] * CELL_SIZE
     assert (columns.min(), columns.max()) == pytest.approx((0.0, 150.0), abs=CELL_SIZE)
-
-
-def test_a_damaged_record_ends_the_journal_and_what_is_written_next_takes_its_place(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "a.journal")
-    journal.append(encode(ballot("a", 5)))
-    with journal.path.open("ab") as file:
-        file.write(b"half a record")
-    journal.append(encode(ballot("a", 9)))
-    assert [part.scans for part in records(journal.path)] == [5, 9]
 
 
 class Killed(BaseException):

@@ -16,7 +16,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import cut_tiles
-from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
+from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool
 from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.detection.packed_tiles import Shelf, Slot
 from mapvote.perception.frontend import Observation, PlacedScan
@@ -132,7 +132,7 @@ class NewPoints:
     def gather(self, seen: Observation, may_be_new: U64) -> None:
         """Offer the points of one scan that lie in ``may_be_new`` (rows, cols) of its view, or outside the view."""
         scan = seen.scan
-        words, base = may_be_new.ravel(), _flat_base(scan.reference)
+        words, base = may_be_new.ravel(), np.ascontiguousarray(scan.reference.base).ravel()
         self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
         if self.beyond:
             self._offer_of(scan, self._strange_beyond(scan))
@@ -211,7 +211,3 @@ def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32
     every = np.ones(len(points_map), np.bool_)
     kept = points_map[select(points_map, cell, every, ~every, words.ravel(), base.ravel())]
     return window.from_map(kept[:, :3]), np.rint(kept[:, 3] * 255.0).astype(np.uint8) if kept.shape[1] == 4 else None
-
-
-def _flat_base(reference: Reference) -> I32:
-    return np.ascontiguousarray(reference.base).ravel()

@@ -25,7 +25,7 @@ import yaml
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.maps.autoware import METADATA, TILES
-from mapvote.formats.maps.cloud import Cloud, joined
+from mapvote.formats.maps.cloud import joined
 from mapvote.formats.maps.pcd import stream_pcd
 from mapvote.live.dds import Network, Publication, Subscription
 from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
@@ -136,25 +136,21 @@ class MapLoader:
         out["new_pointcloud_with_ids"] = clouds = []
         for cell in cells:
             try:
-                cloud = _message_of(joined(stream_pcd(self.folder / TILES / cell.id)))
+                cloud = joined(stream_pcd(self.folder / TILES / cell.id))
             except MapvoteError as error:  # a version was replaced, and its tile deleted, while it was read
                 log.warning("%s", error)
                 continue
-            clouds.append(cell.message(f"{_MSG}WithID", pointcloud=cloud))
+            columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
+            if "intensity" in cloud.fields:
+                columns["intensity"] = cloud.fields["intensity"]
+            message = cloud_of({name: column.astype(np.float32) for name, column in columns.items()}, 0, MAP_FRAME)
+            clouds.append(cell.message(f"{_MSG}WithID", pointcloud=message))
         return out
 
     def table(self, time_ns: int) -> Any:
         """A PointCloudMapMetaData of all tiles."""
         listed = [cell.message(f"{_MSG}MetaDataWithID") for cell in self.cells.values()]
         return blank_message(TABLE, header=header_of(time_ns, MAP_FRAME), metadata_list=listed)
-
-
-def _message_of(cloud: Cloud) -> Any:
-    """A PointCloud2 of map points: x, y, z, and intensity where there is one."""
-    columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
-    if "intensity" in cloud.fields:
-        columns["intensity"] = cloud.fields["intensity"]
-    return cloud_of({name: column.astype(np.float32) for name, column in columns.items()}, 0, MAP_FRAME)
 
 
 class LoaderService:

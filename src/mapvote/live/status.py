@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.geometry import inverse
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import require
 from mapvote.live.dds import Network, Publication
-from mapvote.live.drive import Counts, Fixed, LiveDrive
+from mapvote.live.drive import Counts, LiveDrive
 from mapvote.live.messages import blank_message, header_of, pose_of, to_cdr
 from mapvote.live.outbox import Outbox, OutboxReport
 from mapvote.live.road_map import Maps, RoadMap
@@ -211,8 +211,11 @@ class RosStatus:
         """Publish the poses of the scans that have voted since the last time: of what odometry tracks, in the map's
         frame. The covariance is that of the sensor's position and of the rotation, in map axes."""
         while live.fixes:
-            T_lidar_base = inverse(live.T_base_lidar)
-            self._send(self._poses, pose_message(live.fixes.popleft(), T_lidar_base, topics.map_frame or "map"))
+            fixed = live.fixes.popleft()
+            message = blank_message(POSE, header=header_of(fixed.stamp_ns, topics.map_frame or "map"))
+            message.pose.pose = pose_of(fixed.T_map_lidar @ inverse(live.T_base_lidar))
+            message.pose.covariance = fixed.covariance.astype(np.float64).ravel()
+            self._send(self._poses, to_cdr(POSE, message))
 
     def _send(self, publication: Publication, data: bytes) -> None:
         """A message that a slow reader does not take is dropped: no reader delays the drive."""
@@ -222,14 +225,6 @@ class RosStatus:
             if not self._refused:
                 log.warning("%s", error)
             self._refused = True
-
-
-def pose_message(fixed: Fixed, T_lidar_base: F64, frame: str) -> bytes:
-    """A PoseWithCovarianceStamped."""
-    message = blank_message(POSE, header=header_of(fixed.stamp_ns, frame))
-    message.pose.pose = pose_of(fixed.T_map_lidar @ T_lidar_base)
-    message.pose.covariance = fixed.covariance.astype(np.float64).ravel()
-    return to_cdr(POSE, message)
 
 
 def serve_metrics(board: StatusBoard, port: int) -> int:

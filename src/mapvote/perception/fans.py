@@ -86,14 +86,9 @@ def _follow(rows: F32, clearance: float, rays: Rays) -> None:
         fan[i] = min(np.int32(turn(dx, dy) * np.float32(FANS)), np.int32(FANS - 1))
 
 
-def _marks_from() -> F32:
-    """(FANS,) horizontal metres from which each fan marks what it passes, see FULL_RANGE_M."""
-    halved = np.array([(f & -f).bit_length() - 1 if f else 64 for f in range(FANS)])
-    marks_from = FULL_RANGE_M * 0.5**halved
-    return np.where(marks_from <= CELL_SIZE, 0.0, marks_from).astype(np.float32)
-
-
-_MARKS_FROM = _marks_from()
+_HALVED = FULL_RANGE_M * 0.5 ** np.array([(f & -f).bit_length() - 1 if f else 64 for f in range(FANS)])
+_MARKS_FROM = np.where(_HALVED <= CELL_SIZE, 0.0, _HALVED).astype(np.float32)
+"""(FANS,) horizontal metres from which each fan marks what it passes."""
 _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 """A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
 
