@@ -18,7 +18,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
     os.environ.setdefault(_threads, "1")
 
-from mapvote.cli import diff, files, live, operate, setup, vehicle  # noqa: E402
+from mapvote.cli import drives, files, live, operate, setup  # noqa: E402
 from mapvote.cli.options import DRIVE, MAP, SERVER, SETUP  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
@@ -34,7 +34,7 @@ app = typer.Typer(
 )
 VERBS = {
     DRIVE: (
-        vehicle.build, vehicle.vote, live.topics, live.play, live.drive, live.autoware, diff.diff, diff.merge,
+        drives.build, drives.vote, live.topics, live.play, live.drive, live.autoware, drives.diff, drives.merge,
         files.doctor,
     ),
     MAP: (files.import_map, files.export, files.info, files.update),

@@ -21,7 +21,7 @@ from mapvote.cli.options import (
     Topic,
     with_drive_options,
 )
-from mapvote.cli.terminal import print_table, show_table, stages_that_vanish, waiting
+from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ def info(
     mapvote info fleet.db --vehicles
     """
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     from mapvote.formats.describe import describe
@@ -72,13 +71,8 @@ def info(
     else:
         with waiting(f"reading {path}"):
             title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic)
-    table = Table(show_header=False)
-    table.add_column(style="cyan", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(Text(name), Text(value))
     Console(highlight=False).print(Text(f"{path}: {title}", style="bold"), soft_wrap=True)
-    show_table(table)
+    print_table(("", ""), [(Text(name, "cyan"), value) for name, value in rows])
 
 
 def _readable(value: int | str) -> str:

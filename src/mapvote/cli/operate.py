@@ -204,7 +204,7 @@ def log(
         with api_at(store, key_file) as server:
             _print_versions(server.ask_json("GET", f"/v1/log?events={events}"))
         return
-    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.atomic import write_whole
 
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
     asked = f"from={old or 1}" + ("" if new is None else f"&to={new}")
@@ -212,8 +212,7 @@ def log(
         found = server.ask_json("GET", f"/v1/changes?{asked}&lonlat={str(not local).lower()}")
         text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
     if page is not None:
-        with whole_file(page) as part:
-            part.write_text(text)
+        write_whole(page, text)
         print(f"the largest of {len(found['features'])} changes in {page}")
         if out is None:
             return
@@ -234,7 +233,7 @@ def _print_versions(answer: Mapping[str, Any]) -> None:
 def _write_changes(found: dict[str, Any], out: Path | None) -> None:
     import json
 
-    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.atomic import write_whole
     from mapvote.formats.geo.frame import frame_of
     from mapvote.formats.geo.geopackage import write_geopackage
 
@@ -247,8 +246,7 @@ def _write_changes(found: dict[str, Any], out: Path | None) -> None:
     if out.suffix.lower() == ".gpkg":
         write_geopackage(out, found["features"], frame_of(found["georeference"]))
     else:
-        with whole_file(out) as part:
-            part.write_text(json.dumps(found, indent=1) + "\n")
+        write_whole(out, json.dumps(found, indent=1) + "\n")
     print(f"{len(found['features'])} objects in {out}")
 
 
@@ -297,7 +295,7 @@ def coverage(
     """
     import json
 
-    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.atomic import write_whole
 
     with api_at(store, key_file) as server:
         found = server.ask_json("GET", "/v1/coverage/passes")
@@ -312,8 +310,7 @@ def coverage(
     else:
         print("no cell waits for one more pass")
     if out is not None:
-        with whole_file(out) as partial:
-            partial.write_text(json.dumps(found) + "\n")
+        write_whole(out, json.dumps(found) + "\n")
         print(f"{out}: {len(found['features'])} stretches of road")
 
 

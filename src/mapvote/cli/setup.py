@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from mapvote.cli.options import Config
-from mapvote.cli.terminal import show_table
+from mapvote.cli.terminal import print_table, waiting
 
 
 def warmup() -> None:
@@ -15,8 +15,6 @@ def warmup() -> None:
 
     mapvote warmup
     """
-    from mapvote.cli.terminal import waiting
-
     with waiting("loading"):
         from mapvote.warmup import warm_up
     steps, total = warm_up(), 0.0
@@ -42,7 +40,6 @@ def config(
         mapvote config --toml > settings.toml
     """
     import tomli_w
-    from rich.table import Table
     from rich.text import Text
 
     from mapvote.config import Settings, load_with_sources
@@ -51,16 +48,13 @@ def config(
     if toml:
         print(tomli_w.dumps(settings.model_dump(exclude_none=True)), end="")
         return
-    table = Table(title="Settings", title_justify="left", header_style="bold")
-    for heading in ("setting", "value", "source", "meaning"):
-        table.add_column(heading, overflow="fold")
+    rows: list[list[Text] | None] = []
     for section in Settings.model_fields:
         values = getattr(settings, section)
         for key, field in type(values).model_fields.items():
             source = sources.get(f"{section}.{key}", "default")
-            style = "" if source == "default" else "bold green"
-            row = (f"{section}.{key}", str(getattr(values, key)), source, field.description or "")
-            table.add_row(*(Text(cell) for cell in row), style=style)
-        table.add_section()
-    show_table(table)
+            row = f"{section}.{key}", str(getattr(values, key)), source, field.description or ""
+            rows.append([Text(cell, "" if source == "default" else "bold green") for cell in row])
+        rows.append(None)
+    print_table(("setting", "value", "source", "meaning"), rows, "Settings")
     print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.")

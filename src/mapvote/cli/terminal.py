@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
-    from rich.table import Table
+    from rich.text import Text
 
 _ANY_WIDTH = 10_000
 
@@ -28,24 +28,24 @@ def complain(message: str) -> None:
     Console(stderr=True, soft_wrap=True).print(line, highlight=False)
 
 
-def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> None:
-    """A table of plain text on stdout, see :func:`show_table`."""
+def print_table(headings: Sequence[str], rows: Iterable[Iterable[str | Text] | None], title: str | None = None) -> None:
+    """A table of plain text on stdout, without a head if no heading says anything; None is a line between rows.
+
+    In a terminal, text that does not fit is folded, never cut. In a pipe or a file each row is one line, however wide.
+    """
+    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=None if title is None else Text(title), title_justify="left")
+    head = any(headings)
+    table = Table(title=None if title is None else Text(title), title_justify="left", show_header=head)
     for heading in headings:
         table.add_column(Text(heading), overflow="fold")
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    show_table(table)
-
-
-def show_table(table: Table) -> None:
-    """A table on stdout. In a terminal, text that does not fit is folded, never cut. In a pipe or a file each row is
-    one line, however wide."""
-    from rich.console import Console
-
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _ANY_WIDTH

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -19,7 +20,6 @@ from typing import Literal
 import msgspec
 
 from mapvote.client.connection import Connection, Refused, Unreachable
-from mapvote.client.spool import Spool, server_folder
 from mapvote.codec.arrays import FRAME_HEAD, compress
 from mapvote.codec.ballot import Ballot, decode, encode, tile_index
 from mapvote.codec.manifest import Manifest, TileHashes
@@ -28,7 +28,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, made_in_turn
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
-from mapvote.formats.atomic import whole_file
+from mapvote.formats.atomic import write_whole
 
 Sent = Literal["created", "replaced", "repeated", "spooled"]
 Region = tuple[float, float, float, float]
@@ -60,8 +60,8 @@ class MapClient:
     ) -> None:
         self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
         self._url = url
-        self._planes, self._spool = home / "planes", Spool(home, url)
-        self._kept_manifest = server_folder(home, url) / "manifest.json"
+        self._planes, self._spool = home / "planes", _Spool(home, url)
+        self._kept_manifest = _server_folder(home, url) / "manifest.json"
         self._cache_bytes = cache_bytes
         self.version: int | None = None
         """Version of the map last fetched."""
@@ -217,8 +217,7 @@ class MapClient:
             return None
 
     def _keep(self, manifest: Manifest) -> Manifest:
-        with whole_file(self._kept_manifest, private=True) as part:
-            part.write_bytes(msgspec.json.encode(manifest))
+        write_whole(self._kept_manifest, msgspec.json.encode(manifest), private=True)
         return manifest
 
     def tile(self, window: Grid, planes: TileHashes) -> Tile:
@@ -238,8 +237,7 @@ class MapClient:
         if hashlib.sha256(raw).hexdigest() != digest:
             raise MapvoteError(f"{self._url}: tile plane {digest[:12]} came damaged; fetch again")
         frame = compress(raw, 1)
-        with whole_file(kept, private=True) as part:
-            part.write_bytes(frame)
+        write_whole(kept, frame, private=True)
         return frame
 
     def _bound_cache(self, needed: Iterable[str]) -> None:
@@ -264,3 +262,39 @@ def _meets(window: Grid, region: Region) -> bool:
     x0, y0, x1, y1 = region
     rows, cols = window.shape
     return x0 < window.x0 + cols * CELL_SIZE and window.x0 < x1 and y0 < window.y0 + rows * CELL_SIZE and window.y0 < y1
+
+
+_WAITING, _REFUSED = ".ballot", ".refused"
+
+
+def _server_folder(home: Path, url: str) -> Path:
+    """Where what belongs to one server lies: its name to read, and a hash of its address."""
+    name = re.sub(r"[^A-Za-z0-9.]+", "_", url.partition("://")[2].strip("/"))[:60]
+    return home / "servers" / f"{name}-{hashlib.sha256(url.rstrip('/').encode()).hexdigest()[:8]}"
+
+
+class _Spool:
+    """What waits for one server. Files are their owner's alone, and appear whole."""
+
+    def __init__(self, home: Path, url: str) -> None:
+        self._folder = _server_folder(home, url) / "spool"
+
+    def put(self, vehicle: str, drive: str, data: bytes) -> Path:
+        """Keep a ballot until :meth:`sent`; one of the same drive is replaced."""
+        waiting = self._folder / vehicle / f"{drive}{_WAITING}"
+        write_whole(waiting, data, private=True)
+        return waiting
+
+    def waiting(self, vehicle: str | None = None) -> Iterator[Path]:
+        """Ballots that are to be sent, of one vehicle or of all."""
+        yield from sorted(self._folder.glob(f"{vehicle or '*'}/*{_WAITING}"))
+
+    def sent(self, waiting: Path) -> None:
+        """The server has it."""
+        waiting.unlink(missing_ok=True)
+
+    def set_aside(self, waiting: Path) -> Path:
+        """The server will never take it as it is: keep it, and send it no more."""
+        kept = waiting.with_suffix(_REFUSED)
+        os.replace(waiting, kept)
+        return kept

@@ -47,6 +47,12 @@ def whole_file(path: Path | str, *, private: bool = False) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def write_whole(path: Path | str, content: bytes | str, *, private: bool = False) -> None:
+    """A file of this content, text in UTF-8; see :func:`whole_file`."""
+    with whole_file(path, private=private) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 @contextmanager
 def whole_folder(path: Path | str, *, sign: str) -> Iterator[Path]:
     """Gives a hidden empty folder to fill; on leaving without an error it becomes ``path``.

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mapvote.formats.atomic import whole_file
+from mapvote.formats.atomic import write_whole
 from mapvote_lab.evaluation.scores import (
     CLASSES,
     PAPER_F1,
@@ -286,5 +286,4 @@ def as_text(result: EvaluationResult) -> str:
 
 def write_text(text: str, path: Path) -> None:
     """Whole or not at all."""
-    with whole_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, text)

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.atomic import folder_beside, whole_file, whole_folder
+from mapvote.formats.atomic import folder_beside, whole_file, whole_folder, write_whole
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
@@ -252,5 +252,4 @@ def _history(folder: Path) -> list[_Laid]:
 
 def _write(file: Path, content: bytes) -> None:
     if not (file.is_file() and file.read_bytes() == content):
-        with whole_file(file) as partial:
-            partial.write_bytes(content)
+        write_whole(file, content)

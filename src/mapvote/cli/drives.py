@@ -1,8 +1,9 @@
-"""The verbs of mapping and driving: build, vote."""
+"""The verbs of recorded drives and of whole clouds: build, vote, diff, merge."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,11 +12,12 @@ import typer
 
 from mapvote.cli.door import client_of, key_in, map_at, region_in, usable_drives
 from mapvote.cli.options import Config, DrivePath, KeyFile, with_drive_options
-from mapvote.cli.terminal import progress, waiting
+from mapvote.cli.terminal import print_table, progress, waiting
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot
+    from mapvote.comparison.cloud_changes import CloudChange
     from mapvote.config import Settings
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
@@ -151,12 +153,11 @@ def vote(
 
     mapvote vote ANOTHER_DRIVE --map my_map --vehicle car_1 --out car_1.ballot
     """
-    from mapvote.cli.diff import ballot_of_cloud
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
     from mapvote.core.point_map import has_open_ground
     from mapvote.formats import is_cloud, open_drive
-    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.atomic import write_whole
     from mapvote.formats.geo.frame import frame_of
 
     if out is None and send is None:
@@ -177,14 +178,13 @@ def vote(
                 file=sys.stderr,
             )
         if is_cloud(drive_path):
-            ballot, report = ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
+            ballot, report = _ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
         else:
             drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
             ballot, report = _drive_once(drive, point_map, settings, trust_prior)
     data = encode(ballot)
     if out is not None:
-        with whole_file(out) as partial:
-            partial.write_bytes(data)
+        write_whole(out, data)
     _tell_votes(ballot, report, out, len(data))
     if send is not None:
         _send(send, key, data)
@@ -224,3 +224,135 @@ def _tell_votes(ballot: Ballot, report: DriveReport | None, out: Path | None, si
         stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
         print(f"milliseconds a scan (median): {stages}")
     print(f"{out or 'ballot'}: {len(ballot.tiles)} tiles, {size / 1000.0:.1f} kB")
+
+
+def _ballot_of_cloud(
+    path: Path, point_map: PointMap, settings: Settings, vehicle: str | None, trajectory: Path | None
+) -> Ballot:
+    """The ballot of a session's cloud; prints its registration and where it does not vote. It ended when the file
+    was last changed."""
+    from mapvote.comparison.session_votes import vote_of_session
+    from mapvote.formats import read_map
+    from mapvote.formats.drives.trajectory import read_poses
+
+    with waiting(f"reading {path}"):
+        cloud = read_map(path)
+        driven = None if trajectory is None else read_poses(trajectory)[:, :3, 3]
+    name = path.stem or path.name
+    with waiting("registering and voting"):
+        said = vote_of_session(
+            vehicle or name, name, point_map, cloud, settings, end_ns=path.stat().st_mtime_ns, trajectory=driven
+        )
+    for line in said.registered.told():
+        print(line)
+    if said.registered.bent:
+        print("what is bent does not vote")
+    if not said.by_trajectory:
+        print("no trajectory: gone and new by the ground that the cloud shows, and no free space is learned")
+    _print_sums(said.changes)
+    return said.ballot
+
+
+def diff(
+    path_a: Annotated[
+        Path, typer.Argument(metavar="A", help="the older map or cloud, in any format; results are in its frame")
+    ],
+    path_b: Annotated[Path, typer.Argument(metavar="B", help="the newer one, in any format and frame")],
+    min_area: Annotated[float, typer.Option(min=0.0, metavar="M2", help="leave out smaller objects")] = 0.5,
+    unbend: Annotated[
+        bool, typer.Option("--unbend", help="correct bent parts of B piece by piece, if that makes them fit")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the footprints as GeoJSON")] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the table as CSV")] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="also write one page with both clouds around the largest"),
+    ] = None,
+    show_not_seen: Annotated[
+        bool, typer.Option("--not-seen", help="also list objects of one cloud where the other has no ground")
+    ] = False,
+) -> None:
+    """List the differences of two clouds or maps of one place. B is registered to A without a prior, at any heading.
+
+    mapvote diff old_map.las session.pcd --html diff.html
+    """
+    import json
+
+    from mapvote.comparison.cloud_changes import (
+        compare_cells,
+        difference_geojson,
+        difference_page,
+        difference_rows,
+        differences,
+    )
+    from mapvote.comparison.register import brought_into
+    from mapvote.formats import read_map
+    from mapvote.formats.atomic import write_whole
+    from mapvote.server.views.geojson import as_csv
+
+    with waiting(f"reading {path_a} and {path_b}"):
+        map_a, map_b = read_map(path_a), read_map(path_b)
+    with waiting("registering B to A"):
+        map_b, registered = brought_into(map_a, map_b, unbend=unbend)
+    with waiting("comparing"):
+        compared = compare_cells(map_a, map_b, registered)
+        found = differences(compared, min_area)
+    told = registered.told()
+    by_free = bool(compared.a.free.any() or compared.b.free.any())
+    told.append(
+        "gone and new are decided by free space and by ground that the other one shows"
+        if by_free
+        else "neither has free space: gone and new are decided by geometry alone (the other has ground there, and "
+        "nothing that stands within two cells)"
+    )
+    for line in told:
+        print(line)
+    listed = [one for one in found if show_not_seen or one.kind != "not seen"]
+    rows = difference_rows(listed)
+    shown = ("id", "kind", "x", "y", "area_m2", "height_m", "points", "confidence")
+    print_table(shown, [tuple(str(row[name]) for name in shown) for row in rows])
+    _print_sums(found)
+    left_out = float(compared.left_out.sum()) * 0.09
+    if left_out:
+        print(f"left out in bent parts: {left_out:.1f} m2 of cells")
+    written = []
+    if out is not None:
+        collection = difference_geojson(found, map_a.lattice, map_a.georeference, told)
+        written.append((out, json.dumps(collection, indent=1) + "\n"))
+    if csv is not None:
+        written.append((csv, as_csv(difference_rows(found))))
+    if page is not None:
+        written.append((page, difference_page(f"{path_a.name} and {path_b.name}", found, map_a, map_b)))
+    for file, text in written:
+        write_whole(file, text)
+        print(f"{file}")
+
+
+def merge(
+    paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="maps that overlap, in any format and frame")],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
+) -> None:
+    """Merge overlapping maps into one, in the frame of the first: registered, adjusted together, one point per voxel.
+
+    mapvote merge north.laz south.laz --out town
+    """
+    from mapvote.comparison.merge import merge_maps
+    from mapvote.formats import read_map, write_map
+
+    if out.exists():
+        raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
+    with waiting("reading"):
+        maps = [read_map(path) for path in paths]
+    with waiting("registering and merging"):
+        merged = merge_maps(maps)
+    for (i, j), far in merged.apart_m.items():
+        print(f"{paths[i]} and {paths[j]}: {far:.3f} m apart after adjustment (median)")
+    with waiting(f"writing {out}"):
+        write_map(merged.point_map, out)
+    print(f"{out}: {merged.point_map.n_points} points")
+
+
+def _print_sums(found: Sequence[CloudChange]) -> None:
+    for kind in ("gone", "new", "not seen"):
+        areas_m2 = [one.area_m2 for one in found if one.kind == kind]
+        print(f"{kind}: {len(areas_m2)} things, {sum(areas_m2):.1f} m2")
