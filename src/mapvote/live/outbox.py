@@ -30,7 +30,7 @@ import msgspec
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, decode, encode, path_near
 from mapvote.core.types import MapvoteError
-from mapvote.formats.atomic import whole_file, write_whole
+from mapvote.formats.atomic import whole_file
 from mapvote.vehicle import stretch_name
 
 log = logging.getLogger("mapvote.live")
@@ -271,7 +271,8 @@ class Outbox:
         self._pass_on()
 
     def _put_down(self, drive: str, data: bytes) -> None:
-        write_whole(self._path(drive, "ballot"), data, private=True)
+        with whole_file(self._path(drive, "ballot"), private=True) as part:
+            part.write_bytes(data)
 
     def _end_journal(self, drive: str) -> None:
         with self._disk_may_fail():
@@ -284,7 +285,8 @@ class Outbox:
             with self._disk_may_fail():
                 data = whole.read_bytes()
                 if self._folder is not None:
-                    write_whole(self._folder / f"{self.vehicle}~{whole.stem}.ballot", data)
+                    with whole_file(self._folder / f"{self.vehicle}~{whole.stem}.ballot") as part:
+                        part.write_bytes(data)
                 if self._client is not None:
                     self._client.keep(data)
                 whole.unlink()
