@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from hand_made import AtOnce, unpack_all
+from hand_made import AtOnce, at_least, unpack_all
 from mapvote.codec.ballot import (
     decode,
     encode,
@@ -21,7 +21,7 @@ from mapvote.codec.ballot import (
     unpack_sureness,
     unpack_tally,
 )
-from mapvote.codec.sparse_columns import unpack_words
+from mapvote.codec.sparse_columns import unpack_sparse
 from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
@@ -231,7 +231,7 @@ def test_by_surfaces_a_ballot_tells_what_was_taken_down_and_which_voxels_are_gon
     for tile in vehicle.ballot().tiles:
         assert tile.gone is not None
         assert tile.states is not None
-        gone, states = unpack_words(tile.gone, "gone"), unpack_states(tile.states)
+        gone, states = at_least([unpack_sparse(tile.gone, "gone")], 1), unpack_states(tile.states)
         window = vehicle.point_map.lattice.tile(tile.tile)
         mapped = reference_window(vehicle.point_map, window).occupied
         assert not (gone & ~mapped).any()

@@ -266,8 +266,6 @@ MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
 _PLACES = 32
 """Places along a voxel's side that a point may have."""
-MOST_OFF_M = 0.5 * CELL_SIZE / _PLACES
-"""How far rounding moves a point along an axis, but for what float32 adds."""
 _POINT_BYTES = 9
 _MAX_POINT_BYTES = CELLS * MAX_POINTS_PER_CELL * _POINT_BYTES
 _TOP_M = 1e5
@@ -290,7 +288,7 @@ def unpack_points(data: bytes) -> F32:
     sound = _placed(raw.reshape(_POINT_BYTES, -1), points)
     if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
-    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
+    if _most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)) > MAX_POINTS_PER_CELL:
         raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
     return points
 
@@ -341,14 +339,10 @@ def _all_inside(points: F32, side: np.float32) -> bool:
     return sound
 
 
-def most_in_a_cell(points: F32) -> int:
-    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
-    return int(_most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)))
-
-
 @kernel
 def _most_in_a_cell(points: F32, counts: I64) -> int:
-    """:func:`most_in_a_cell`; ``counts`` (cells,): scratch, zeros."""
+    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell; ``counts`` (cells,):
+    scratch, zeros."""
     most = 0
     for i in range(len(points)):
         row, col = int(points[i, 1] / CELL_SIZE), int(points[i, 0] / CELL_SIZE)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.columns import EVERY_BIT
-from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.grid import CELLS
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, MapvoteError
 
@@ -98,14 +98,6 @@ def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
         cells[i], words[i] = cell, word
         sound &= (way > 0 or i == 0) and word != 0
     return bool(sound and cell < CELLS)
-
-
-def unpack_words(data: bytes, what: str) -> U64:
-    """(256, 256) uint64; MapvoteError if damaged."""
-    cells, words = unpack_sparse(data, what)
-    plane = np.zeros(CELLS, dtype=np.uint64)
-    plane[cells] = words
-    return plane.reshape(TILE_CELLS, TILE_CELLS)
 
 
 def _by_byte(values: NDArray[np.integer], size: int) -> bytes:

@@ -25,14 +25,10 @@ MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
 """800 MB: 16 bytes for each point of the densest tile there may be."""
 
 
-def content_hash(tile_points: F32) -> str:
-    """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
-    return hashlib.sha256(raw_plane(tile_points, "<f4")).hexdigest()
-
-
 def base_hash(tile: Tile | None) -> str:
-    """The content hash that a ballot gives for this tile: "" where the map has none."""
-    return "" if tile is None else content_hash(tile.points)
+    """What a ballot names as its base: SHA-256 of a tile's points, "" where the map has none. Free space learned later
+    changes no published point (docs/decisions/data.md)."""
+    return "" if tile is None else hashlib.sha256(raw_plane(tile.points, "<f4")).hexdigest()
 
 
 def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) -> tuple[TileHashes, dict[str, bytes]]:

@@ -51,7 +51,9 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
         cells = cells[(flat[cells] == before) | (flat[cells] == _UN)]
         if len(cells):
             said, ends_ns, whose = said_in_order(drives, cells)
-            found = cells[_turn(said, ends_ns, whose, before, after)]
+            turned = np.zeros(len(cells), dtype=np.bool_)
+            _find_turns(said, ends_ns, whose, before, after, np.empty(len(whose), dtype=np.int64), turned)
+            found = cells[turned]
             out = out.copy() if out is states and len(found) else out
             out.reshape(-1)[found] = after
     return out
@@ -70,16 +72,10 @@ def said_in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]
     return said, ends_ns, np.array([names[drive.vehicle] for drive in ordered], dtype=np.int64)
 
 
-def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> Bool:
-    """(n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since."""
-    found = np.zeros(said.shape[1], dtype=np.bool_)
-    _find_turns(said, ends_ns, whose, before, after, np.empty(len(whose), dtype=np.int64), found)
-    return found
-
-
 @kernel
 def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, last: I64, found: Bool) -> None:
-    """:func:`_turn` into ``found`` (n,). ``last`` (m,): memory for the last word of each vehicle."""
+    """Into ``found`` (n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since.
+    ``last`` (m,): memory for the last word of each vehicle."""
     for cell in range(said.shape[1]):
         for i in range(len(last)):
             last[i] = -1

@@ -9,7 +9,7 @@ import operator
 import os
 import sqlite3
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from threading import Lock
@@ -127,8 +127,10 @@ def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple
     mark = "?" if connection.dialect.name == "sqlite" else "%s"
     values = ", ".join([mark] * len(table.columns))
     statement = f"INSERT INTO {quote(table.name)} ({columns}) VALUES ({values})"
-    whole = len(rows[0]) == len(table.columns)
-    connection.exec_driver_sql(statement, list(rows if whole else _with_sums(table, rows)))
+    if len(rows[0]) < len(table.columns):
+        at = [table.columns.keys().index(name) for name in summed(table)]
+        rows = [(*row, sum_of(*(row[i] for i in at))) for row in rows]
+    connection.exec_driver_sql(statement, list(rows))
 
 
 @contextmanager
@@ -205,18 +207,7 @@ def summed(table: sa.Table) -> Sequence[str]:
 
 def is_sound(table: sa.Table, row: Any) -> bool:
     """Whether a row with all columns of its table's sum is what was written."""
-    return bool(row.sum == sum_of(*_parts_of(table)(row)))
-
-
-@cache
-def _parts_of(table: sa.Table) -> Callable[[Any], tuple[Any, ...]]:
-    """A function that takes the values of the sum's columns, two or more, from a row."""
-    return operator.attrgetter(*summed(table))
-
-
-def _with_sums(table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
-    at = [list(table.c.keys()).index(name) for name in summed(table)]
-    return [(*row, sum_of(*(row[i] for i in at))) for row in rows]
+    return bool(row.sum == sum_of(*(getattr(row, name) for name in summed(table))))
 
 
 REMEMBERED_BYTES = 128 << 20

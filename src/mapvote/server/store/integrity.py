@@ -7,7 +7,7 @@ A ballot in quarantine does not count on its tile, and a tile with a damaged pla
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -111,13 +111,9 @@ def _rows(connection: sa.Connection) -> Iterator[Damage]:
         key = list(table.primary_key)
         for row in _in_batches(connection, sa.select(table).order_by(*key)):
             if not is_sound(table, row):
-                yield _damaged_row(kind, row, [str(getattr(row, column.name))[:64] for column in key])
-
-
-def _damaged_row(kind: str, row: Any, key: Sequence[str]) -> Damage:
-    if kind == "votes":
-        return Damage("ballot", ballot_name(row.ballot, row.row, row.col), NOT_ITS_SUM)
-    return Damage(kind, " ".join(key), NOT_ITS_SUM)
+                name = " ".join(str(getattr(row, column.name))[:64] for column in key)
+                votes = kind == "votes" and ballot_name(row.ballot, row.row, row.col)
+                yield Damage("ballot" if votes else kind, votes or name, NOT_ITS_SUM)
 
 
 def _ends(connection: sa.Connection) -> Iterator[Damage]:

@@ -40,10 +40,14 @@ class Cleared:
 def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleared:
     """Delete what the policy does not keep, in one transaction; with ``dry_run`` only count it."""
     with store.database.reading() if dry_run else store.database.writing() as connection:
-        oldest = _oldest_to_keep(connection)
+        v, d, b, t = schema.versions, schema.decisions, schema.ballots, schema.ballot_tiles
+        keep, oldest = policy_in(connection).keep.versions, oldest_kept(connection)
+        if keep:  # the first of the last so many versions; one that was not cleared yet if none may go
+            oldest = max(oldest, current_number(connection) - keep + 1)
         old_planes, old_ballots = _planes(connection, oldest), _ballots(connection, oldest)
-        old_decisions = _decisions(connection, oldest)
-        v = schema.versions
+        length = (sa.func.length(d.c.states) + sa.func.length(d.c.tally)).label("size")
+        decided = sa.select(d.c.version, d.c.row, d.c.col, length).where(d.c.version < oldest)
+        old_decisions = list(connection.execute(decided).all())
         gone = (v.c.number < oldest) & v.c.cleared_seq.is_(None)
         versions = int(connection.execute(sa.select(sa.func.count()).where(gone)).scalar_one())
         size = sum(row.size for row in (*old_planes, *old_ballots, *old_decisions))
@@ -56,14 +60,10 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         _delete(connection, schema.decisions, ("version", "row", "col"), old_decisions)
         _delete(connection, schema.ballot_tiles, ("row", "col", "ballot"), old_ballots)
         _delete(connection, schema.blobs, ("hash",), old_planes)
-        _give_back_quota(connection)
+        # A ballot of which nothing is left takes no room of its vehicle's quota any more.
+        empty = (b.c.bytes > 0) & ~sa.exists().where(t.c.ballot == b.c.seq)
+        connection.execute(b.update().where(empty).values(bytes=0))
     return found
-
-
-def _oldest_to_keep(connection: sa.Connection) -> int:
-    """The first of the last so many versions; one that was not cleared yet if none may go."""
-    keep, before = policy_in(connection).keep.versions, oldest_kept(connection)
-    return before if keep == 0 else max(before, current_number(connection) - keep + 1)
 
 
 def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
@@ -74,15 +74,10 @@ def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
     return list(connection.execute(unused).all())
 
 
-def _decisions(connection: sa.Connection, oldest: int) -> list[Any]:
-    d = schema.decisions
-    size = (sa.func.length(d.c.states) + sa.func.length(d.c.tally)).label("size")
-    return list(connection.execute(sa.select(d.c.version, d.c.row, d.c.col, size).where(d.c.version < oldest)).all())
-
-
 def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     """Votes on a tile that no version after ``oldest`` has counted or can count: withdrawn or replaced before it, or
-    older than every window since, counted from the newest vote on the tile that stood then and still does."""
+    older than every window of the policies since, counted from the newest vote on the tile that stood then and still
+    does."""
     t, b, then = schema.ballot_tiles, schema.ballots, version_of(connection, oldest)
     newest = (
         sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns).label("end_ns"))
@@ -91,7 +86,10 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
         .group_by(t.c.row, t.c.col)
         .subquery()
     )
-    window_ns = round(_longest_window_days(connection, oldest) * DAY_NS)
+    v = schema.versions
+    made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
+    policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
+    window_ns = round(max(history_days(policy.fuse) for policy in policies) * DAY_NS)
     past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
     size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in schema.BALLOT_PLANES), start=sa.literal(0))
     found = (
@@ -102,22 +100,8 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     return list(connection.execute(found.where(past)).all())
 
 
-def _longest_window_days(connection: sa.Connection, oldest: int) -> float:
-    """The largest window of the present policy and of the policies of all kept versions."""
-    v = schema.versions
-    made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
-    policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
-    return max(history_days(policy.fuse) for policy in policies)
-
-
 def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
     columns = sa.tuple_(*(table.c[name] for name in key))
     for start in range(0, len(rows), _AT_ONCE):
         some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + _AT_ONCE]]
         connection.execute(table.delete().where(columns.in_(some)))
-
-
-def _give_back_quota(connection: sa.Connection) -> None:
-    """A ballot of which nothing is left takes no room any more."""
-    b, t = schema.ballots, schema.ballot_tiles
-    connection.execute(b.update().where(b.c.bytes > 0, ~sa.exists().where(t.c.ballot == b.c.seq)).values(bytes=0))

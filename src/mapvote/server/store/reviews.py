@@ -57,7 +57,9 @@ def decide(
     another stands on some of these cells, or the one that was seen stands no more.
     """
     with store.database.writing() as connection:
-        on_it = [review for review, theirs in _standing(connection) if _overlaps(review, feature, cells, theirs)]
+        kind = feature["properties"]["kind"]
+        alike = [found for found in _standing(connection) if found[0].feature["properties"]["kind"] == kind]
+        on_it = [r for r, theirs in alike if any((cells[i] & theirs[i]).any() for i in cells.keys() & theirs.keys())]
         others = [review for review in on_it if review.seq != after]
         if others:
             raise Conflict(f"{others[0].by} has {others[0].verdict} this change meanwhile: look again, then decide")
@@ -100,10 +102,3 @@ def _standing(connection: sa.Connection) -> list[tuple[Review, dict[TileIndex, B
     found = sa.select(r.c.seq, r.c.verdict, r.c.comment, e.c.actor, e.c.at_ns, r.c.feature).join(e, e.c.seq == r.c.seq)
     rows = connection.execute(found.where(r.c.gone_seq.is_(None)).order_by(r.c.seq)).all()
     return [(Review(*row), cells.get(row.seq, {})) for row in rows]
-
-
-def _overlaps(
-    review: Review, feature: Mapping[str, Any], cells: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]
-) -> bool:
-    same_kind = review.feature["properties"]["kind"] == feature["properties"]["kind"]
-    return same_kind and any((cells[i] & theirs[i]).any() for i in cells.keys() & theirs.keys())
