@@ -52,7 +52,7 @@ def one_scan(point_map: PointMap, points: F64) -> Observation:
     obstacle, cell = find_obstacles(points, here)
     hit = np.zeros(grid.shape, np.uint64)
     for k, z in zip(cell, points[:, 2], strict=True):
-        hit.ravel()[k] |= np.uint64(1 << int(z / CELL_SIZE))
+        hit.ravel()[k] |= np.uint64(1 << int(z // CELL_SIZE - here.base.ravel()[k]))
     still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
     scan = PlacedScan(0, points, origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit, np.zeros((0, 0), np.uint8))

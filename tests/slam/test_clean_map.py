@@ -26,6 +26,7 @@ from mapvote.slam.clean_map import (
     TALL_M,
     Mapper,
     _leave_out,
+    _unbroken,
     lone_points,
     mirrored,
     seen_through,
@@ -233,6 +234,16 @@ def test_the_wall_down_to_a_yard_beside_the_street_stays() -> None:
     assert left_out(np.vstack([street, yard]), road_along(5.0), np.array([[15.0, 15.0, -5.0]])) == [True]
 
 
+def test_ground_is_broken_up_to_two_cells_beside_a_leap_and_beside_what_is_not_known() -> None:
+    step = np.where(np.arange(20) < 10, 0.0, 0.6) + np.zeros((20, 1))
+    step[:, 18:] = np.nan
+    for ground_z in (step, step.T):
+        broken = ~_unbroken(ground_z.astype(np.float32))
+        expected = np.isin(np.arange(20), [8, 9, 10, 11, 16, 17, 18, 19])
+        assert (broken == (expected if ground_z is step else expected[:, None])).all()
+    assert _unbroken((0.8 * step[:, :18]).astype(np.float32)).all(), "a step of less than half a metre is none"
+
+
 def test_where_a_vehicle_drove_below_a_bridge_nothing_is_left_out() -> None:
     street, bridge = sheet((0, 30), (0, 30), 0.0), sheet((12, 18), (0, 30), 6.0)
     over, under = road_along(15.0, 6.0)[:, [1, 0, 2]], road_along(15.0)
@@ -312,9 +323,11 @@ def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_t
     assert found.tolist() == out
 
 
-def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart() -> None:
-    street = make_map({(0, 0): make_tile(wall([(r, c) for r in range(40) for c in range(40)], [0.05]))})
-    one, other = np.array([[3.15, 3.15, 1.65]]), np.array([[9.15, 9.15, 1.65]])
+@pytest.mark.parametrize("ground_m", [0.0, 6.3, -9.3])
+def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart(ground_m: float) -> None:
+    road = wall([(r, c) for r in range(40) for c in range(40)], [0.05]) + np.array([0, 0, ground_m], np.float32)
+    street = make_map({(0, 0): make_tile(road, ground_m + 0.05)})
+    one, other = np.array([[3.15, 3.15, ground_m + 1.65]]), np.array([[9.15, 9.15, ground_m + 1.65]])
     mapper = Mapper(street, Settings())
     mapper._add([one_scan(street, one), one_scan(street, one), one_scan(street, other)])
     assert mapper._counts(np.concatenate([one, other]))[:, :2].tolist() == [[2, 1], [1, 2]]

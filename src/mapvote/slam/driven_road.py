@@ -5,7 +5,7 @@ sensor is taken from the points on the driven track, of which the road is the de
 states need not be known.
 
 The same road checks a prior's claim to a precise attitude, which guides every registration
-(:mod:`mapvote.slam.surveyor`). If that is pitched by a degree, the road ahead of each scan lies where no other scan has
+(:mod:`mapvote.slam.build`). If that is pitched by a degree, the road ahead of each scan lies where no other scan has
 it, and the ground is wrong. One scan shows the pitch: the road along the driven path runs parallel to that path. Roll
 does not show: a road's own crossfall is as large.
 """
