@@ -6,15 +6,16 @@ docs/decisions/house.md gives the reasons. There is no lower limit and no median
 from __future__ import annotations
 
 import ast
+import importlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src"
 SOURCES = sorted(SRC.rglob("*.py"))
-BENCHMARKS = ROOT / "benchmarks"
 COSTS = ROOT / "docs/measurements/kernels.md"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -27,8 +28,6 @@ MOST_FUNCTION_LINES = 60
 MOST_ARGUMENTS = 8
 MOST_NAMED_TWICE = 10
 """Public functions and classes with two meanings."""
-MOST_MODULES_NAMED_TWICE = 0
-"""Module names with two meanings."""
 
 
 def lines(source: Path) -> int:
@@ -68,23 +67,20 @@ def crowded(function: Function) -> bool:
     return arguments(function) > MOST_ARGUMENTS and not is_kernel(function) and not is_verb(function)
 
 
-def public_names(sources: list[Path]) -> dict[str, set[str]]:
+def named(sources: list[Path]) -> Iterator[tuple[str, Path]]:
     """Functions and classes that others may import, and where each is defined."""
-    found: dict[str, set[str]] = defaultdict(set)
     for source in sources:
         for node in parsed(source).body:
             if isinstance(node, Function | ast.ClassDef) and not node.name.startswith("_"):
-                found[node.name].add(str(source.relative_to(ROOT)))
-    return found
+                yield node.name, source
 
 
-def module_names(sources: list[Path]) -> dict[str, set[str]]:
-    """Module names, and where each is; two modules of one name cannot be told apart in a traceback."""
-    found: dict[str, set[str]] = defaultdict(set)
-    for source in sources:
-        if source.stem not in ("__init__", "__main__"):
-            found[source.stem].add(str(source.relative_to(ROOT)))
-    return found
+def twice(names: Iterable[tuple[str, Path]]) -> dict[str, set[Path]]:
+    """Names with two meanings, and where they are."""
+    found: dict[str, set[Path]] = defaultdict(set)
+    for name, source in names:
+        found[name].add(source.relative_to(ROOT))
+    return {name: places for name, places in found.items() if len(places) > 1}
 
 
 def too_long(function: Function) -> bool:
@@ -157,15 +153,11 @@ def test_every_kernel_has_a_line_that_says_what_numpy_costs_in_its_place() -> No
 
 def test_few_names_mean_two_things() -> None:
     """Verbs, routes and migrations apart: the command line and HTTP use the names of what they call."""
-    rooms = [
-        s
-        for s in SOURCES
-        if not ({"cli", "migrations"} & set(s.parts) or s.stem == "verbs" or s.stem.endswith("routes"))
-    ]
-    twice = {name: places for name, places in public_names(rooms).items() if len(places) > 1}
-    assert len(twice) <= MOST_NAMED_TWICE, twice
-    modules = {name: places for name, places in module_names(rooms).items() if len(places) > 1}
-    assert len(modules) <= MOST_MODULES_NAMED_TWICE, modules
+    apart = {s for s in SOURCES if {"cli", "migrations"} & set(s.parts)}
+    rooms = [s for s in SOURCES if s not in apart and s.stem != "verbs" and not s.stem.endswith("routes")]
+    assert len(twice(named(rooms))) <= MOST_NAMED_TWICE, twice(named(rooms))
+    # Two modules of one name cannot be told apart in a traceback.
+    assert twice((s.stem, s) for s in rooms if s.stem not in ("__init__", "__main__")) == {}
 
 
 def test_no_module_imports_itself_through_others() -> None:
@@ -187,42 +179,14 @@ def test_what_is_too_crowded_or_circular_is_found() -> None:
 
 def test_benchmarks_import_names_that_are_there() -> None:
     """Nobody runs them all: a name that moved would be noticed months later."""
-    roots = {
-        SRC: SOURCES,
-        ROOT / "tests": sorted((ROOT / "tests").glob("*.py")),
-        BENCHMARKS: sorted(BENCHMARKS.glob("*.py")),
-    }
-    modules = {
-        ".".join(s.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): s
-        for root, sources in roots.items()
-        for s in sources
-    }
-    lost = [
-        f"{source.name}:{node.lineno} {node.module}.{alias.name}"
-        for source in roots[BENCHMARKS]
-        for node in ast.walk(parsed(source))
-        if isinstance(node, ast.ImportFrom) and node.module in modules
-        for alias in node.names
-        if f"{node.module}.{alias.name}" not in modules and alias.name not in named_in(modules[node.module])
-    ]
+    ours, lost = {"mapvote", "mapvote_lab", *(source.stem for source in (ROOT / "tests").glob("*.py"))}, []
+    for source in sorted((ROOT / "benchmarks").glob("*.py")):
+        for node in ast.walk(parsed(source)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ours:
+                module = importlib.import_module(node.module)
+                names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                lost += [f"{source.name}: {name}" for name in names if not find_spec(f"{node.module}.{name}")]
     assert lost == []
-
-
-def named_in(source: Path) -> set[str]:
-    """What a module defines or imports at its top level, and what the table of a lazy package lists."""
-    found: set[str] = set()
-    for top in parsed(source).body:
-        if isinstance(top, Function | ast.ClassDef):
-            found.add(top.name)
-            continue
-        for node in ast.walk(top):
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-                found.add(node.id)
-            elif isinstance(node, ast.Import | ast.ImportFrom):
-                found |= {alias.asname or alias.name for alias in node.names}
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.add(node.value)
-    return found
 
 
 def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:

@@ -8,16 +8,12 @@ import pytest
 import mapvote
 
 
-def test_every_public_name_is_there() -> None:
-    for name in mapvote.__all__:
-        assert getattr(mapvote, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
-        mapvote.no_such_name  # noqa: B018
-
-
-def test_dir_lists_the_public_names_and_nothing_else() -> None:
+def test_every_public_name_is_there_and_dir_lists_nothing_else() -> None:
+    assert all(getattr(mapvote, name) is not None for name in mapvote.__all__)
     assert dir(mapvote) == sorted(mapvote.__all__)
     assert {"build_map", "vote_drive", "update_map", "map_from_points"} <= set(dir(mapvote))
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        mapvote.no_such_name  # noqa: B018
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
