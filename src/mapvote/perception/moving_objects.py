@@ -339,9 +339,7 @@ class MovingFilter:
         side = 2 * half + 1
         shares = SHARE_WHOLE, SHARE_PART
         moves = moving_components(rows * side + cols, side, total >= MIN_FREE, brief, MIN_VOXELS, *shares)
-        out = np.empty(len(scan.voxel_of), dtype=np.bool_)
-        _gather(moves, scan.voxel_of, out)
-        return out
+        return np.append(moves, False)[scan.voxel_of]  # -1: points that cannot be moving
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.
@@ -383,14 +381,6 @@ def _scatter(chosen: I32, of: I32, voxel_of: I32) -> None:
         voxel_of[i] = -1
     for k in range(np.uint64(0), np.uint64(len(of))):
         voxel_of[chosen[k]] = of[k]
-
-
-@kernel
-def _gather(moves: Bool, voxel_of: I32, out: Bool) -> None:
-    """Into ``out`` (n,) what each point's voxel does, of ``moves`` (m,); points without one stay."""
-    for i in range(np.uint64(0), np.uint64(len(voxel_of))):
-        k = voxel_of[i]
-        out[i] = k >= 0 and moves[k]
 
 
 def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, F64]:
