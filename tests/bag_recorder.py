@@ -12,8 +12,10 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from mapvote.core.types import F64
+from mapvote.live.messages import CLOUD as CLOUD
+from mapvote.live.messages import TF
+from mapvote.live.play import frames_message
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
 START = 1_700_000_000 * 10**9
 """When the first message comes, nanoseconds."""
 
@@ -34,9 +36,12 @@ class Recorder:
         )
 
     def write(self, topic: str, kind: str, ns: int, message: Any) -> None:
+        self.write_raw(topic, kind, ns, self.store.serialize_cdr(message, kind))
+
+    def write_raw(self, topic: str, kind: str, ns: int, data: bytes | memoryview) -> None:
         if topic not in self.topics:
             self.topics[topic] = self.bag.add_connection(topic, kind, typestore=self.store)
-        self.bag.write(self.topics[topic], ns, self.store.serialize_cdr(message, kind))
+        self.bag.write(self.topics[topic], ns, data)
 
     def cloud(self, topic: str, frame: str, ns: int, points: NDArray[np.floating]) -> None:
         rows = np.ascontiguousarray(points, dtype="<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
@@ -61,10 +66,4 @@ class Recorder:
         self.write(topic, kind, received_ns, self.types[kind](self.header(ns, "map"), pose))
 
     def static(self, frames: dict[str, F64]) -> None:
-        g = "geometry_msgs/msg/"
-        transforms = []
-        for child, T in frames.items():
-            q = self.types[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
-            transform = self.types[g + "Transform"](self.types[g + "Vector3"](*T[:3, 3].tolist()), q)
-            transforms.append(self.types[g + "TransformStamped"](self.header(START, "base_link"), child, transform))
-        self.write("/tf_static", "tf2_msgs/msg/TFMessage", START, self.types["tf2_msgs/msg/TFMessage"](transforms))
+        self.write_raw("/tf_static", TF, START, frames_message(START, frames))

@@ -8,17 +8,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from bag_recorder import START, Recorder
 from command_line import type_in
 from mapvote.codec.ballot import encode
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64
+from mapvote.core.types import F64, Scan
 from mapvote.formats import open_drive, read_map, write_map
+from mapvote.live.messages import BASE_FRAME, CLOUD, ODOMETRY
+from mapvote.live.play import cloud_message, odometry_message
 from mapvote.vehicle import Cuts, Vehicle
 from streets import path, street, sweep, twist_of, vote_in_stretches
 
@@ -33,21 +33,12 @@ def record(
     odometry: str = "/odometry",
 ) -> None:
     """A drive through ``world``, of which each scan measures other points."""
-    recorder = Recorder(bag)
-    poses, t = path(SCANS), recorder.types
-    g, kind = "geometry_msgs/msg/", "nav_msgs/msg/Odometry"
+    recorder, poses = Recorder(bag), path(SCANS)
     for i, T in enumerate(poses):
         ns = START + i * 100_000_000
         scan = sweep(world(i), T, twist_of(poses, i), ns)
-        pose = t[g + "Pose"](
-            t[g + "Point"](*T[:3, 3].tolist()),
-            t[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
-        )
-        zero, none = t[g + "Vector3"](0.0, 0.0, 0.0), np.zeros(36)
-        twist = t[g + "TwistWithCovariance"](t[g + "Twist"](zero, zero), none)
-        message = t[kind](recorder.header(ns, "map"), "lidar", t[g + "PoseWithCovariance"](pose, none), twist)
-        recorder.write(odometry, kind, ns, message)
-        recorder.cloud(points, "lidar", ns, scan.points)
+        recorder.write_raw(odometry, ODOMETRY, ns, odometry_message(ns, T))
+        recorder.write_raw(points, CLOUD, ns, cloud_message(Scan(ns, scan.points), BASE_FRAME))
     recorder.bag.close()
 
 

@@ -1,10 +1,11 @@
-"""The ROS 2 node in place of Autoware's map loader, with stand-ins for rclpy and the messages: no ROS is here."""
+"""The ROS 2 node in place of Autoware's map loader, with a stand-in for rclpy: no ROS is here."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -14,23 +15,9 @@ import pytest
 import yaml
 
 from live.test_map_loader import lay, points
+from mapvote.live.messages import blank_message, header_of
 
 PACKAGE = Path(__file__).parents[2] / "examples/autoware_map_loader"
-
-
-def message(**members: Any) -> Any:
-    """A class of messages whose members begin so; a callable makes each message its own."""
-
-    class Message(SimpleNamespace):
-        def __init__(self, **given: Any) -> None:
-            super().__init__(**({k: v() if callable(v) else v for k, v in members.items()} | given))
-
-    return Message
-
-
-Header = message(frame_id="", stamp=None)
-Square = message(min_x=0.0, min_y=0.0, max_x=0.0, max_y=0.0)
-Cloud = message(header=Header, height=0, width=0, fields=list, point_step=0, row_step=0, data=None, is_dense=False)
 
 
 class Node:
@@ -60,9 +47,10 @@ class Node:
 
 @pytest.fixture
 def module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    cells = {"PointCloudMapCellMetaDataWithID": message(cell_id="", metadata=Square)}
-    cells["PointCloudMapCellWithID"] = message(cell_id="", metadata=Square, pointcloud=Cloud)
-    cells["PointCloudMapMetaData"] = message(header=Header, metadata_list=list)
+    cells = {
+        f"PointCloudMap{name}": partial(blank_message, f"autoware_map_msgs/msg/PointCloudMap{name}")
+        for name in ("CellMetaDataWithID", "CellWithID", "MetaData")
+    }
     services = ("GetDifferentialPointCloudMap", "GetPartialPointCloudMap", "GetSelectedPointCloudMap")
     stand_ins: dict[str, dict[str, Any]] = {
         "rclpy": {},
@@ -70,8 +58,8 @@ def module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "rclpy.qos": {"QoSProfile": dict, "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1)},
         "autoware_map_msgs.msg": cells,
         "autoware_map_msgs.srv": dict.fromkeys(services),
-        "sensor_msgs.msg": {"PointField": message()},
-        "tier4_external_api_msgs.msg": {"MapHash": message(pcd="", lanelet="")},
+        "sensor_msgs.msg": {"PointField": partial(blank_message, "sensor_msgs/msg/PointField")},
+        "tier4_external_api_msgs.msg": {"MapHash": partial(blank_message, "tier4_external_api_msgs/msg/MapHash")},
     }
     for name, members in stand_ins.items():
         made = ModuleType(name)
@@ -92,7 +80,7 @@ def test_the_node_answers_from_the_folder_and_says_which_map_it_is(module: Modul
     node = module.MapvoteMapLoader()
     answer = node.services["~/service/get_differential_pcd_map"]
     area = SimpleNamespace(center_x=5.0, center_y=5.0, radius=1.0)
-    response = SimpleNamespace(header=Header(), new_pointcloud_with_ids=[], ids_to_remove=[])
+    response = SimpleNamespace(header=header_of(0, ""), new_pointcloud_with_ids=[], ids_to_remove=[])
     answer(SimpleNamespace(area=area, cached_ids=["old"]), response)
     (cell,) = response.new_pointcloud_with_ids
     assert (response.ids_to_remove, response.header.frame_id) == (["old"], "map")
