@@ -76,7 +76,7 @@ def preview(
     executor: Executor | None = None,
 ) -> Outcome:
     """The result of :func:`publish` if it ran now. Nothing is written."""
-    return _outcome(store, _round(store, store.clock(), settings, parent, executor), gate)
+    return _outcome(store, store.clock(), settings, parent, gate, executor)[1]
 
 
 def publish(
@@ -98,8 +98,7 @@ def publish(
     drive and there is no ``gate``.
     """
     now = store.clock()
-    found = _round(store, now, settings, parent, executor)
-    outcome = _outcome(store, found, gate)
+    found, outcome = _outcome(store, now, settings, parent, gate, executor)
     damaged = [damage for one in outcome.fused for damage in one.damaged]
     copies = {str(copy) for one in outcome.fused for copy in one.copies}
     if damaged or copies:
@@ -115,36 +114,31 @@ def publish(
     if outcome.held and not override:
         raise Held(list(outcome.held))
     why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
-    number = _commit(store, found, now, by, why)
+    newest, made_by = found.newest.number, policy.model_dump(mode="json")
+    version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
+    tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
+    write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused)
     if policy.keep.automatic:
         clear(store, by=by, dry_run=False)
-    return replace(outcome, version=number, published=True)
+    return replace(outcome, version=version.number, published=True)
 
 
-def _round(
-    store: Store, now: int, settings: FuseSettings | None, parent: int | None, executor: Executor | None
-) -> Round:
+def _outcome(
+    store: Store,
+    now: int,
+    settings: FuseSettings | None,
+    parent: int | None,
+    gate: Gate | None,
+    executor: Executor | None,
+) -> tuple[Round, Outcome]:
+    """The round, and what a publish of it would be."""
     found = round_at(store, now, settings, executor)
-    if parent is not None and parent != found.newest.number:
-        raise Conflict(f"the newest version is {found.newest.number}, not {parent}: look at it, then publish")
-    return found
-
-
-def _outcome(store: Store, found: Round, gate: Gate | None) -> Outcome:
-    changed, held = found.changed, reasons_to_hold(store, found, gate)
+    newest, changed = found.newest.number, found.changed
+    if parent is not None and parent != newest:
+        raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
+    held, fused = reasons_to_hold(store, found, gate), list(found.decided.values())
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
-    fused = list(found.decided.values())
-    return Outcome(found.newest.number, False, [f.index for f in changed], added, deleted, held, fused)
-
-
-def _commit(store: Store, found: Round, now: int, by: str, why: str) -> int:
-    """Write the version; its number."""
-    newest, made_by = found.newest.number, found.asked.policy.model_dump(mode="json")
-    version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
-    fused = list(found.decided.values())
-    tiles = {f.index: f.hashes for f in fused if f.hashes is not None}
-    write_version(store, version, NewTiles(tiles, [f.planes for f in fused], fused))
-    return version.number
+    return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused)
 
 
 def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:
@@ -155,42 +149,40 @@ def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: 
         log_event(connection, now, "copy", by, copy)
 
 
-@dataclass(frozen=True, slots=True)
-class NewTiles:
-    """The tiles that a version sets, and all planes that the store may not hold yet."""
+def write_version(
+    store: Store,
+    version: Version,
+    tiles: Mapping[TileIndex, TileHashes],
+    planes: Iterable[Mapping[str, bytes]],
+    decided: Iterable[Fused] = (),
+    unvoted: str | None = None,
+) -> Version:
+    """Publish a version that sets ``tiles``, one without points where it has none; Conflict if its parent is the newest
+    no more.
 
-    tiles: Mapping[TileIndex, TileHashes]
-    """A tile without points is one that the version does not have."""
-    planes: Sequence[Mapping[str, bytes]]
-    fused: Sequence[Fused] = field(default=(), repr=False)
-    """All decided tiles, also those that do not change."""
-
-
-def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | None = None) -> Version:
-    """Publish a version; Conflict if its parent is the newest no more. ``unvoted``: this vehicle's votes are gone."""
+    ``planes``: all that the store may not hold yet. ``decided``: tiles that do not change too. ``unvoted``: this
+    vehicle's votes are gone.
+    """
+    late = Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
     try:
         with store.database.writing() as connection:
             if current_number(connection) != version.parent:
-                raise Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
+                raise late
             if version.target is not None:
                 version_of(connection, version.target)
             seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
             if version.kind != "publish":
                 version = replace(version, mark=seq)
             connection.execute(schema.versions.insert().values(**asdict(version)))
-            add_blobs(connection, {digest: data for some in new.planes for digest, data in some.items()})
-            set_tiles(connection, version.number, new.tiles)
-            rows = [
-                _decision_row(version.number, fused, fused.record) for fused in new.fused if fused.record is not None
-            ]
+            add_blobs(connection, {digest: data for some in planes for digest, data in some.items()})
+            set_tiles(connection, version.number, tiles)
+            rows = [_decision_row(version.number, one, one.record) for one in decided if one.record is not None]
             if rows:
                 insert_rows(connection, schema.decisions, rows)
             if unvoted is not None:
                 end_votes(connection, unvoted, seq)
     except IntegrityError as error:
-        raise Conflict(
-            f"version {version.number} was published by somebody else meanwhile; look at it first"
-        ) from error
+        raise late from error
     return version
 
 

@@ -28,7 +28,7 @@ from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Task, fuse_round
-from mapvote.server.store.publish import NewTiles, Outcome, write_version
+from mapvote.server.store.publish import Outcome, write_version
 from mapvote.server.store.queries import (
     Version,
     load_tile,
@@ -64,7 +64,7 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
                 planes.append(plane)
     policy = dict(target.policy)
     version = Version(number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, policy)
-    return write_version(store, version, NewTiles(tiles, planes))
+    return write_version(store, version, tiles, planes)
 
 
 def turned_back(version: int, now: Tile, then: Tile) -> Memory:
@@ -73,14 +73,19 @@ def turned_back(version: int, now: Tile, then: Tile) -> Memory:
     return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
 
 
+class _Content(NamedTuple):
+    """A tile of a state: what it holds, and whether the map has it; else it holds memory only."""
+
+    tile: Tile
+    there: bool
+
+
 @dataclass(frozen=True, slots=True)
 class _State:
     """A map under way: a published version, with some tiles changed."""
 
     root: int
-    edited: Mapping[TileIndex, Tile] = field(default_factory=dict)
-    absent: frozenset[TileIndex] = frozenset()
-    """Edited tiles that the map does not have: they hold memory only."""
+    edited: Mapping[TileIndex, _Content] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -134,7 +139,7 @@ def replay(
     why = f"as if {vehicle} had never voted, from version {start} on"
     policy = {"unvoted": vehicle}
     version = Version(number, newest.number, "replay", start, store.clock(), by, why, mark, policy)
-    write_version(store, version, NewTiles(tiles, planes), unvoted=vehicle)
+    write_version(store, version, tiles, planes, unvoted=vehicle)
     return Outcome(number, True, sorted(tiles), added, deleted, [])
 
 
@@ -156,12 +161,12 @@ def _again(store: Store, version: Version, history: _History, executor: Executor
 
 
 def _turned_back(store: Store, number: int, before: _State, target: _State) -> _State:
-    edited, absent = dict(before.edited), set(before.absent)
+    edited = dict(before.edited)
     for index, now, then in _pairs(store, before, target):
         if now.there != then.there or pack_tile(now.tile)[0] != pack_tile(then.tile)[0]:
-            edited[index] = replace(then.tile, memory=turned_back(number, now.tile, then.tile))
-            absent = absent - {index} if then.there else absent | {index}
-    return _State(before.root, edited, frozenset(absent))
+            tile = replace(then.tile, memory=turned_back(number, now.tile, then.tile))
+            edited[index] = _Content(tile, then.there)
+    return _State(before.root, edited)
 
 
 def _fused(store: Store, version: Version, before: _State, history: _History, executor: Executor | None) -> _State:
@@ -170,19 +175,11 @@ def _fused(store: Store, version: Version, before: _State, history: _History, ex
     with store.database.reading() as connection:
         asked = Electorate.of(version, without, ballots_aside(connection))
         for index in standing_tiles(connection, version.mark):
-            tile = _content(store, connection, before, index, tile_of(connection, before.root, index)).tile
-            misread = history.misread.get(index, {})
+            tile, misread = _content(store, connection, before, index).tile, history.misread.get(index, {})
             tasks.append(Task(url, tile.window, version.number, tile, asked, misread))
     fused = fuse_round(tasks, store.database, executor)
-    edited = {f.index: f.tile for f in fused if f.hashes and f.tile is not None}
-    return _State(before.root, dict(before.edited) | edited, before.absent - edited.keys())
-
-
-class _Content(NamedTuple):
-    """A tile of a state: what it holds, and whether the map has it."""
-
-    tile: Tile
-    there: bool
+    edited = {f.index: _Content(f.tile, True) for f in fused if f.hashes and f.tile is not None}
+    return _State(before.root, {**before.edited, **edited})
 
 
 def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, _Content, _Content]]:
@@ -191,14 +188,11 @@ def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, _Con
         old, new = tiles_of(connection, a.root), tiles_of(connection, b.root)
         candidates = {i for i in old.keys() | new.keys() if old.get(i) != new.get(i)} | set(a.edited) | set(b.edited)
         for index in sorted(candidates):
-            ours = _content(store, connection, a, index, old.get(index))
-            yield index, ours, _content(store, connection, b, index, new.get(index))
+            yield index, _content(store, connection, a, index), _content(store, connection, b, index)
 
 
-def _content(
-    store: Store, connection: sa.Connection, state: _State, index: TileIndex, hashes: TileHashes | None
-) -> _Content:
-    """A tile of a state, whose root has it as ``hashes``."""
+def _content(store: Store, connection: sa.Connection, state: _State, index: TileIndex) -> _Content:
     if index in state.edited:
-        return _Content(state.edited[index], index not in state.absent)
-    return _Content(tile_as_of(connection, store.lattice.tile(index), state.root), hashes is not None)
+        return state.edited[index]
+    there = tile_of(connection, state.root, index) is not None
+    return _Content(tile_as_of(connection, store.lattice.tile(index), state.root), there)
