@@ -10,9 +10,11 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 FLAGS = (
     "--headless=new",
@@ -35,6 +37,16 @@ def program() -> str | None:
     """Path of Chromium or Chrome, None if neither is installed."""
     names = ("chromium", "chromium-browser", "google-chrome")
     return next((found for name in names if (found := shutil.which(name))), None)
+
+
+@contextlib.contextmanager
+def browsing(webgl: bool = False) -> Iterator[Chromium]:
+    """A browser for the tests of a module, which skip where none is installed."""
+    if program() is None:
+        pytest.skip("Chromium is not installed: apt-get install chromium")
+    found = Chromium(webgl=webgl)
+    yield found
+    found.close()
 
 
 class Chromium:
@@ -117,6 +129,11 @@ class Chromium:
                 raise TimeoutError(f"never true: {script}\nerrors: {self.errors}\npage: {page}")
             time.sleep(0.02)
         return value
+
+    def text(self, selector: str) -> str:
+        """What the first element of a selector shows."""
+        found: str = self.run(f"document.querySelector({selector!r}).innerText")
+        return found
 
     def click(self, x: float, y: float) -> None:
         """A real click at a place of the window, in pixels."""

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from hand_made import Cell, Say, states_plane
+from collections.abc import Callable, Iterable
+
+from hand_made import Cell, Say, make_ballot, states_plane
 from mapvote.codec.ballot import Ballot, encode
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import I8, NO_VOTE, CellState, MapvoteError
 from mapvote.server.store.admission import Intake, Receipt, examine
 from mapvote.server.store.store import Store
 
+NewStore = Callable[..., Store]
+"""See conftest.py."""
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 """The cells of the wall in each tile of :func:`hand_made.two_walls`."""
 
@@ -25,3 +30,16 @@ def send(store: Store | Intake, *ballots: Ballot) -> list[Receipt]:
 def wall_gone(fill: int = NO_VOTE, odds: I8 | None = None) -> Say:
     """The wall is not there any more; ``fill``: the state of all other cells."""
     return Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill), odds=odds)
+
+
+def vote_gone(
+    store: Store,
+    vehicles: Iterable[str] = "ab",
+    drive: str = "d1",
+    tiles: Iterable[TileIndex] = ((0, 0),),
+    fill: int = NO_VOTE,
+    odds: I8 | None = None,
+) -> None:
+    """These vehicles say on the newest map that the walls of these tiles are gone."""
+    base, says = store.point_map(), dict.fromkeys(tiles, wall_gone(fill, odds))
+    send(store, *[make_ballot(base, says, name, drive, end_ns=store.clock()) for name in vehicles])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import is_dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,7 @@ from mapvote.server.http.security import Probe
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from stores import WALL, send
+from stores import WALL, NewStore, send
 
 ASKED: list[tuple[str, str, str, Any]] = [
     ("GET", "/healthz", "", None),
@@ -81,16 +79,15 @@ def ballot(store: Store, vehicle: str, drive: str, gone: list[tuple[int, int]], 
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
+def store(new_store: NewStore) -> Store:
     """A store where one wall went in version 2, and another would go with the next."""
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1)))
+    store = new_store(two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1)))
     for number, tile in ((1, (0, 0)), (2, (0, 1))):
         for vehicle in "ab":
             send(store, ballot(store, vehicle, f"d{number}", WALL, tile))
         if number == 1:
             publish(store)
-    yield store
-    store.close()
+    return store
 
 
 def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:

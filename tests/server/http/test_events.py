@@ -1,4 +1,5 @@
-"""Events as they happen, on a real server: by stream and by webhook."""
+"""Events as they happen: by stream and by webhook. Listeners share one poll of the database, and each hears every event
+once and in order."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import httpx2
 import pytest
@@ -28,6 +29,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import Event, Feed, newest_event, without_names
+from stores import NewStore
 
 if TYPE_CHECKING:
     from mapvote.server.http.services import Services
@@ -37,9 +39,14 @@ Posts = queue.Queue[tuple[dict[str, str], bytes]]
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Path:
-    Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls()).close()
-    return tmp_path / "store.db"
+def store(new_store: NewStore) -> Store:
+    return new_store()
+
+
+def log(store: Store, *details: str) -> list[int]:
+    """Numbers of new events of a store."""
+    with store.database.writing() as connection:
+        return [log_event(connection, store.clock(), "publish", "boss", detail) for detail in details]
 
 
 def vote(url: str, home: Path) -> None:
@@ -49,8 +56,8 @@ def vote(url: str, home: Path) -> None:
         client.send(make_ballot(two_walls(), says, "v1"))
 
 
-def test_a_ballot_is_told_to_who_listens_and_again_to_who_comes_back(store: Path, tmp_path: Path) -> None:
-    with serving_here(store, log=tmp_path / "log") as url, httpx2.Client(timeout=20.0) as http:
+def test_a_ballot_is_told_to_who_listens_and_again_to_who_comes_back(store: Store, tmp_path: Path) -> None:
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url, httpx2.Client(timeout=20.0) as http:
         with http.stream("GET", f"{url}/v1/events") as answer:
             lines = answer.iter_lines()
             assert next(lines) == ": listening"
@@ -91,11 +98,11 @@ def receiver() -> Iterator[tuple[str, Posts]]:
 
 @pytest.mark.slow
 def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
-    store: Path, tmp_path: Path, receiver: tuple[str, Posts]
+    store: Store, tmp_path: Path, receiver: tuple[str, Posts]
 ) -> None:
     config = tmp_path / "mapvote.toml"
     config.write_text(f'[server]\nwebhook_url = "{receiver[0]}"\nwebhook_secret = "{SECRET}"\n')
-    with serving(store, "--open", "--config", config, log=tmp_path / "log") as (url, _):
+    with serving(tmp_path / "s.db", "--open", "--config", config, log=tmp_path / "log") as (url, _):
         vote(url, tmp_path / "home")
         headers, body = receiver[1].get(timeout=30)
     told = Webhook(SECRET).verify(body, headers)
@@ -112,8 +119,7 @@ def test_an_address_without_a_secret_and_a_secret_of_another_form_are_refused() 
         ServerSettings(webhook_secret="a secret of both")
 
 
-def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path, receiver: tuple[str, Posts]) -> None:
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(store: Store, receiver: tuple[str, Posts]) -> None:
     settings = SimpleNamespace(server=ServerSettings(webhook_url=receiver[0], webhook_secret=SECRET))
     parts = cast("Services", SimpleNamespace(store=store, settings=settings, fetching=None, feed=Feed(store, 0.0)))
 
@@ -133,17 +139,11 @@ def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path,
         with store.database.reading() as connection:
             return list(connection.execute(sa.select(schema.deliveries.c.seq)).scalars())
 
-    def happens(what: str) -> None:
-        with store.database.writing() as connection:
-            log_event(connection, 5, "test", "", what)
-
     assert asyncio.run(listen(0)) == []
-    happens("one")
+    log(store, "one")
     assert asyncio.run(listen(1)) == ["one"]
-    happens("two")
-    happens("three")
+    log(store, "two", "three")
     assert asyncio.run(listen(1)) == ["two", "three"]
-    store.close()
 
 
 def test_no_name_can_begin_another_event() -> None:
@@ -156,3 +156,45 @@ def test_readers_hear_what_happened_to_the_map_but_not_who_drove_by_or_when() ->
     published, judged = Event(2, 6, "publish", "boss", "v2", 2), Event(3, 7, "rejected", "eve", "built.v2.1.1", 2)
     events = [Event(1, 5, "ballot", "v1", "d1", 1), published, judged, Event(4, 8, "withdraw", "v1", "v1/d1", 2)]
     assert without_names(events) == [published, Event(3, 7, "rejected", "", "", 2)]
+
+
+def test_twenty_listeners_cost_one_poll_a_second(store: Store) -> None:
+    listeners, seconds = 20, 30
+    now, statements = [0.0], [0]
+    feed = Feed(store, seconds=lambda: now[0])
+    start = newest_event(store)
+    at, heard = [start] * listeners, [list[str]() for _ in range(listeners)]
+
+    def asked(*_: Any) -> None:
+        statements[0] += 1
+
+    for second in range(seconds):
+        if second % 10 == 5:
+            log(store, f"e{second}")
+        sa.event.listen(store.database.engine, "before_cursor_execute", asked)
+        for i in range(listeners):
+            now[0] = second + i / listeners
+            for event in feed.after(at[i]):
+                heard[i].append(event.detail)
+                at[i] = event.seq
+        sa.event.remove(store.database.engine, "before_cursor_execute", asked)
+    now[0] += 1.0
+    for i in range(listeners):
+        heard[i] += [event.detail for event in feed.after(at[i])]
+    assert heard == [["e5", "e15", "e25"]] * listeners
+    assert statements[0] <= 3 * (seconds / 0.9 + 1), "begin, events, and the version where there are any"
+
+
+def test_who_comes_back_after_long_reads_the_log_and_misses_nothing(store: Store) -> None:
+    now = [0.0]
+    feed = Feed(store, seconds=lambda: now[0])
+    feed.after(newest_event(store))
+    told = log(store, *[f"e{i}" for i in range(600)])
+    for _ in range(3):
+        now[0] += 1.0
+        feed.after(told[-1])
+    seq, heard = told[0] - 1, list[int]()
+    while found := feed.after(seq):
+        heard += [event.seq for event in found]
+        seq = heard[-1]
+    assert heard == told

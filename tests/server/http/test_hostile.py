@@ -111,11 +111,8 @@ def refusal_of(data: bytes) -> str | None:
     return None
 
 
-def test_an_honest_ballot_is_read() -> None:
-    assert refusal_of(honest()) is None
-
-
 def test_500_mutants_end_in_a_ballot_or_a_refusal() -> None:
+    assert refusal_of(honest()) is None
     answers = [refusal_of(data) for data in mutants(honest(), 500)]
     refusals = [answer for answer in answers if answer is not None]
     assert 250 < len(refusals) < 500, "most are refused; a plane of the future and a harmless flip are not"
@@ -184,13 +181,6 @@ def test_a_body_without_an_announced_length_is_cut_off_too(site: Site) -> None:
     except httpx2.TransportError:
         return  # cut off while still sending
     assert answer.status_code == 413
-
-
-def test_another_vehicles_ballots_cannot_be_touched(site: Site) -> None:
-    assert site.put(changed(vehicle="v2"), "/v1/ballots/v2/d1").status_code == 403
-    assert site.http.request("DELETE", "/v1/ballots/v2/d1").status_code == 403
-    assert site.http.request("POST", "/v1/publish", json={}).status_code == 403
-    assert site.http.request("POST", "/v1/rollback", json={"to": 1}).status_code == 403
 
 
 PATHS = ("ballots/../../etc/passwd", "ballots/v1/%2e%2e", "ballots/v1/a%00b", "tiles/..%2f..", "map/versions/%2e%2e")

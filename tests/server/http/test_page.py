@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from chromium import Chromium, program
+from chromium import Chromium, browsing
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.codec.ballot import pack_path
@@ -63,11 +63,8 @@ def village(database: str) -> None:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Chromium]:
-    if program() is None:
-        pytest.skip("Chromium is not installed: apt-get install chromium")
-    found = Chromium(webgl=True)
-    yield found
-    found.close()
+    with browsing(webgl=True) as found:
+        yield found
 
 
 def press(browser: Chromium, key: str) -> None:
@@ -88,11 +85,6 @@ def enter(browser: Chromium, chosen: str) -> None:
     press(browser, "Enter")
 
 
-def text(browser: Chromium, selector: str) -> str:
-    found: str = browser.run(f"document.querySelector({selector!r}).innerText")
-    return found
-
-
 def ready(browser: Chromium, url: str) -> None:
     browser.open(url)
     browser.wait("performance.getEntriesByName('all-in-view').length", 60)
@@ -103,8 +95,8 @@ def ready(browser: Chromium, url: str) -> None:
 def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: Path, tmp_path: Path) -> None:
     with serving(store, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
-        assert "0 built" in text(browser, "#tally")
-        assert text(browser, "#labels").startswith("× demolished 4 m")
+        assert "0 built" in browser.text("#tally")
+        assert browser.text("#labels").startswith("× demolished 4 m")
         colours = """(() => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
             p.width = c.width; p.height = c.height; const g = p.getContext('2d'); g.drawImage(c, 0, 0);
             const d = g.getImageData(0, 0, p.width, p.height).data, seen = new Set();
@@ -128,10 +120,10 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             assert browser.run("document.querySelector('#slice-text').textContent") == told
         enter(browser, "document.querySelector('#measure')")
         for x, y in ((420, 420), (520, 440)):
-            told = text(browser, "#measured-text")
+            told = browser.text("#measured-text")
             browser.click(x, y)
             browser.wait(f"document.querySelector('#measured-text').innerText !== {told!r}")
-        assert " m (level " in text(browser, "#measured-text")
+        assert " m (level " in browser.text("#measured-text")
         enter(browser, "document.querySelector('#measure')")
         before = browser.run(f"{PIXELS}('#c26a00')")
         browser.run("document.querySelector('#paths').click()")
@@ -144,8 +136,8 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         browser.run("document.querySelector('#changes button').click()")
         browser.wait("location.hash.includes('change=demolished.v2')")
         browser.wait("location.hash.includes('eye=')")
-        assert "mean of its cells" in text(browser, "#details")
-        assert "<script>alert(1)</script>" in text(browser, "#versions"), "text stays text"
+        assert "mean of its cells" in browser.text("#details")
+        assert "<script>alert(1)</script>" in browser.text("#versions"), "text stays text"
         shared = browser.run("location.href").replace("compare=", "was=") + "&compare=swipe&swipe=30"
         asked = list(browser.requests)
         assert browser.errors == []
@@ -164,7 +156,7 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
     with serving(database_url, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
         enter(browser, "document.querySelector('#pending button')")
-        assert text(browser, "#labels").startswith("pending: ×")
+        assert browser.text("#labels").startswith("pending: ×")
         marked = f"{PIXELS}('#2f62c4')"
         browser.wait(f"{marked} > 100")  # the points that would go are blue crosses
         browser.wait("document.querySelectorAll('#pending-sides button').length === 3")
@@ -204,7 +196,7 @@ def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, sto
             f"fetch('v1/desk/reviews', {json.dumps(told)}).then(() => document.querySelector('#rejected').click())"
         )
         browser.wait("document.querySelector('#desk-said').innerText")
-        assert "operator" in text(browser, "#desk-said")
+        assert "operator" in browser.text("#desk-said")
         browser.wait("document.querySelector('#pending').innerText.includes('accepted by operator')")
 
 
@@ -265,7 +257,7 @@ def test_a_change_in_a_file_of_its_own_can_be_looked_at_offline(browser: Chromiu
     page.write_text(whole_page("</title><script>alert(1)</script>", cutouts))
     browser.open(page.as_uri())
     browser.wait("document.querySelectorAll('.row button').length === 4")
-    assert text(browser, "h1") == "</title><script>alert(1)</script>"
+    assert browser.text("h1") == "</title><script>alert(1)</script>"
     browser.run("document.querySelectorAll('.row button')[2].click()")
     assert browser.run("document.querySelectorAll('.row button')[2].getAttribute('aria-pressed')") == "true"
     assert not [u for u in browser.requests if u.startswith("http")]

@@ -4,7 +4,6 @@ command line uses on a store."""
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +14,17 @@ import pytest
 from fastapi.testclient import TestClient
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from live_server import mapvote, serving
+from live_server import serving
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings, ServerSettings, Settings
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import CellState, MapvoteError
+from mapvote.core.types import CellState
 from mapvote.server.http.app import URL, create_app, in_process
 from mapvote.server.store import keys
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from stores import send
+from stores import NewStore, send
 
 CELL = (10, 10)
 OPERATES: list[tuple[str, str, object]] = [
@@ -51,7 +50,7 @@ class Site(NamedTuple):
     operator: str
     a: str
     b: str
-    store: Path
+    store: Store
     log: Path
 
     def ask(self, method: str, path: str, key: str | None, **more: object) -> httpx2.Response:
@@ -63,14 +62,11 @@ class Site(NamedTuple):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     home = tmp_path_factory.mktemp("site")
     store = Store.create(f"sqlite:///{home / 'store.db'}", two_walls())
-    operator, a, b = (
-        keys.issue(store, "boss", "operator"),
-        keys.issue(store, "a", "vehicle"),
-        keys.issue(store, "b", "vehicle"),
-    )
-    store.close()
+    operator = keys.issue(store, "boss", "operator")
+    a, b = (keys.issue(store, name, "vehicle") for name in "ab")
     with serving(home / "store.db", log=home / "log") as (url, _):
-        yield Site(url, operator, a, b, home / "store.db", home / "log")
+        yield Site(url, operator, a, b, store, home / "log")
+    store.close()
 
 
 def says(point_map: PointMap, vehicle: str, drive: str = "d1", state: int = CellState.CHANGED_EMPTY) -> Ballot:
@@ -163,9 +159,9 @@ def test_tiles_are_immutable_and_cacheable(site: Site) -> None:
     assert httpx2.get(f"{site.url}/v1/tiles/{digest}", headers=headers, timeout=300.0).status_code == 304
 
 
-def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path) -> None:
+def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(new_store: NewStore, tmp_path: Path) -> None:
     """Also when another process publishes it."""
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    store = new_store()
     elsewhere = Store.open(f"sqlite:///{tmp_path / 's.db'}")
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as http:
         first = http.get("/v1/map")
@@ -180,7 +176,6 @@ def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path)
         assert list(http.get("/v1/map?since=1").json()["tiles"]) == ["0,0"]
         assert http.get("/v1/map/versions/1", headers=known).status_code == 304
     elsewhere.close()
-    store.close()
 
 
 def test_metrics_and_logs_hold_no_secret(site: Site) -> None:
@@ -194,29 +189,14 @@ def test_metrics_and_logs_hold_no_secret(site: Site) -> None:
 
 
 def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
-    issued = subprocess.run(mapvote("keys", site.store, "issue", "c"), capture_output=True, text=True, check=True)
-    key = issued.stdout.strip()
+    key = keys.issue(site.store, "c", "vehicle")
     assert site.ask("GET", "/v1/map", key).status_code == 200
     newest = replace(two_walls(), version=site.ask("GET", "/v1/map", key).json()["version"])
     ballots = [encode(says(newest, "c", drive, CellState.UNCHANGED_OCCUPIED)) for drive in ("d1", "d2")]
     assert site.ask("PUT", "/v1/ballots/c/d1", key, content=ballots[0]).status_code == 201
-    subprocess.run(mapvote("keys", site.store, "revoke", "c"), capture_output=True, check=True)
+    keys.revoke(site.store, "c")
     assert site.ask("PUT", "/v1/ballots/c/d2", key, content=ballots[1]).status_code == 401
     assert site.ask("GET", "/v1/map", key).status_code == 401
-
-
-def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None:
-    newest = replace(two_walls(), version=site.ask("GET", "/v1/map", site.a).json()["version"])
-    ballot = says(newest, "a", "spooled", CellState.UNCHANGED_OCCUPIED)
-    shut_out = MapClient(site.url, key="of nobody", home=tmp_path)
-    with shut_out, pytest.raises(MapvoteError, match=r"refused \(401\).*the ballot waits in"):
-        shut_out.send(ballot)
-    with MapClient(site.url, key=site.a, home=tmp_path) as client:
-        assert client.flush() == {"a~spooled": "created"}
-        assert client.flush() == {}
-        with pytest.raises(MapvoteError, match=r"refused \(409\).*the ballot is kept in"):
-            client.send(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "x", map_id="elsewhere"))
-        assert client.flush() == {}
 
 
 @pytest.mark.parametrize("headers", [{}, {"Host": "mapvote.default.svc"}])
@@ -230,24 +210,14 @@ def test_a_probe_needs_no_key_and_no_name_and_learns_nothing_else(site: Site, he
     assert site.ask("GET", "/readyz", site.a).json()["status"] == "ready"
 
 
-def test_a_graceful_stop(tmp_path: Path) -> None:
-    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, process):
-        assert httpx2.get(url + "/healthz", timeout=300.0).json() == {"status": "ok", "version": 1}
-        process.terminate()
-        assert process.wait(10) in (0, -15)
-    assert "Traceback" not in (tmp_path / "log").read_text()
-
-
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[httpx2.Client]:
+def client(new_store: NewStore) -> Iterator[httpx2.Client]:
     """The API of a store that holds a key, as its owner ``kim``; over HTTP its vehicles could send one drive a day."""
-    store = Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls())
+    store = new_store()
     keys.issue(store, "v1", "vehicle")
     settings = Settings(server=ServerSettings(drives_a_day=1))
     with in_process(store, settings, owner="kim") as transport:
         yield httpx2.Client(transport=transport, base_url=URL)
-    store.close()
 
 
 def test_the_owner_of_a_store_needs_no_key_and_no_quota_and_signs_what_he_does(client: httpx2.Client) -> None:

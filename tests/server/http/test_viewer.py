@@ -12,7 +12,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from chromium import Chromium, program
+from chromium import Chromium, browsing
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving_here
 from mapvote.config import FuseSettings
@@ -68,16 +68,8 @@ def url(town: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Chromium]:
-    if program() is None:
-        pytest.skip("Chromium is not installed: apt-get install chromium")
-    found = Chromium()
-    yield found
-    found.close()
-
-
-def text(browser: Chromium, selector: str) -> str:
-    found: str = browser.run(f"document.querySelector({selector!r}).innerText")
-    return found
+    with browsing() as found:
+        yield found
 
 
 SHOWN = "!document.querySelector('#content').hidden && document.querySelector('#tally').innerText"
@@ -99,13 +91,13 @@ def test_the_liar_is_named_from_the_ballots_in_the_store(town: Path) -> None:
 
 def test_the_page_lists_what_was_built_and_demolished_and_asks_nobody_else(browser: Chromium, url: str) -> None:
     open_page(browser, url)
-    assert text(browser, "#which-map") == "test-map, version 2"
-    assert text(browser, "#tally").split() == ["1", "built", "1", "demolished"]
-    assert text(browser, "#small summary") == "1 smaller than 1 m²", "the pole is folded away"
-    assert text(browser, "#changes li").split("\n") == ["Built", "10.4 m²", "4.3 m high"], "the largest comes first"
-    assert REASON in text(browser, "#versions"), "text stays text"
-    assert "published by <b>boss</b>" in text(browser, "#versions")
-    assert "1 of 1 tiles" in text(browser, "#coverage-note")
+    assert browser.text("#which-map") == "test-map, version 2"
+    assert browser.text("#tally").split() == ["1", "built", "1", "demolished"]
+    assert browser.text("#small summary") == "1 smaller than 1 m²", "the pole is folded away"
+    assert browser.text("#changes li").split("\n") == ["Built", "10.4 m²", "4.3 m high"], "the largest comes first"
+    assert REASON in browser.text("#versions"), "text stays text"
+    assert "published by <b>boss</b>" in browser.text("#versions")
+    assert "1 of 1 tiles" in browser.text("#coverage-note")
     browser.wait("document.querySelector('#vehicles')?.innerText.includes('liar')")
     browser.wait("performance.getEntriesByType('resource').filter(e => e.name.includes('/tiles/')).length === 1")
     asked = {urlsplit(one).netloc for one in browser.requests if one.startswith(("http", "ws"))}
@@ -134,7 +126,7 @@ def test_a_click_on_a_change_tells_its_votes_height_and_area(browser: Chromium, 
     scale = min(width / box[0], height / box[1]) * (1 - 2 * 0.38)
     browser.click(width / 2 - (box[0] / 2 - 0.15) * scale, height / 2)
     browser.wait("!document.querySelector('#details').hidden")
-    shown = text(browser, "#details")
+    shown = browser.text("#details")
     for fact in ("Built", f"({len(NEW)} cells)", "4.3 m above ground", "464 added", "7 (fewest 7)"):
         assert fact in shown
     assert "false" not in shown, "what is not known is left out"
@@ -142,7 +134,7 @@ def test_a_click_on_a_change_tells_its_votes_height_and_area(browser: Chromium, 
     assert browser.run("document.querySelector('#changes [aria-current=true]').innerText").startswith("Built")
     browser.run("document.querySelector('#details > .link').click()")
     browser.wait("document.querySelector('#details').innerText.includes('liar / d1')")
-    shown = text(browser, "#details")
+    shown = browser.text("#details")
     assert "Version 2 decided: changed, now occupied." in shown
     assert "does not count now: spent: version 2 has changed the cell since" in shown
 
@@ -152,7 +144,7 @@ def test_a_link_opens_the_same_change_again(browser: Chromium, url: str) -> None
     last = browser.run("document.querySelector('#small li').id.slice(5)")
     open_page(browser, f"{url}#change={last}")
     browser.wait("!document.querySelector('#details').hidden")
-    assert "0.09 m² (1 cells)" in text(browser, "#details")
+    assert "0.09 m² (1 cells)" in browser.text("#details")
 
 
 def test_an_equal_or_empty_range_says_so(browser: Chromium, url: str) -> None:
@@ -168,9 +160,9 @@ def test_a_new_server_says_what_is_missing(browser: Chromium, tmp_path: Path) ->
     Store.create(f"sqlite:///{tmp_path / 's.db'}", make_map({})).close()
     with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url:
         open_page(browser, url)
-        assert "Changes appear once vehicles have voted" in text(browser, "#tally")
-        assert text(browser, "#coverage-note") == "No ballot has come yet."
-        assert text(browser, "#notice") == "This map has no tiles yet."
+        assert "Changes appear once vehicles have voted" in browser.text("#tally")
+        assert browser.text("#coverage-note") == "No ballot has come yet."
+        assert browser.text("#notice") == "This map has no tiles yet."
         assert browser.errors == []
         browser.open("about:blank")
 

@@ -129,10 +129,11 @@ def test_votes_and_stamps_come_from_the_drives_that_said_so() -> None:
 def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> None:
     before = street()
     after = street(cell_points(0, 0, 3, 3, (2.0,)), cell_points(3, 3, 1, 1, (2.0,)))
-    objects = compare(before, after)
-    first = json.dumps(to_geojson(objects, Lattice(0.3, -0.6), map_id="street", from_version=1, to_version=2))
-    again = json.dumps(
-        to_geojson(compare(before, after), Lattice(0.3, -0.6), map_id="street", from_version=1, to_version=2)
+    first, again = (
+        json.dumps(
+            to_geojson(compare(before, after), Lattice(0.3, -0.6), map_id="street", from_version=1, to_version=2)
+        )
+        for _ in range(2)
     )
     assert first == again
     collection = json.loads(first)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,7 @@ from mapvote.server.views import explain
 from mapvote.server.views.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell
 from mapvote.server.views.history import last_events
 from standing_clock import Clock
-from stores import send
+from stores import NewStore, send
 
 WALL, LAWN = (10, 10), (20, 20)
 START_NS = 1_700_000_000 * 10**9
@@ -40,18 +38,17 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
+def store(new_store: NewStore, clock: Clock) -> Store:
     policy = Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=10.0))
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), policy, clock=clock)
-    yield store
-    store.close()
+    return new_store(two_walls(), policy, clock=clock)
 
 
-def say(store: Store, vehicle: str, state: CellState, cell: tuple[int, int] = WALL) -> None:
+def say(store: Store, vehicles: str, state: CellState, cell: tuple[int, int] = WALL) -> None:
+    """These vehicles, a letter each, vote so on one cell."""
     points = wall([cell], [0.45, 0.75]) if state == CellState.CHANGED_OCCUPIED else None
     now, base = store.clock(), store.point_map()
-    ballot = make_ballot(base, {(0, 0): Say(states_plane({cell: state}), new_points=points)}, vehicle, f"d{now}", now)
-    send(store, ballot)
+    says = {(0, 0): Say(states_plane({cell: state}), new_points=points)}
+    send(store, *[make_ballot(base, says, vehicle, f"d{now}", now) for vehicle in vehicles])
 
 
 def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
@@ -59,8 +56,7 @@ def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
 
 
 def test_a_vote_that_a_version_counted_stays_in_the_story_when_it_is_taken_back(store: Store, clock: Clock) -> None:
-    for vehicle in ("a", "b", "c"):
-        say(store, vehicle, CellState.CHANGED_EMPTY)
+    say(store, "abc", CellState.CHANGED_EMPTY)
     assert publish(store).version == 2
     withdraw(store, "a", by="a")
     issue(store, "b", "vehicle")
@@ -77,8 +73,7 @@ def test_a_vote_that_a_version_counted_stays_in_the_story_when_it_is_taken_back(
 
 
 def test_a_vote_is_named_with_the_version_that_counted_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
-    for vehicle in ("a", "b"):
-        say(store, vehicle, CellState.CHANGED_EMPTY)
+    say(store, "ab", CellState.CHANGED_EMPTY)
     assert [(v.counts, v.counted_in) for v in story(store).votes] == [(True, ()), (True, ())]
     assert publish(store).version == 2
     clock.now += DAY_NS
@@ -94,8 +89,7 @@ def test_a_vote_is_named_with_the_version_that_counted_it_or_why_it_does_not_cou
 
 
 def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_stay(store: Store, clock: Clock) -> None:
-    for vehicle in ("a", "b"):
-        say(store, vehicle, CellState.CHANGED_OCCUPIED, LAWN)
+    say(store, "ab", CellState.CHANGED_OCCUPIED, LAWN)
     assert story(store, LAWN).thing.startswith("temporary:")
     assert not publish(store).published
     clock.now += 21 * DAY_NS
@@ -104,8 +98,7 @@ def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_sta
     assert publish(store).published
     assert story(store, LAWN).thing == "stands: brought by vehicles"
     assert [v.counted_in for v in story(store, LAWN).votes] == [(2,)] * 3
-    for vehicle in ("a", "b"):
-        say(store, vehicle, CellState.CHANGED_EMPTY, LAWN)
+    say(store, "ab", CellState.CHANGED_EMPTY, LAWN)
     assert publish(store).published
     assert story(store, LAWN).thing.startswith("1 things came and went here, after 21.0 days on average; the next can")
     assert story(store, WALL).thing == "stands: surveyed"
@@ -121,8 +114,7 @@ def test_who_looked_last_holds_up_what_is_new(store: Store, clock: Clock) -> Non
 
 
 def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
-    for vehicle in ("a", "b", "c"):
-        say(store, vehicle, CellState.CHANGED_EMPTY)
+    say(store, "abc", CellState.CHANGED_EMPTY)
     with store.database.writing() as connection:
         t = schema.ballot_tiles
         first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
@@ -133,8 +125,7 @@ def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
 
 
 def test_a_damaged_decision_is_told_and_hides_no_vote(store: Store) -> None:
-    for vehicle in ("a", "b"):
-        say(store, vehicle, CellState.CHANGED_EMPTY)
+    say(store, "ab", CellState.CHANGED_EMPTY)
     publish(store)
     with store.database.writing() as connection:
         connection.execute(schema.decisions.update().values(states=b"rot"))
@@ -171,8 +162,7 @@ def test_the_story_of_a_cell_of_many_versions_decides_its_tile_once(
     store.set_policy(Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=1000.0)))
     for k in range(4):
         clock.now += 40 * DAY_NS
-        for vehicle in ("a", "b"):
-            say(store, vehicle, CellState.CHANGED_EMPTY if k % 2 == 0 else CellState.CHANGED_OCCUPIED)
+        say(store, "ab", CellState.CHANGED_EMPTY if k % 2 == 0 else CellState.CHANGED_OCCUPIED)
         assert publish(store).published
     decided, statements = Counter[str](), list[object]()
 
@@ -198,16 +188,8 @@ def test_where_as_many_vehicles_say_one_thing_as_another_the_page_shows_undeterm
 TIE, CLEAR = (10, 10), (10, 11)
 
 
-@pytest.fixture
-def one_stage(tmp_path: Path) -> Iterator[Store]:
-    policy = Policy(round=RoundPolicy(stage="one-stage"))
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), policy)
-    yield store
-    store.close()
-
-
-def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store) -> None:
-    store = one_stage
+def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(new_store: NewStore) -> None:
+    store = new_store(two_walls(), Policy(round=RoundPolicy(stage="one-stage")))
     tally = np.zeros((256, 256, N_STATES), dtype=np.uint16)
     for state in (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
         tally[TIE][state] = 3 * VOTE_UNIT

@@ -90,19 +90,11 @@ def run(old: F64, new: F64, world: F64) -> GateResult:
     return gate(street_map(old), street_map(new), drive_through(world), SETTINGS, NDT)
 
 
-def test_a_street_that_lost_a_house_and_a_map_that_followed_passes() -> None:
-    after = np.concatenate([ROAD, *HOUSES[:7], *HOUSES[8:]])
-    result = run(STREET, after, world=after)
-    assert result.verdict == "pass", result.reasons
-    assert result.scans_compared == 20
-
-
-def test_a_house_that_was_built_raises_the_inlier_share() -> None:
-    before = np.concatenate([ROAD, *HOUSES[:7], *HOUSES[8:]])
-    result = run(before, STREET, world=STREET)
-    assert result.verdict == "pass", result.reasons
-    gains = {m.name: m.gain for m in result.measures}
-    assert gains["inlier share"] > 0.0
+def test_a_map_that_followed_when_a_house_was_lost_or_built_passes() -> None:
+    without = np.concatenate([ROAD, *HOUSES[:7], *HOUSES[8:]])
+    lost, built = run(STREET, without, world=without), run(without, STREET, world=STREET)
+    assert (lost.verdict, lost.scans_compared, built.verdict) == ("pass", 20, "pass"), (lost.reasons, built.reasons)
+    assert {m.name: m.gain for m in built.measures}["inlier share"] > 0.0
 
 
 def test_a_version_that_demolishes_houses_that_still_stand_is_held_and_says_why() -> None:
@@ -146,11 +138,6 @@ def pairs(gains: list[float]) -> list[tuple[Localised, Localised]]:
 )
 def test_within_tolerance_passes_worse_holds_and_between_it_abstains(gains: list[float], verdict: str) -> None:
     assert pass_or_hold(compare(pairs(gains), SETTINGS))[0] == verdict
-
-
-def test_equal_maps_are_equal() -> None:
-    for measure in compare(pairs([0.0] * 20), SETTINGS):
-        assert (measure.gain, measure.uncertainty) == (0.0, 0.0)
 
 
 def test_the_gate_judges_by_the_drive_that_the_policy_names(monkeypatch: pytest.MonkeyPatch) -> None:

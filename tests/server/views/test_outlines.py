@@ -36,32 +36,22 @@ def area(ring: Ring) -> float:
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
-def test_one_cell_is_a_square_counter_clockwise_from_its_lower_left_corner() -> None:
-    assert outlines("#") == [[[(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]]]
+SQUARE = [(0, 0), (3, 0), (3, 3), (0, 3), (0, 0)]
 
 
-def test_a_corner_house_keeps_its_corner() -> None:
-    assert outlines("#.", "##") == [[[(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 0)]]]
-
-
-def test_a_courtyard_is_a_hole_and_runs_clockwise() -> None:
-    outer, hole = outlines("###", "#.#", "###")[0]
-    assert outer == [(0, 0), (3, 0), (3, 3), (0, 3), (0, 0)]
-    assert hole == [(1, 1), (1, 2), (2, 2), (2, 1), (1, 1)]
-
-
-def test_cells_that_meet_at_a_corner_are_one_object_of_two_polygons() -> None:
-    rows, cols = drawn(".#", "#.")
-    found = pieces(rows, cols, np.zeros(2, dtype=np.int64))
-    assert found.objects.tolist() == [0, 0]
-    assert found.polygons.tolist() == [0, 1]
-    assert [len(polygon) for polygon in outlines(".#", "#.")] == [1, 1]
-
-
-def test_a_ring_that_closes_over_a_corner_encloses_a_hole_and_does_not_touch_itself() -> None:
-    outer, hole = outlines("##.", "#.#", "###")[0]
-    assert outer.count((2, 2)) == 1
-    assert hole.count((2, 2)) == 1
+@pytest.mark.parametrize(
+    ("picture", "expected"),
+    [
+        (["#"], [[[(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]]]),
+        (["#.", "##"], [[[(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 0)]]]),
+        (["###", "#.#", "###"], [[SQUARE, [(1, 1), (1, 2), (2, 2), (2, 1), (1, 1)]]]),
+    ],
+    ids=["a cell, from its lower left corner", "a corner house", "a courtyard runs clockwise"],
+)
+def test_a_ring_begins_at_its_lower_left_corner_and_turns_at_each(
+    picture: list[str], expected: list[list[list[tuple[int, int]]]]
+) -> None:
+    assert outlines(*picture) == expected
 
 
 def test_kinds_never_join() -> None:

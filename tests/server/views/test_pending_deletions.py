@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,26 +21,20 @@ from mapvote.server.store.store import Store
 from mapvote.server.views.desk import desk, review
 from mapvote.server.views.explain import CellStory, explain_cell
 from mapvote.server.views.history import changes_between
-from stores import WALL, send, wall_gone
+from stores import WALL, NewStore, send, vote_gone
 
 BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
 SURE, UNSURE = [20, 20, 20], [20, -MOST_STEPS, 20]
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), BUDGET)
-    yield store
-    store.close()
+def store(new_store: NewStore) -> Store:
+    return new_store(two_walls(), BUDGET)
 
 
-def vote(store: Store, drive: str, sure: list[int] | None, vehicles: str = "ab") -> None:
+def vote(store: Store, drive: str, sure: list[int], vehicles: str = "ab") -> None:
     """These say that the wall of the first tile is gone, and how sure they are of each of its cells."""
-    odds = None if sure is None else np.array(sure, dtype=np.int8)
-    for name in vehicles:
-        says = {(0, 0): wall_gone(odds=odds)}
-        ballot = make_ballot(store.point_map(), says, name, drive, end_ns=store.clock())
-        send(store, ballot)
+    vote_gone(store, vehicles, drive, odds=np.array(sure, dtype=np.int8))
 
 
 def middle(store: Store) -> CellStory:
@@ -64,17 +56,11 @@ def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(stor
     assert "stands: surveyed" in story.thing
     assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
     assert not publish(store).published
-    vote_middle(store, "d2", 20)
+    for name in "ab":  # both drive by again, and are sure of the cell in the middle now
+        say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([20], np.int8))
+        send(store, make_ballot(store.point_map(), {(0, 0): say}, name, "d2", end_ns=store.clock()))
     assert desk(store).waiting == []
     assert publish(store).deleted == 3
-
-
-def vote_middle(store: Store, drive: str, sure: int) -> None:
-    """Both drive by again, and say of the cell in the middle alone how sure they are now."""
-    for name in "ab":
-        say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([sure], np.int8))
-        ballot = make_ballot(store.point_map(), {(0, 0): say}, name, drive, end_ns=store.clock())
-        send(store, ballot)
 
 
 def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> None:
@@ -84,11 +70,9 @@ def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> No
         review(store, waits["id"], "accepted", by="anna")
 
 
-def test_the_desk_says_in_which_system_its_coordinates_lie(tmp_path: Path) -> None:
+def test_the_desk_says_in_which_system_its_coordinates_lie(new_store: NewStore) -> None:
     place = {"crs": "EPSG:32654", "offset": "300000.0,3900000.0,0.0"}
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", replace(two_walls(), georeference=place), BUDGET)
-    pending = desk(store).pending
-    store.close()
+    pending = desk(new_store(replace(two_walls(), georeference=place), BUDGET)).pending
     assert pending["georeference"] == place
     assert "EPSG:32654" in pending["frame"]
 
@@ -125,7 +109,7 @@ def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(
 
 
 def test_ballots_that_do_not_say_are_told_by_their_votes(store: Store) -> None:
-    vote(store, "d1", None)
+    vote_gone(store)
     assert publish(store).deleted == 9
     assert [vote.sure for vote in middle(store).votes] == [None, None]
     assert middle(store).probability is not None
@@ -140,12 +124,14 @@ def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
     assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
 
 
-def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(tmp_path: Path) -> None:
+def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(
+    new_store: NewStore,
+) -> None:
     y, z = np.meshgrid(np.arange(40.05, 43.0, 0.3), np.arange(0.45, 3.0, 0.3))
     wall = np.column_stack([np.full(y.size, 30.04), y.ravel(), z.ravel()]).astype(np.float32)
     spill = wall[::3] + np.array([-0.05, 0.1, 0.0], np.float32)  # a centimetre beyond the cells' border
     point_map = make_map({(0, 0): make_tile(np.concatenate([wall, spill]))})
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    store = new_store(point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
     cells = sorted({(int(p[1] // 0.3), int(p[0] // 0.3)) for p in np.concatenate([wall, spill]).tolist()})
     states, odds = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), np.full(len(cells), 20, np.int8)
     for name in "ab":
@@ -157,4 +143,3 @@ def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_ch
     assert publish(store).deleted == len(wall) + len(spill)
     told = [explain_cell(store, x, 41.55).decisions for x in (29.85, 30.15)]
     assert [[decision.state for decision in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]
-    store.close()

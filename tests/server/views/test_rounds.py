@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.desk import desk, review
 from standing_clock import Clock
-from stores import send
+from stores import NewStore, send
 
 MOST_STATEMENTS = 20
 FREE = FuseSettings(max_deleted_share=1.0, max_change_m2=1e6, max_freed_share=1.0)
@@ -44,16 +43,8 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def make(tmp_path: Path, clock: Clock) -> Iterator[Callable[..., Store]]:
-    made: list[Store] = []
-
-    def store(side: int = 2, fuse: FuseSettings = FREE) -> Store:
-        made.append(Store.create(f"sqlite:///{tmp_path / 's.db'}", town(side), Policy(fuse=fuse), clock=clock))
-        return made[-1]
-
-    yield store
-    for one in made:
-        one.close()
+def make(new_store: NewStore, clock: Clock) -> Callable[..., Store]:
+    return lambda side=2, fuse=FREE, **more: new_store(town(side), Policy(fuse=fuse), clock=clock, **more)
 
 
 def says(store: Store, base: PointMap, tiles: list[TileIndex], vehicle: str, drive: str = "d1") -> Ballot:
@@ -117,9 +108,9 @@ def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
 
 
 def test_a_publish_of_what_was_looked_at_is_the_publish_of_who_never_looked(
-    make: Callable[..., Store], tmp_path: Path, clock: Clock
+    make: Callable[..., Store],
 ) -> None:
-    looked, other = make(), Store.create(f"sqlite:///{tmp_path / 'o.db'}", town(2), Policy(fuse=FREE), clock=clock)
+    looked, other = make(), make(name="o.db")
     for store in (looked, other):
         for vehicle in "ab":
             vote(store, [(0, 0), (0, 1)], vehicle)
@@ -136,7 +127,6 @@ def test_a_publish_of_what_was_looked_at_is_the_publish_of_who_never_looked(
     assert looked.tiles() == other.tiles()
     assert looked.manifest().digest == other.manifest().digest
     assert [(v.number, v.mark) for v in looked.versions()] == [(v.number, v.mark) for v in other.versions()]
-    other.close()
 
 
 def test_a_round_ends_with_the_policy_and_with_a_version(make: Callable[..., Store]) -> None:

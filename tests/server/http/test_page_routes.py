@@ -7,7 +7,6 @@ import re
 import struct
 from collections.abc import Iterator
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,8 +21,7 @@ from mapvote.core.types import CellState
 from mapvote.fusion.loss_budget import change_probability
 from mapvote.server.http.app import create_app
 from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
-from stores import send, wall_gone
+from stores import NewStore, send, wall_gone
 
 VENDORED = {
     "three.core.min.js": "e5a824c8ec97ee44aeb8ce0ab64664e1dd1777df9d0ab2345b35f9941a9fcf33",
@@ -33,19 +31,16 @@ VENDORED = {
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    """Two walls, one of which two vehicles saw gone."""
-    store = Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls())
-    for name in ("v1", "v2"):
-        ballot = make_ballot(two_walls(), {(0, 0): wall_gone(CellState.UNCHANGED_EMPTY)}, name, end_ns=store.clock())
-        if name == "v1":
-            way = [np.array([x, 6.0, 2.0]) for x in np.arange(2.0, 42.0, 0.5)]
-            ballot = replace(ballot, path=pack_path(way, store.lattice))
-        send(store, ballot)
+def client(new_store: NewStore) -> Iterator[TestClient]:
+    """Two walls, one of which two vehicles saw gone; the path of the first."""
+    store = new_store()
+    says = {(0, 0): wall_gone(CellState.UNCHANGED_EMPTY)}
+    way = pack_path([np.array([x, 6.0, 2.0]) for x in np.arange(2.0, 42.0, 0.5)], store.lattice)
+    first, second = (make_ballot(two_walls(), says, name, end_ns=store.clock()) for name in ("v1", "v2"))
+    send(store, replace(first, path=way), second)
     publish(store, FuseSettings(max_deleted_share=1.0))
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as found:
         yield found
-    store.close()
 
 
 def cloud(data: bytes, at: int = 0) -> tuple[np.ndarray, int]:
@@ -56,12 +51,12 @@ def cloud(data: bytes, at: int = 0) -> tuple[np.ndarray, int]:
     return np.frombuffer(data[at + 16 : end], "<u2").reshape(n, 4), end
 
 
-def test_the_intensity_of_each_point_travels_behind_the_places_where_the_map_has_any(tmp_path: Path) -> None:
+def test_the_intensity_of_each_point_travels_behind_the_places_where_the_map_has_any(new_store: NewStore) -> None:
     def bright(tile: Tile) -> Tile:
         return tile.but(fields={"intensity": (1000 * tile.points[:, 2]).astype(np.uint16)})
 
     tiles = two_walls().tiles
-    store = Store.create(f"sqlite:///{tmp_path / 'b.db'}", make_map({(0, 0): bright(tiles[0, 0]), (0, 1): tiles[0, 1]}))
+    store = new_store(make_map({(0, 0): bright(tiles[0, 0]), (0, 1): tiles[0, 1]}))
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as client:
         hashes = client.get("/v1/map").json()["tiles"]["0,0"]
         for level in range(6):
@@ -78,7 +73,6 @@ def test_the_intensity_of_each_point_travels_behind_the_places_where_the_map_has
         lit = np.frombuffer(coarse, "u1", offset=8 + 2 * 24 + 24 * 8)
         assert lit[:12].max() == round(1050 * 255 / 4095)
         assert not lit[12:].any()
-    store.close()
 
 
 def test_the_levels_of_a_tile_hold_its_points_and_no_more(client: TestClient) -> None:
@@ -169,11 +163,7 @@ def test_the_page_names_every_module_that_it_begins_with_so_that_all_are_asked_f
 def test_the_page_has_its_files_and_nobody_reaches_others(client: TestClient) -> None:
     page = client.get("/viewer/vendor/three.core.min.js")
     assert page.status_code == 200
-    assert (
-        client.get(
-            "/viewer/app.js", headers={"If-None-Match": client.get("/viewer/app.js").headers["etag"]}
-        ).status_code
-        == 304
-    )
+    known = {"If-None-Match": client.get("/viewer/app.js").headers["etag"]}
+    assert client.get("/viewer/app.js", headers=known).status_code == 304
     for name in ("../app.py", "..%2fapp.py", "vendor/../../app.py", "/etc/passwd", "vendor/LICENSE", "vendor"):
         assert client.get(f"/viewer/{name}").status_code == 404, name

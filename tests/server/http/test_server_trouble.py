@@ -1,4 +1,6 @@
-"""A real server process whose disk is full or read-only: 503, nothing acknowledged lost, and well again afterwards."""
+"""A real server process in trouble: its disk is full or read-only, its database goes away, it is stopped under load.
+
+Nothing is half done, nothing acknowledged is lost, and it is well again afterwards (kills: store/test_crash.py)."""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import os
 import resource
 import shutil
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,12 +18,15 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from hand_made import Say, make_ballot, states_plane, two_walls
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls, wall
 from live_server import mapvote, serving
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import Ballot, encode
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
 from mapvote.server.store.store import Store
+from postgres_cluster import PostgresCluster
+from stores import send
 
 CELL = (10, 10)
 
@@ -136,4 +142,98 @@ def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path
         httpx2.Client(base_url=address, timeout=60.0) as http,
     ):
         assert_well_again(http, url, {"d0", "d1"})
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+@pytest.mark.slow
+def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
+    postgres_cluster: PostgresCluster, postgres_url: str, tmp_path: Path
+) -> None:
+    Store.create(postgres_url, two_walls()).close()
+    with serving(postgres_url, log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url, timeout=60.0) as http:
+        assert put(http, "v1", "before").status_code == 201
+        postgres_cluster.stop()
+        try:
+            gone = time.monotonic()
+            while time.monotonic() - gone < 10.0:
+                assert_refused(put(http, "v1", "during"))
+                assert http.get("/livez").status_code == 200
+                for path in ("/v1/map", "/healthz", "/readyz", "/v1/coverage"):
+                    assert http.get(path).status_code == 503
+                assert http.request("POST", "/v1/publish", json={}).status_code == 503
+                time.sleep(0.5)
+        finally:
+            postgres_cluster.start()
+        assert put(http, "v1", "after").status_code == 201
+        for path in ("/healthz", "/readyz"):
+            assert http.get(path).status_code == 200
+    assert standing(postgres_url) == {"before", "after"}
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+TILES = [(row, col) for row in range(20) for col in range(20)]
+
+
+def street() -> PointMap:
+    """400 tiles with a pillar each, none like another."""
+    pillar = wall([CELL], [0.45, 0.75, 1.05])
+    return make_map({tile: make_tile(pillar + np.float32(1e-3 * i)) for i, tile in enumerate(TILES)})
+
+
+def gone_everywhere(point_map: PointMap, vehicle: str) -> Ballot:
+    states = states_plane({CELL: CellState.CHANGED_EMPTY})
+    return make_ballot(point_map, dict.fromkeys(TILES, Say(states)), vehicle, "all", time.time_ns())
+
+
+def send_until_stopped(url: str, vehicle: str, point_map: PointMap, acknowledged: set[str]) -> None:
+    say = {TILES[0]: Say(states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))}
+    with httpx2.Client(base_url=url, timeout=30.0) as http:
+        for i in range(100_000):
+            drive = f"{vehicle}.{i}"
+            body = encode(make_ballot(point_map, say, vehicle, drive, time.time_ns()))
+            try:
+                answer = http.request("PUT", f"/v1/ballots/{vehicle}/{drive}", content=body)
+            except httpx2.TransportError:
+                return
+            assert answer.status_code == 201, answer.text
+            acknowledged.add(drive)
+
+
+@pytest.mark.parametrize("after_s", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: float) -> None:
+    point_map = street()
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
+    send(store, *[gone_everywhere(point_map, vehicle) for vehicle in ("a", "b")])
+    acknowledged: set[str] = set()
+    published: list[int] = []
+    connected = threading.Event()
+
+    def publish(url: str) -> None:
+        with httpx2.Client(base_url=url, timeout=60.0) as http:
+            assert http.get("/healthz").status_code == 200
+            connected.set()
+            published.append(http.request("POST", "/v1/publish", json={"override": True}).status_code)
+
+    (tmp_path / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
+    with serving(tmp_path / "s.db", "--config", tmp_path / "server.toml", log=tmp_path / "log") as (url, process):
+        senders = [
+            threading.Thread(target=send_until_stopped, args=(url, f"v{i}", point_map, acknowledged)) for i in range(4)
+        ]
+        for sender in senders:
+            sender.start()
+        while len(acknowledged) < 20:
+            time.sleep(0.01)
+        publisher = threading.Thread(target=publish, args=(url,))
+        publisher.start()
+        assert connected.wait(30.0)
+        time.sleep(after_s)
+        process.terminate()
+        assert process.wait(300) in (0, -15), "it waits neither for the publish nor for the senders"
+        for thread in (*senders, publisher):
+            thread.join()
+    assert published[0] in (503, 200)
+    assert store.current() == (2 if published == [200] else 1)
+    assert len(store.point_map().tiles) == len(TILES)
+    store.close()
+    assert acknowledged <= standing(f"sqlite:///{tmp_path / 's.db'}")
     assert "Traceback" not in (tmp_path / "log").read_text()
