@@ -7,7 +7,7 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.tile import Tile
-from mapvote.core.types import F64, U8, Drive, MapvoteError
+from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
 from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.geo.frame import LOCAL, PROJECTOR, MapFrame, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import Convert, settle
 from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces, joined
-from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
+from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS
@@ -132,54 +131,28 @@ def import_cloud(
     if from_crs is not None:
         said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
         pieces = (replace(piece, frame=said) for piece in pieces)
-    left = _LeftOut()
-    metres = in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)
-    point_map = map_of(str(path), left.noise(metres), folder, look)
-    return point_map, left.told()
+    dropped: dict[str, None] = {}
+    noise = 0
 
+    def kept() -> Iterator[Cloud]:
+        nonlocal noise
+        for piece in in_map_metres(str(path), pieces, wanted, sure=from_crs is not None):
+            dropped.update(dict.fromkeys(piece.dropped))
+            bad = np.isin(piece.fields.get("classification", ()), NOISE)
+            if not bad.any():
+                yield piece
+                continue
+            noise += int(bad.sum())
+            fields = {name: column[~bad] for name, column in piece.fields.items()}
+            yield replace(piece, points=piece.points[~bad], fields=fields)
 
-@dataclass
-class _LeftOut:
-    """What passes by on the way from the file to the map."""
-
-    frame: MapFrame = field(default_factory=MapFrame)
-    points: int = 0
-    fields: dict[str, None] = field(default_factory=dict)
-
-    def noise(self, pieces: Iterator[Cloud]) -> Iterator[Cloud]:
-        """The pieces without the points that the file classifies as noise."""
-        for piece in pieces:
-            self.frame = piece.frame
-            self.fields |= dict.fromkeys(piece.dropped)
-            kept, n = without_noise(piece)
-            self.points += n
-            yield kept
-
-    def told(self) -> list[str]:
-        """In words."""
-        told = [f"coordinates: {self.frame.told()}"]
-        if self.points:
-            told.append(f"dropped: {self.points} points that the file classifies as noise (classes 7 and 18)")
-        if self.fields:
-            told.append(f"dropped fields: {', '.join(self.fields)}")
-        return told
-
-
-def without_noise(cloud: Cloud) -> tuple[Cloud, int]:
-    """The cloud without the points that its file classifies as noise, and how many were dropped."""
-    classes = cloud.fields.get("classification")
-    if classes is None:
-        return cloud, 0
-    noise = np.isin(classes, NOISE)
-    if not noise.any():
-        return cloud, 0
-    fields = {name: column[~noise] for name, column in cloud.fields.items()}
-    return replace(cloud, points=cloud.points[~noise], fields=fields), int(noise.sum())
-
-
-def write_map(point_map: PointMap, path: Path | str) -> None:
-    """Write a mapvote map folder, whole or not at all. An older mapvote map there is replaced, anything else is not."""
-    write_map_folder(point_map, Path(path))
+    point_map = map_of(str(path), kept(), folder, look)
+    told = [f"coordinates: {frame_of(point_map.georeference).told()}"]
+    if noise:
+        told.append(f"dropped: {noise} points that the file classifies as noise (classes 7 and 18)")
+    if dropped:
+        told.append(f"dropped fields: {', '.join(dropped)}")
+    return point_map, told
 
 
 def export_map(
@@ -235,7 +208,8 @@ def _pieces(
             tile = point_map.tiles[index]
             fields: dict[str, NDArray[Any]] = {name: tile.fields[name] for name in KEPT if name in tile.fields}
             if classes and "classification" not in fields:
-                fields["classification"] = ground_classes(tile)
+                on_ground = tile.has_ground & ~tile.columns[1]
+                fields["classification"] = np.where(on_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
             points = convert(tile.points_map)
             yield Cloud(points - np.array(offset) if any(offset) else points, frame=frame, fields=fields)
 
@@ -249,11 +223,6 @@ def _corners(where: Path, point_map: PointMap) -> F64:
         raise MapvoteError(f"{where}: the map holds no points, so there is nothing to export")
     low, high = np.array(boxes).transpose(1, 0, 2)
     return np.array([low.min(axis=0), high.max(axis=0)])
-
-
-def ground_classes(tile: Tile) -> U8:
-    """(n,) ASPRS class of every point of a tile: ground, or unclassified."""
-    return np.where(tile.has_ground & ~tile.columns[1], GROUND, UNCLASSIFIED).astype(np.uint8)
 
 
 def _what_is_there(path: Path) -> str:

@@ -41,7 +41,7 @@ def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
     angles = [_angles(scan) for scan in scans]
     elevation, azimuth = (np.concatenate([a[k] for a in angles]) for k in (0, 1))
     rings = [_rings(scan, *pair) for scan, pair in zip(scans, angles, strict=True)]
-    blind = blind_sectors(azimuth)
+    blind = _blind_sectors(azimuth)
     found = None if any(r is None for r in rings) else _ring_model(angles, [r for r in rings if r is not None])
     if found is None or found[2] < _SURE:
         return _ringless(elevation, azimuth, rate_hz, blind, 0.0 if found is None else found[2])
@@ -191,7 +191,7 @@ def _ringless(
     return Estimate(sensor, share, told)
 
 
-def blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
+def _blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
     """Azimuths (from, to) in degrees, at least 10 wide, without a point; past 180 where a sector spans +-180."""
     turns = round(360.0 / _SECTOR_DEG)
     empty = np.histogram(azimuth, turns, (-180.0, 180.0))[0] == 0
@@ -211,16 +211,11 @@ def blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
 def _clockwise(scans: Sequence[Scan], angles: Sequence[tuple[F64, F64, F64]]) -> bool:
     """Whether azimuth falls as time goes on; True, as most sensors turn, where no times are known."""
     turned = [
-        float(np.sign(_wrapped(np.diff(azimuth[np.argsort(scan.time_s, kind="stable")]))).sum())
+        float(np.sign((np.diff(azimuth[np.argsort(scan.time_s, kind="stable")]) + 180.0) % 360.0 - 180.0).sum())
         for scan, (_, azimuth, _) in zip(scans, angles, strict=True)
         if scan.time_s is not None
     ]
     return sum(turned) <= 0
-
-
-def _wrapped(angle: F64) -> F64:
-    out: F64 = (angle + 180.0) % 360.0 - 180.0
-    return out
 
 
 def _reach(scans: Sequence[Scan]) -> float:

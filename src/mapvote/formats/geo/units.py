@@ -41,7 +41,7 @@ def settle(
         if wanted is None or wanted.is_local:
             if not sure:
                 _check_no_degrees(where, first)
-            return stated, _as_it_is
+            return stated, lambda points: points
         log.warning("%s: names no coordinate system: the requested one is assumed", where)
         stated = replace(wanted, heights=stated.heights or wanted.heights)
         if not any(wanted.offset_m):
@@ -69,14 +69,10 @@ def settle(
     return frame, lambda points: move(points.astype(np.float64) * scale)
 
 
-def _as_it_is(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    return points
-
-
 def _moved(stated: MapFrame, wanted: MapFrame | None) -> tuple[MapFrame, Convert]:
     """From one metric frame to another; the same projection takes only a subtraction, which is exact."""
     if wanted is None or wanted.is_local or (wanted.crs == stated.crs and wanted.offset_m == stated.offset_m):
-        return wanted if wanted is not None and wanted.projector else stated, _as_it_is
+        return wanted if wanted is not None and wanted.projector else stated, lambda points: points
     wanted = replace(wanted, heights=wanted.heights or stated.heights)
     if wanted.crs == stated.crs:
         shift = np.array(stated.offset_m) - np.array(wanted.offset_m)

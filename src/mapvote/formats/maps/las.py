@@ -54,12 +54,8 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
     text = f"EPSG:{code}"
     if 0 < vertical < _USER_DEFINED and _is_height(vertical):
         text += f"+{vertical}"
-    try:
-        read_crs(text)
-        units = [METRES.get(keys.get(key, 0)) for key in (_UNIT, _VERTICAL_UNIT)]
-        return MapFrame(with_units(text, units[0], units[1]))
-    except MapvoteError as error:
-        raise MapvoteError(f"{where}: {error}; say what it is with --from-crs") from error
+    plane, up = (METRES.get(keys.get(key, 0)) for key in (_UNIT, _VERTICAL_UNIT))
+    return MapFrame(with_units(_known(where, text), plane, up))
 
 
 def _is_height(code: int) -> bool:
@@ -95,7 +91,7 @@ def stream_las(path: Path) -> Iterator[Cloud]:
 
 
 def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
-    frame = MapFrame(_known(path, head.wkt)) if head.wkt else frame_of_keys(str(path), head.geo_keys)
+    frame = MapFrame(_known(str(path), head.wkt)) if head.wkt else frame_of_keys(str(path), head.geo_keys)
     others = tuple(n for n in other_fields(tuple(n.lower() for n in head.dimensions)) if n not in FIELDS)
     done = 0
     for points, fields in pieces:
@@ -107,12 +103,12 @@ def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
         yield Cloud(np.empty((0, 3)), others, frame)
 
 
-def _known(path: Path, wkt: str) -> str:
+def _known(where: str, crs: str) -> str:
     try:
-        read_crs(wkt)
+        read_crs(crs)
     except MapvoteError as error:
-        raise MapvoteError(f"{path}: {error}; say what it is with --from-crs") from error
-    return wkt
+        raise MapvoteError(f"{where}: {error}; say what it is with --from-crs") from error
+    return crs
 
 
 def _apart(path: Path) -> Iterator[Cloud]:

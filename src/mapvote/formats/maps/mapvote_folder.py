@@ -49,8 +49,8 @@ def is_map_folder(path: Path) -> bool:
     return (path / MANIFEST).is_file()
 
 
-def write_map_folder(point_map: PointMap, path: Path) -> None:
-    """Write the map whole or not at all; an older mapvote map at ``path`` is replaced, anything else is not."""
+def write_map(point_map: PointMap, path: Path | str) -> None:
+    """Write a mapvote map folder, whole or not at all. An older mapvote map there is replaced, anything else is not."""
     with whole_folder(path, sign=MANIFEST) as folder:
         (folder / "planes").mkdir()
         tiles = {}

@@ -145,8 +145,8 @@ class _Taken:
     frame: MapFrame = field(default_factory=MapFrame)
     total: int = 0
     bad: int = 0
-    _low: F64 | None = None
-    _high: F64 | None = None
+    _low: F64 = field(default_factory=lambda: np.full(3, np.inf))
+    _high: F64 = field(default_factory=lambda: np.full(3, -np.inf))
     _kinds: list[dict[str, np.dtype[Any]]] = field(default_factory=list)
 
     def take(self, cloud: Cloud) -> None:
@@ -161,9 +161,8 @@ class _Taken:
             columns = {name: column[good] for name, column in columns.items()}
         if not good.any():
             return
-        low, high = columns[_XYZ].min(axis=0).astype(np.float64), columns[_XYZ].max(axis=0).astype(np.float64)
-        self._low = low if self._low is None else np.minimum(self._low, low)
-        self._high = high if self._high is None else np.maximum(self._high, high)
+        self._low = np.minimum(self._low, columns[_XYZ].min(axis=0))
+        self._high = np.maximum(self._high, columns[_XYZ].max(axis=0))
         for start in range(0, len(columns[_XYZ]), _SOME):
             self.spill.add({name: column[start : start + _SOME] for name, column in columns.items()})
 
@@ -178,8 +177,6 @@ class _Taken:
             )
         if self.bad:
             log.warning("%s: dropped %d of %d points that are not finite", self.where, self.bad, self.total)
-        assert self._low is not None
-        assert self._high is not None
         return lattice_of(np.array([self._low, self._high]))
 
     def blocks(self) -> Iterator[Columns]:
