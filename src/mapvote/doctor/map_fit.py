@@ -103,13 +103,12 @@ class MapEvidence:
     @cached_property
     def scans(self) -> dict[int, Scan]:
         """Along the drive, by their numbers; de-skewed by the prior's motion."""
-        index = np.unique(np.linspace(0, len(self.drive) - 1, _PLACES).astype(np.int64)).tolist()
-        return {i: self._deskewed(i) for i in index}
-
-    def _deskewed(self, i: int) -> Scan:
-        scan = self.drive.read_scan(i)
-        points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
-        return Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))
+        out = {}
+        for i in np.unique(np.linspace(0, len(self.drive) - 1, _PLACES).astype(np.int64)).tolist():
+            scan = self.drive.read_scan(i)
+            points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
+            out[i] = Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))
+        return out
 
     def scaled(self, i: int, scale: float) -> F64:
         """The prior's pose (4, 4) of a scan in a map that is so many times as large about the middle of the drive."""

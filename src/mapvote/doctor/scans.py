@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import F32, F64, Bool, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity, any_error, usable
 from mapvote.formats.drives.sensor_estimate import contradiction
 
@@ -264,16 +264,13 @@ def _jumps_and_stops(steps_m: F64, usual_m: float) -> Iterator[Finding]:
         yield Finding("warning", what, "GNSS outliers: smooth them, or give prior_sigma_m in drive.toml")
     stuck = steps_m < 1e-6
     if 3 <= stuck.sum() < len(steps_m) and usual_m > 0.05:
-        what = f"the prior stands still for {_longest(stuck)} rows, at full speed before or after"
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], stuck.astype(np.int8), [0]])))
+        longest = int((edges[1::2] - edges[::2]).max()) + 1
+        what = f"the prior stands still for {longest} rows, at full speed before or after"
         yield Finding("warning", what, "was it held while GNSS or the filter was away? Leave those rows out")
     elif usual_m <= 1e-6 < steps_m.sum() and stuck.sum() > 0.4 * len(stuck):
         what = f"{stuck.mean():.0%} of the prior's rows repeat the one before"
         yield Finding("warning", what, "it is slower than the scans, or was held: interpolate it")
-
-
-def _longest(flags: Bool) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max()) + 1
 
 
 def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
@@ -353,11 +350,8 @@ def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
             goes_round = name != "z" and abs(np.median(looks["turns"])) > 0.3
             if goes_round or (name == "x" and not drive.sensor.rings):
                 continue
-            what = f"{name} is never negative: no LiDAR sees nothing below itself"
-            if name != "z":
-                what = (
-                    f"{name} is never negative: an absolute value, a range, or half of the azimuth is missing (180 deg)"
-                )
+            halved = "an absolute value, a range, or half of the azimuth is missing (180 deg)"
+            what = f"{name} is never negative: {'no LiDAR sees nothing below itself' if name == 'z' else halved}"
             yield Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns")
 
 

@@ -7,37 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapvote.core.types import Drive
-from mapvote.formats.drives.datasets import (
-    BOREAS,
-    MULRAN,
-    NEWER_COLLEGE,
-    OXFORD_LIDARS,
-    Dataset,
-    is_nuscenes,
-    open_kitti_raw,
-    open_nuscenes,
-    open_oxford,
-)
+from mapvote.formats.drives import datasets, rosbag, scan_folder
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
-from mapvote.formats.drives.scan_folder import (
-    cloud_scans,
-    open_cloud_scans,
-    open_kitti,
-    open_pcd_scans,
-    pcd_scans,
-)
-from mapvote.formats.maps.autoware import (
-    is_autoware,
-    is_autoware_default,
-    stream_autoware,
-    stream_autoware_default,
-    write_autoware,
-)
+from mapvote.formats.maps import autoware, las, pcd, ply_e57
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
-from mapvote.formats.maps.las import stream_las, write_las
-from mapvote.formats.maps.pcd import is_pcd_tiles, stream_pcd, stream_pcd_tiles, write_pcd
-from mapvote.formats.maps.ply_e57 import stream_e57, stream_ply, write_ply
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,36 +50,36 @@ def _holds(*folders: str) -> Callable[[Path], bool]:
     return lambda path: any((path / folder).is_dir() for folder in folders)
 
 
-DRIVES: dict[str, DriveFormat | Dataset] = {
-    "KITTI drive folder": DriveFormat(_holds("velodyne"), open_kitti),
-    "KITTI raw or KITTI-360 recording": DriveFormat(_holds("velodyne_points/data"), open_kitti_raw),
-    "nuScenes": DriveFormat(is_nuscenes, open_nuscenes),
-    "Boreas sequence": BOREAS,
-    "MulRan sequence": MULRAN,
-    "Newer College experiment": NEWER_COLLEGE,
-    "Oxford RobotCar traversal": DriveFormat(_holds(*OXFORD_LIDARS), open_oxford),
-    "ROS bag": DriveFormat(is_rosbag, open_rosbag),
-    "folder of PCD scans": DriveFormat(pcd_scans, open_pcd_scans),
-    "folder of PLY, LAS, npy or bin scans": DriveFormat(cloud_scans, open_cloud_scans),
+DRIVES: dict[str, DriveFormat | datasets.Dataset] = {
+    "KITTI drive folder": DriveFormat(_holds("velodyne"), scan_folder.open_kitti),
+    "KITTI raw or KITTI-360 recording": DriveFormat(_holds("velodyne_points/data"), datasets.open_kitti_raw),
+    "nuScenes": DriveFormat(datasets.is_nuscenes, datasets.open_nuscenes),
+    "Boreas sequence": datasets.BOREAS,
+    "MulRan sequence": datasets.MULRAN,
+    "Newer College experiment": datasets.NEWER_COLLEGE,
+    "Oxford RobotCar traversal": DriveFormat(_holds(*datasets.OXFORD_LIDARS), datasets.open_oxford),
+    "ROS bag": DriveFormat(rosbag.is_rosbag, rosbag.open_rosbag),
+    "folder of PCD scans": DriveFormat(scan_folder.pcd_scans, scan_folder.open_pcd_scans),
+    "folder of PLY, LAS, npy or bin scans": DriveFormat(scan_folder.cloud_scans, scan_folder.open_cloud_scans),
 }
 """In the order in which they are tried."""
 
 MAPS: dict[str, MapFormat] = {
-    "Autoware tile folder": MapFormat(is_autoware, stream_autoware),
-    "Autoware default folder": MapFormat(is_autoware_default, stream_autoware_default),
-    "PCD file": MapFormat(_file(".pcd"), stream_pcd),
-    "folder of PCD tiles X_Y.pcd": MapFormat(is_pcd_tiles, stream_pcd_tiles),
-    "LAS or LAZ file": MapFormat(_file(".las", ".laz"), stream_las),
-    "PLY file": MapFormat(_file(".ply"), stream_ply),
-    "E57 file": MapFormat(_file(".e57"), stream_e57),
+    "Autoware tile folder": MapFormat(autoware.is_autoware, autoware.stream_autoware),
+    "Autoware default folder": MapFormat(autoware.is_autoware_default, autoware.stream_autoware_default),
+    "PCD file": MapFormat(_file(".pcd"), pcd.stream_pcd),
+    "folder of PCD tiles X_Y.pcd": MapFormat(pcd.is_pcd_tiles, pcd.stream_pcd_tiles),
+    "LAS or LAZ file": MapFormat(_file(".las", ".laz"), las.stream_las),
+    "PLY file": MapFormat(_file(".ply"), ply_e57.stream_ply),
+    "E57 file": MapFormat(_file(".e57"), ply_e57.stream_e57),
 }
 """Maps that are only points, in the order in which they are tried."""
 
 WRITERS: dict[str, MapWriter] = {
-    ".pcd": MapWriter("PCD file", write_pcd),
-    ".las": MapWriter("LAS file", write_las, classes=True),
-    ".laz": MapWriter("LAZ file", write_las, classes=True),
-    ".ply": MapWriter("PLY file", write_ply),
-    "": MapWriter("Autoware tile folder", write_autoware),
+    ".pcd": MapWriter("PCD file", pcd.write_pcd),
+    ".las": MapWriter("LAS file", las.write_las, classes=True),
+    ".laz": MapWriter("LAZ file", las.write_las, classes=True),
+    ".ply": MapWriter("PLY file", ply_e57.write_ply),
+    "": MapWriter("Autoware tile folder", autoware.write_autoware),
 }
 """By the suffix of the path; a folder has none."""

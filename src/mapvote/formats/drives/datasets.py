@@ -121,25 +121,19 @@ def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajector
     """
     rows = read_numbers(file, 13)
     T_world_imu = rigid_motions(rows[:, 1:], str(file))
-    T_imu_lidar = _T_imu_lidar(file.parents[2] / "calibration")
-    numbers = np.array([number_of(f) for f in files])
-    first = np.searchsorted(numbers, rows[:, 0])
-    known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
-    if not known.any():
-        raise MapvoteError(f"{file}: no pose for any of the scans {files[0].name} to {files[-1].name}; --prior none")
-    return sorted_trajectory(
-        stamps_ns[first[known]], (T_world_imu @ T_imu_lidar)[known], of_vehicle=False, frame=MapFrame()
-    )
-
-
-def _T_imu_lidar(folder: Path) -> F64:
-    """(4, 4) through camera 0: calib_cam_to_pose.txt and calib_cam_to_velo.txt."""
+    folder = file.parents[2] / "calibration"  # from the IMU to the LiDAR through camera 0
     calib = read_calib(folder / "calib_cam_to_pose.txt")
     velo = read_numbers(folder / "calib_cam_to_velo.txt", 12).ravel()
     if "image_00" not in calib or calib["image_00"].size != 12 or velo.size != 12:
         raise MapvoteError(f"{folder}: calib_cam_to_pose.txt (image_00) and calib_cam_to_velo.txt need 12 numbers each")
     T_imu_camera, T_lidar_camera = rigid_motions(np.stack([calib["image_00"], velo]), str(folder))
-    return T_imu_camera @ geometry.inverse(T_lidar_camera)
+    numbers = np.array([number_of(f) for f in files])
+    first = np.searchsorted(numbers, rows[:, 0])
+    known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
+    if not known.any():
+        raise MapvoteError(f"{file}: no pose for any of the scans {files[0].name} to {files[-1].name}; --prior none")
+    T = T_world_imu[known] @ (T_imu_camera @ geometry.inverse(T_lidar_camera))
+    return sorted_trajectory(stamps_ns[first[known]], T, of_vehicle=False, frame=MapFrame())
 
 
 def is_nuscenes(path: Path) -> bool:

@@ -293,9 +293,11 @@ def open_pcd_scans(path: Path, options: DriveOptions) -> Drive:
 
     def read(file: Path) -> NDArray[np.void]:
         table = read_pcd_table(file)
-        return (
-            _to_lidar(str(file), table, viewpoints[index[file]]) if viewpoints is not None and in_map_frame else table
-        )
+        if viewpoints is not None and in_map_frame:
+            table = table.copy()
+            points = geometry.transform(geometry.inverse(viewpoints[index[file]]), xyz(str(file), table))
+            table["x"], table["y"], table["z"] = points.T
+        return table
 
     def prior() -> Trajectory | F64 | None:
         if viewpoints is not None:
@@ -306,23 +308,19 @@ def open_pcd_scans(path: Path, options: DriveOptions) -> Drive:
 
 
 def _viewpoints(files: list[Path]) -> F64 | None:
-    """(n, 4, 4) of the files' VIEWPOINTs; None if they are all the same, and so say nothing."""
-    rows = np.array([_viewpoint_of(f) for f in files])
+    """(n, 4, 4) of the files' VIEWPOINTs; None if they are all the same, and so say nothing. The identity where there
+    is none, or the header is broken (which the reader reports)."""
+    rows = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(files), 1))
+    for row, file in zip(rows, files, strict=True):
+        with suppress(MapvoteError):
+            viewpoint = read_viewpoint(file)
+            row[:] = viewpoint if np.linalg.norm(viewpoint[3:]) > 0.5 else row
     if (rows == rows[0]).all():
         return None
     rotations = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True)
     T = geometry.poses_at(rows[:, :3], rotations.as_matrix())
     check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
     return T
-
-
-def _viewpoint_of(file: Path) -> F64:
-    """tx ty tz qw qx qy qz; the identity where there is none, or the header is broken (which the reader reports)."""
-    with suppress(MapvoteError):
-        viewpoint = read_viewpoint(file)
-        if np.linalg.norm(viewpoint[3:]) > 0.5:
-            return viewpoint
-    return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _points_lie_around(viewpoints: F64, files: list[Path]) -> bool:
@@ -332,15 +330,6 @@ def _points_lie_around(viewpoints: F64, files: list[Path]) -> bool:
     centre = viewpoints[far, :3, 3]
     to_origin = np.nanmedian(np.linalg.norm(points, axis=1))
     return bool(np.linalg.norm(centre) > 10.0 and np.nanmedian(np.linalg.norm(points - centre, axis=1)) < to_origin)
-
-
-def _to_lidar(where: str, table: np.ndarray, T_map_lidar: F64) -> np.ndarray:
-    """The table with x, y, z in the sensor's frame instead of the map's."""
-    points = geometry.transform(geometry.inverse(T_map_lidar), xyz(where, table))
-    out = table.copy()
-    for column, axis in enumerate("xyz"):
-        out[axis] = points[:, column]
-    return out
 
 
 @dataclass(frozen=True)
@@ -385,7 +374,8 @@ class DriveWriter:
         written = len(list((self._partial / "velodyne").iterdir()))
         if written != len(stamps_ns):
             raise MapvoteError(f"{self.path}: {written} scans written, but {len(stamps_ns)} stamps")
-        write_times(self._partial / "times.txt", stamps_ns - self.start_ns)
+        times = (f"{ns // 10**9}.{ns % 10**9:09d}\n" for ns in (stamps_ns - self.start_ns).tolist())
+        (self._partial / "times.txt").write_text("".join(times))
         if T_map_lidar_prior is not None:
             write_poses(self._partial / "prior.txt", T_map_lidar_prior)
         about = {
@@ -400,11 +390,6 @@ class DriveWriter:
         }
         (self._partial / "drive.toml").write_text(tomli_w.dumps(about))
         os.replace(self._partial, self.path)
-
-
-def write_times(path: Path, times_ns: I64) -> None:
-    """times.txt: one line of seconds a scan, with nanoseconds kept exactly."""
-    path.write_text("".join(f"{ns // 1_000_000_000}.{ns % 1_000_000_000:09d}\n" for ns in times_ns.tolist()))
 
 
 def write_poses(path: Path, T_map_lidar: F64) -> None:

@@ -135,7 +135,9 @@ def _ring_model(angles: Sequence[tuple[F64, F64, F64]], rings: Sequence[I64]) ->
             ring_of.append(int(number))
     if len(set(ring_of)) < 4 or not steps:
         return None
-    levels = _merged(np.array(elevations))
+    every = np.sort(elevations)[::-1]
+    same = np.cumsum(np.abs(np.diff(every, prepend=every[:1])) > 0.08)  # the same ring in several scans is one
+    levels = np.array([np.median(every[same == k]) for k in range(int(same[-1]) + 1)])
     elevation, reach = (np.concatenate([a[k] for a in angles]) for k in (0, 2))
     spacing = np.median(np.abs(np.diff(levels))) if len(levels) > 1 else 1.0
     off = np.abs(elevation - _nearest(levels, elevation))[reach > _FAR_M]
@@ -149,13 +151,6 @@ def _nearest(levels: F64, values: F64) -> F64:
     after = np.clip(np.searchsorted(up, values), 1, max(len(up) - 1, 1))
     below, above = up[after - 1], up[np.minimum(after, len(up) - 1)]
     return np.where(np.abs(values - below) <= np.abs(values - above), below, above)
-
-
-def _merged(elevations: F64) -> F64:
-    """Elevations of the same ring in several scans as one, from the top down."""
-    levels = np.sort(elevations)[::-1]
-    groups = np.cumsum(np.abs(np.diff(levels, prepend=levels[:1])) > 0.08)
-    return np.array([np.median(levels[groups == g]) for g in range(int(groups[-1]) + 1)])
 
 
 def _known(elevations: F64) -> tuple[str, Sensor | None]:

@@ -206,7 +206,9 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
         return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
     times_ns, columns = read_columns(file)
     zero = np.zeros(len(times_ns))
-    angles = {name: _radians(columns[name]) for name in ("roll", "pitch", "yaw", "heading") if name in columns}
+    angles = {name: columns[name] for name in ("roll", "pitch", "yaw", "heading") if name in columns}
+    for name, angle in angles.items():  # beyond two turns of radians they can only be degrees
+        angles[name] = np.radians(angle) if float(np.abs(angle).max()) > 2.0 * np.pi + 0.01 else angle
     yaw = angles.get("yaw", np.pi / 2 - angles.get("heading", zero))
     rpy = np.column_stack([angles.get("roll", zero), angles.get("pitch", zero), yaw])
     if {"latitude", "longitude"} <= set(columns):
@@ -222,11 +224,6 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
     else:
         raise MapvoteError(f"{file}: no orientation: name columns qx, qy, qz, qw, or roll, pitch, yaw")
     return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
-
-
-def _radians(angle: F64) -> F64:
-    """Angles beyond two turns of radians can only be degrees."""
-    return np.radians(angle) if len(angle) and float(np.abs(angle).max()) > 2.0 * np.pi + 0.01 else angle
 
 
 def _motions_of_quaternions(file: Path, rows: F64) -> F64:
@@ -355,18 +352,6 @@ def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any
     )
 
 
-def _prior_file(folder: Path, options: DriveOptions) -> Path | None:
-    """The file that the options name, here or in ``folder``; else prior.txt, if it exists."""
-    if options.prior is None:
-        return folder / "prior.txt" if (folder / "prior.txt").is_file() else None
-    for file in (Path(options.prior), folder / options.prior):
-        if file.is_file():
-            return file
-    raise MapvoteError(
-        f"{options.prior}: no such prior, neither here nor in {folder}; give a file of 3 x 4 rows, or none"
-    )
-
-
 def prior_of(
     path: Path,
     options: DriveOptions,
@@ -378,9 +363,13 @@ def prior_of(
 ) -> tuple[F64 | None, MapFrame]:
     """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the file that the options name, else prior.txt,
     else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
-    if options.prior is not None and options.prior.lower() == "none":
+    said = options.prior
+    if said is not None and said.lower() == "none":
         return None, MapFrame()
-    file = None if options.prior is not None and options.prior == own_name else _prior_file(path, options)
+    places = (path / "prior.txt",) if said is None else () if said == own_name else (Path(said), path / said)
+    file = next((place for place in places if place.is_file()), None)
+    if file is None and said not in (None, own_name):
+        raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")
     if file is not None and not has_times(file):
         return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
     found = own() if file is None else read_trajectory(file, map_frame(options))

@@ -50,21 +50,14 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
         )
     if not code:
         return MapFrame()
-    vertical = keys.get(_VERTICAL, 0)
-    text = f"EPSG:{code}"
-    if 0 < vertical < _USER_DEFINED and _is_height(vertical):
-        text += f"+{vertical}"
+    vertical, text = keys.get(_VERTICAL, 0), f"EPSG:{code}"
+    if 0 < vertical < _USER_DEFINED:
+        try:  # files often hold a code of a vertical datum, or of an ellipsoid, where that of a vertical CRS belongs
+            text += f"+{vertical}" if read_crs(f"EPSG:{vertical}").is_vertical else ""
+        except MapvoteError:
+            log.warning("heights: EPSG:%d is no vertical coordinate system; ignored", vertical)
     plane, up = (METRES.get(keys.get(key, 0)) for key in (_UNIT, _VERTICAL_UNIT))
     return MapFrame(with_units(_known(where, text), plane, up))
-
-
-def _is_height(code: int) -> bool:
-    """Files often hold a code of a vertical datum, or of an ellipsoid, where that of a vertical CRS belongs."""
-    try:
-        return bool(read_crs(f"EPSG:{code}").is_vertical)
-    except MapvoteError:
-        log.warning("heights: EPSG:%d is no vertical coordinate system; ignored", code)
-        return False
 
 
 STEP_M = 0.0001

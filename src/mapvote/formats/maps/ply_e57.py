@@ -5,6 +5,7 @@ E57 files through pye57 (extra ``e57``): every scan of the file, brought to the 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,9 @@ def stream_e57(path: Path) -> Iterator[Cloud]:
             raise ValueError(f"its header promises {sum(counts)} points, more than it has room for")
         if not any(counts):
             raise MapvoteError(f"{path}: holds no scan with points")
-        wkt = _coordinate_metadata(file)
+        wkt = ""
+        with suppress(Exception):  # libE57's own, for a file that names no coordinate system
+            wkt = str(file.root["coordinateMetadata"].value()).strip()
         frame = MapFrame(wkt) if wkt else MapFrame()
         for i in range(file.scan_count):
             if counts[i]:
@@ -94,11 +97,3 @@ def _scan(file: Any, index: int) -> Cloud:
     known = ("cartesianX", "cartesianY", "cartesianZ", "sphericalRange", "sphericalAzimuth", "sphericalElevation")
     others = tuple(n for n in names if n not in (*known, *_FIELDS) and not n.endswith("InvalidState"))
     return Cloud(points, others, fields=fields)
-
-
-def _coordinate_metadata(file: Any) -> str:
-    """The file's coordinate system as WKT, "" where it names none that can be read."""
-    try:
-        return str(file.root["coordinateMetadata"].value()).strip()
-    except Exception:  # libE57's own, for a file without it
-        return ""
