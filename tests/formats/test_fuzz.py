@@ -204,6 +204,7 @@ def read_damaged(folder: Path, good: Path, target: Target, times: int, seconds: 
             warnings.simplefilter("ignore")  # numpy's and laspy's opinions on garbage
             said = what_it_says(target, folder / what)
         assert "\n" not in said, f"seed {seed}: {said}"
+        assert not said or str(folder) in said, f"seed {seed} names no file: {said}"
         signal.alarm(0)
 
 

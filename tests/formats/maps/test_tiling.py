@@ -19,6 +19,7 @@ from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, import_cloud, read_map, write_map
 from mapvote.formats.maps import pcd, ply_e57, tiling
 from mapvote.formats.maps.cloud import Cloud, lattice_of
+from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.mapvote_folder import read_manifest
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.ply_e57 import write_ply
@@ -35,9 +36,13 @@ def street(seed: int, n: int = 4000, x: float = 0.0) -> tuple[F64, dict[str, Any
     return points, {"intensity": rng.integers(0, 999, n).astype(np.uint16), "classification": classes}
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
 def files(point_map: PointMap, folder: Path) -> dict[str, bytes]:
     write_map(point_map, folder)
-    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+    return content(folder)
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -81,27 +86,33 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("large")
-@pytest.mark.parametrize("suffix", [".pcd", ".ply", " ascii.pcd", ".laz"])
-def test_a_map_larger_than_memory_is_the_same_map(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mapvote.formats.maps.las import write_las
-
+@pytest.mark.parametrize(
+    ("suffix", "out"),
+    [(".pcd", "a.las"), (".ply", "a.laz"), (" ascii.pcd", "a.ply"), (".laz", "a.pcd"), (".las", "a")],
+)
+def test_a_map_larger_than_memory_is_the_same_map_and_leaves_as_the_same_file(
+    tmp_path: Path, suffix: str, out: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     points, fields = street(3)
     cloud, file = Cloud(points, fields=fields), tmp_path / f"a{suffix}"
-    if suffix == ".ply":
-        write_ply(file, cloud)
-    elif suffix == ".laz":
-        write_las(file, cloud)
-    else:
+    if "pcd" in suffix:
         save_pcd(file, points, "ascii" if "ascii" in suffix else "binary", **fields)
+    else:
+        (write_ply if suffix == ".ply" else write_las)(file, cloud)
     made, _ = import_cloud(file, folder=tmp_path)
     assert isinstance(made.tiles, LazyTiles)
     assert (len(made.tiles), made.n_points) == (4, 4000)
     lazy = files(made, tmp_path / "lazy")
+    export_map(made, tmp_path / "out of lazy" / out)
     monkeypatch.undo()
     small, _ = import_cloud(file)
     assert isinstance(small.tiles, dict)
     assert lazy == files(small, tmp_path / "small")
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([file.name, "lazy", "small"])
+    export_map(small, tmp_path / "out of small" / out)
+    written = content(tmp_path / "out of lazy")
+    assert written == content(tmp_path / "out of small")
+    assert len(written) == (1 if "." in out else 18)
+    assert {p.name for p in tmp_path.iterdir()} == {file.name, "lazy", "small", "out of lazy", "out of small"}
 
 
 @pytest.mark.usefixtures("large")
@@ -129,25 +140,6 @@ def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) 
     before, now = files(opened, tmp_path / "a"), files(after, tmp_path / "b")
     assert {name for name in now.keys() & before.keys() if now[name] != before[name]} == {"manifest.json"}
     assert len(now.keys() - before.keys()) == 3, "points and fields of one tile, and what it remembers"
-
-
-@pytest.mark.parametrize("out", ["a.las", "a.laz", "a.ply", "a.pcd", "a"])
-def test_a_large_map_leaves_as_the_same_file(tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    points, fields = street(9)
-    fields["intensity"] = (fields["intensity"] / 999.0).astype(np.float32)
-    small = map_of("it", [Cloud(points, fields=fields)])
-    export_map(small, tmp_path / "small" / out)
-    monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
-    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
-    large = map_of("it", [Cloud(points, fields=fields)])
-    assert isinstance(large.tiles, LazyTiles)
-    export_map(large, tmp_path / "large" / out)
-    found = [
-        {str(f.relative_to(tmp_path / size)): f.read_bytes() for f in (tmp_path / size).rglob("*") if f.is_file()}
-        for size in ("small", "large")
-    ]
-    assert found[0] == found[1]
-    assert len(found[0]) == (1 if "." in out else 18)
 
 
 @pytest.mark.usefixtures("large")

@@ -117,15 +117,17 @@ def joined(pieces: Iterable[Cloud]) -> Cloud:
     )
 
 
-def kept_fields(table: NDArray[np.void]) -> dict[str, NDArray[Any]]:
-    """The columns of a structured array that a map keeps: numbers under LAS's names, PCL's packed rgb taken apart."""
+def cloud_of(where: str, table: NDArray[np.void]) -> Cloud:
+    """The points of a structured array with x, y, z, and of its fields what a map keeps: numbers under LAS's names,
+    PCL's packed rgb taken apart. MapvoteError as :func:`xyz`."""
     names = table.dtype.names or ()
     out = {name: np.ascontiguousarray(table[name]) for name in KEPT if name in names}
     for packed in ("rgb", "rgba"):
         if packed in names and "red" not in out and table.dtype[packed].itemsize == 4:
             word = np.ascontiguousarray(table[packed]).view(np.uint32)
             out |= {c: ((word >> s) & 255).astype(np.uint8) for c, s in (("red", 16), ("green", 8), ("blue", 0))}
-    return {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
+    kept = {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
+    return Cloud(xyz(where, table), other_fields(names), fields=kept)
 
 
 def table_of(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArray[np.void]:

@@ -17,7 +17,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, kept_fields, other_fields, table_of, xyz
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of, table_of
 
 _BLOCK = 500_000
 """Vertices handed on at a time."""
@@ -42,7 +42,7 @@ def stream_ply(path: Path) -> Iterator[Cloud]:
         for start in range(0, max(len(vertices), 1), _BLOCK):
             part = np.array(vertices[start : start + _BLOCK])
             part = part.astype(part.dtype.newbyteorder("="))
-            yield Cloud(xyz(str(path), part), other_fields(part.dtype.names or ()), fields=kept_fields(part))
+            yield cloud_of(str(path), part)
 
 
 def write_ply(path: Path, cloud: Cloud | CloudPieces) -> None:

@@ -11,7 +11,7 @@ import hashlib
 import logging
 import tempfile
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -131,7 +131,7 @@ def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look
         digest.update(points.tobytes())
         parts.cut(block)
     taken.spill.close()
-    ground = lay_ground(parts.heights, parts.road, parts.points)
+    ground = lay_ground(parts.heights(), parts.heights(of_ground=True), parts.points)
     tiles = in_memory_if_small(LazyTiles(lambda index: parts.tile(index, ground[index]), parts.points))
     return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.frame.georeference())
 
@@ -217,29 +217,21 @@ class _Parts:
         points = columns.pop(_XYZ)
         return Tile(self._lattice.tile(index), points, ground_z, fields=columns)
 
-    @property
-    def heights(self) -> Mapping[TileIndex, Heights]:
-        """Of all points."""
-        return _Asked(self.points, lambda index: self._heights(index, self.read(index)[_XYZ]))
+    def heights(self, *, of_ground: bool = False) -> Mapping[TileIndex, Heights]:
+        """Of all points, or of those that the file classifies as ground, if it does."""
 
-    @property
-    def road(self) -> Mapping[TileIndex, Heights]:
-        """Of the points that the file classifies as ground, if it does."""
-
-        def ground(index: TileIndex) -> Heights:
+        def ask(index: TileIndex) -> Heights:
             columns = self.read(index)
-            return self._heights(index, columns[_XYZ][columns["classification"] == GROUND])
+            points = columns[_XYZ][columns["classification"] == GROUND] if of_ground else columns[_XYZ]
+            return flat_cells(self._lattice.tile(index), points), points[:, 2]
 
-        return _Asked(dict.fromkeys(self._grounded), ground)
-
-    def _heights(self, index: TileIndex, points: F32) -> Heights:
-        return flat_cells(self._lattice.tile(index), points), points[:, 2]
+        return _Asked(self._grounded if of_ground else self.points, ask)
 
 
 class _Asked(Mapping[TileIndex, Heights]):
     """A mapping that computes a value at every access."""
 
-    def __init__(self, keys: Mapping[TileIndex, Any], ask: Callable[[TileIndex], Heights]) -> None:
+    def __init__(self, keys: Collection[TileIndex], ask: Callable[[TileIndex], Heights]) -> None:
         self._keys, self._ask = keys, ask
 
     def __getitem__(self, index: TileIndex) -> Heights:
