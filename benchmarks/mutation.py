@@ -29,6 +29,7 @@ DECIDING = [
     "fusion/distrust", "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper",
     "detection/evidence", "detection/packed_tiles", "detection/surfaces", "perception/fans", "perception/raycast",
     "slam/clean_map", "server/store/votes", "server/store/publish", "localisation/odometry", "localisation/pose_check",
+    "doctor/map_fit", "doctor/prior_fit", "formats/drives/trajectory", "formats/geo/units",
 ]  # fmt: skip
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
@@ -40,6 +41,10 @@ TESTS = {
     **dict.fromkeys(("detection/evidence", "detection/packed_tiles", "detection/surfaces"), "detection"),
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
     "server/store/publish": "server/store/test_publish_limits.py server/views/test_rounds.py",
+    "doctor/map_fit": "doctor/test_drives.py",
+    "doctor/prior_fit": "doctor/test_small.py doctor/test_drives.py",
+    "formats/drives/trajectory": "formats/drives",
+    "formats/geo/units": "formats/geo/test_frames.py",
 }
 """The tests that must notice; of the other modules those of the same name."""
 SWAPS = {
