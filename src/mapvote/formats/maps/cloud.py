@@ -117,7 +117,7 @@ def joined(pieces: Iterable[Cloud]) -> Cloud:
     )
 
 
-def cloud_of(where: str, table: NDArray[np.void]) -> Cloud:
+def cloud_of_table(where: str, table: NDArray[np.void]) -> Cloud:
     """The points of a structured array with x, y, z, and of its fields what a map keeps: numbers under LAS's names,
     PCL's packed rgb taken apart. MapvoteError as :func:`xyz`."""
     names = table.dtype.names or ()

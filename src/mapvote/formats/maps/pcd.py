@@ -17,7 +17,7 @@ from pypcd4 import Encoding, MetaData, PointCloud
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of, table_of, warn_of_float32
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of, warn_of_float32
 
 _BLOCK = 500_000
 """Points read at a time."""
@@ -80,7 +80,7 @@ def stream_pcd(path: Path) -> Iterator[Cloud]:
         found = 0
         for table in tables:
             found += len(table)
-            yield cloud_of(str(path), table)
+            yield cloud_of_table(str(path), table)
         _check_count(path, found, about, 0 if compressed else _rest(file, about))
 
 

@@ -17,7 +17,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of, table_of
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of
 
 _BLOCK = 500_000
 """Vertices handed on at a time."""
@@ -42,7 +42,7 @@ def stream_ply(path: Path) -> Iterator[Cloud]:
         for start in range(0, max(len(vertices), 1), _BLOCK):
             part = np.array(vertices[start : start + _BLOCK])
             part = part.astype(part.dtype.newbyteorder("="))
-            yield cloud_of(str(path), part)
+            yield cloud_of_table(str(path), part)
 
 
 def write_ply(path: Path, cloud: Cloud | CloudPieces) -> None:
