@@ -60,13 +60,6 @@ def test_nearest_neighbour_finds_the_fallen_and_the_new(old_map: PointMap) -> No
     assert 0 < detector.memory_bytes < 10e6
 
 
-def test_movers_are_no_new_objects(old_map: PointMap) -> None:
-    points, obstacle = today()
-    detector = NearestNeighbour(map_obstacles(old_map), GRID)
-    detector.push(points, ORIGIN, obstacle, obstacle & (points[:, 1] < 7))
-    assert not (detector.states() == CellState.CHANGED_OCCUPIED).any()
-
-
 @pytest.mark.slow
 def test_evidence_finds_them_too_and_says_nothing_about_what_is_hidden(old_map: PointMap) -> None:
     points, obstacle = today()
@@ -81,10 +74,6 @@ def test_evidence_finds_them_too_and_says_nothing_about_what_is_hidden(old_map: 
     assert (states[22, columns(8, 14)] == CellState.CHANGED_OCCUPIED).all()
     assert (states[52, columns(14, 23)] == CellState.UNCHANGED_OCCUPIED).all()
     assert (states[52, columns(8, 11)] == CellState.UNDETERMINED).all()
-
-
-def test_no_vehicle_no_evidence(old_map: PointMap) -> None:
-    assert (combine([], reference_window(old_map, GRID)) == 255).all()
 
 
 masses = st.tuples(st.floats(0, 1), st.floats(0, 1)).map(lambda m: (0.99 * m[0], 0.99 * (1 - m[0]) * m[1]))

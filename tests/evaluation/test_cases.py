@@ -17,11 +17,7 @@ from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.cases import as_paper, choose_cases
 from mapvote_lab.evaluation.scene import (
-    _DRIVES_FROM,
-    _MAP_FROM,
-    BALLOTS_FROM,
     SharedPass,
-    sources_digest,
 )
 
 N = 8
@@ -79,30 +75,8 @@ def test_an_occluded_scan_abstains_by_default_and_the_map_of_the_papers_street_k
     settings = as_paper(Settings(), "as_published")
     assert settings.paper.occluded == "abstains"
     assert not settings.mapping.drop_strays
-
-
-def test_on_every_other_street_the_settings_stay_as_they_are() -> None:
-    assert as_paper(Settings(), "street570") == Settings()
-    assert as_paper(Settings(), "street570", reading="n_min=3").paper.n_min == 3
-
-
-def test_what_the_user_set_stays() -> None:
-    told = as_paper(Settings(), "as_published", ["paper.n_min", "mapping.drop_strays", "fuse.min_votes"])
-    assert told == Settings()
-    read = as_paper(Settings(), "as_published", ["paper.n_min"], "occluded=votes")
-    assert read.paper.occluded == "votes"
-
-
-def test_a_reading_there_is_not_is_refused() -> None:
+    assert as_paper(Settings(), "street570") == Settings(), "every other street is as it is set"
+    assert as_paper(Settings(), "as_published", ["mapping.drop_strays"]) == Settings(), "what the user set stays"
+    assert as_paper(Settings(), "street570", reading="occluded=votes").paper.occluded == "votes"
     with pytest.raises(MapvoteError, match="occluded=abstains"):
         as_paper(Settings(), "as_published", reading="hidden=no")
-
-
-@pytest.mark.parametrize("parts", [_DRIVES_FROM, _MAP_FROM, BALLOTS_FROM])
-def test_the_sources_that_a_cached_result_depends_on_exist(parts: tuple[str, ...]) -> None:
-    assert len(sources_digest(parts)) == 64
-
-
-def test_a_source_that_is_not_there_is_an_error() -> None:
-    with pytest.raises(FileNotFoundError, match="no_such_room"):
-        sources_digest(("core", "no_such_room"))

@@ -16,7 +16,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation import tables
 from mapvote_lab.evaluation.cases import choose_cases
-from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
+from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, running_server
 from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import EvaluationResult, to_json
 from mapvote_lab.evaluation.tables import ReportSection, page
@@ -153,3 +153,12 @@ def mapvote_map_points(folder: Path) -> int:
     from mapvote.formats import read_map
 
     return len(all_points(read_map(folder)))
+
+
+@pytest.mark.slow
+def test_a_server_that_cannot_start_says_why(tmp_path: Path) -> None:
+    with (
+        pytest.raises(MapvoteError, match="did not start"),
+        running_server(tmp_path / "s.db", tmp_path / "no map", tmp_path / "log"),
+    ):
+        pass

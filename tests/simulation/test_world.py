@@ -70,11 +70,6 @@ def test_the_road_is_crowned_kerbed_and_no_steeper_than_it_says() -> None:
     assert 0.1 < walk - edge < 0.2
 
 
-def test_other_worlds_of_the_same_seed_do_not_depend_on_the_number_of_vehicles() -> None:
-    few, many = (make_world(load_scenario("corner", {"vehicles": n}), 2) for n in (3, 10))
-    np.testing.assert_array_equal(few.mesh(few.standing(None))[0], many.mesh(many.standing(None))[0])
-
-
 def test_a_body_changes_the_map_only_if_every_pass_agrees() -> None:
     triangle = np.zeros((1, 3, 3))
     roles = {
