@@ -23,8 +23,6 @@ from mapvote_lab.evaluation.scores import (
     PAPER_SCORES,
     UNSCORED,
     MapJudge,
-    binned,
-    confusion,
     determined_share,
     map_obstacles,
     reliability,
@@ -45,7 +43,6 @@ def test_table_iv_follows_from_tables_ii_and_iii(case: str) -> None:
 def test_counts_by_hand() -> None:
     truth = np.array([[1, 1, 2, 2, 0, 0, UNSCORED]], dtype=np.uint8)
     states = np.array([[2, 4, 3, 2, 3, 255, 3]], dtype=np.uint8)
-    assert confusion(states, truth).tolist() == [[1, 0, 1], [1, 1, 0], [0, 1, 1]]
     scores = score_cells(states, truth)
     assert tuple(scores.precision) == (0.5, 0.5, 0.5)
     assert tuple(scores.recall) == (0.5, 0.5, 0.5)
@@ -172,15 +169,6 @@ def test_the_obstacles_of_a_map_are_its_points_above_the_ground_tile_by_tile() -
     assert map_obstacles(make_map({})).shape == (0, 3)
 
 
-def test_a_bin_tells_how_often_what_it_speaks_of_was_so() -> None:
-    found = binned(np.array([0.05, 0.92, 0.94, 0.96, 1.0]), np.array([False, True, True, False, True]))
-    assert found.cells.tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 0, 4]
-    assert found.true[-1] == pytest.approx(0.75)
-    assert found.predicted[-1] == pytest.approx(0.955)
-    assert np.isnan(found.true[1:-1]).all()
-    assert found.calibration_error == pytest.approx((0.05 + 4 * 0.205) / 5)
-
-
 def test_only_cells_that_are_scored_count_wherever_their_tile_lies() -> None:
     lattice = Lattice()
     states = np.full((256, 256), NO_VOTE, dtype=np.uint8)
@@ -193,4 +181,7 @@ def test_only_cells_that_are_scored_count_wherever_their_tile_lies() -> None:
     truth[1, 3], truth[1, 4] = 2, 255
     found = reliability({(1, 0): decision}, lattice, truth, window, CellState.CHANGED_EMPTY)
     assert found.cells.sum() == 2
-    assert np.nansum(found.true * found.cells) == 1
+    assert found.true[found.cells > 0].tolist() == [1.0, 0.0]
+    right, wrong = found.predicted[found.cells > 0]
+    assert found.calibration_error == pytest.approx((1.0 - right + wrong) / 2)
+    assert found.brier == pytest.approx(((1.0 - right) ** 2 + wrong**2) / 2)

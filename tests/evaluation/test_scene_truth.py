@@ -65,12 +65,9 @@ def test_a_truth_is_read_as_it_was_written(truth: Truth) -> None:
 
 def test_half_a_truth_or_one_of_other_planes_is_none_and_says_what_to_do(tmp_path: Path) -> None:
     folder = write_scene(tmp_path) / "truth"
-    for spoil in (
-        lambda: np.savez(folder / "truth.npz", strict=np.zeros((2, 2))),
-        (folder / "truth.npz").unlink,
-        (folder / "objects.json").unlink,
-    ):
-        spoil()
+    np.savez(folder / "truth.npz", strict=np.zeros((2, 2)))
+    for missing in ("none", "truth.npz", "objects.json"):
+        (folder / missing).unlink(missing_ok=True)
         with pytest.raises(MapvoteError, match=r"truth: no usable truth .* simulate the scene again"):
             read_truth(tmp_path)
 

@@ -1,6 +1,8 @@
-"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V).
+"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V): how far
+poses and maps are off the truth, and how well a vehicle localises where the world changed, in the old map, in the
+updated one, and in one surveyed anew.
 
-The vehicles vote through a real server: its own process on this machine, spoken to by HTTP alone (paper, Figure 1).
+A round of votes through a real server: its own process on this machine, spoken to by HTTP alone (paper, Figure 1).
 """
 
 from __future__ import annotations
@@ -34,21 +36,16 @@ from mapvote_lab.evaluation.cases import Case, Progress, fuse_case, read_kept, s
 from mapvote_lab.evaluation.scene import Pass, Scene, pass_folder, passes
 from mapvote_lab.evaluation.scores import CaseResult, Cost, EvaluationResult, MapShift, PoseErrors, Scores, Timings
 from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth, error_summary, rigid_between
-from mapvote_lab.simulation.routes import ar1
+from mapvote_lab.simulation.routes import RTK_SIGMA_DEG, RTK_SIGMA_M, ar1
 
 
 def map_shift(scene: Scene) -> MapShift:
     """How far the first map lies from the truth: mean offset of the survey's poses, and the 95 % of their distances."""
     names = scene.drive_names("survey_")
     offset = np.concatenate([scene.survey_poses(n)[:, :3, 3] - scene.true_poses(n)[:, :3, 3] for n in names])
-    mean = offset.mean(axis=0)
-    return MapShift(
-        float(np.linalg.norm(mean)),
-        float(mean[0]),
-        float(mean[1]),
-        float(mean[2]),
-        float(np.percentile(np.linalg.norm(offset, axis=1), 95)),
-    )
+    x, y, z = offset.mean(axis=0).tolist()
+    p95_m = float(np.percentile(np.linalg.norm(offset, axis=1), 95))
+    return MapShift(float(np.linalg.norm(offset.mean(axis=0))), x, y, z, p95_m)
 
 
 def T_map_world_of(scene: Scene) -> F64:
@@ -58,23 +55,8 @@ def T_map_world_of(scene: Scene) -> F64:
     return rigid_between(believed, np.concatenate([scene.true_poses(n) for n in names]))
 
 
-def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, PoseErrors]:
-    """Each vehicle's pose errors in the map's frame."""
-    T_map_world = T_map_world_of(scene)
-    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}
-
-
 NEAR_M = 30.0
 """Scans this close to a changed object count."""
-_RTK_M, _RTK_DEG = 0.02, 0.05
-
-
-def scans_near_changes(scene: Scene, truth: Truth, drive: str) -> I64:
-    """Indices of a drive's scans taken within NEAR_M of a changed object's footprint."""
-    position = scene.true_poses(drive)[:, :2, 3]
-    corners = np.concatenate([np.asarray(o["footprint"]) for o in truth.objects]) if truth.objects else np.zeros((0, 2))
-    distance = np.linalg.norm(position[:, None] - corners[None], axis=2)
-    return np.flatnonzero((distance <= NEAR_M).any(axis=1))
 
 
 def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> F64:
@@ -82,11 +64,7 @@ def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> 
     tracker = Tracker(MapWindow(point_map), scene.settings.ndt)
     out = np.full((len(scans), 4, 4), np.nan)
     for k, i in enumerate(scans):
-        prior = None
-        if drive.T_map_lidar_prior is not None:
-            sigma_rad = float(np.radians(drive.prior_sigma_deg))
-            prior = PosePrior(drive.T_map_lidar_prior[i], drive.prior_sigma_m, sigma_rad)
-        fix = tracker.localise(drive.read_scan(int(i)), prior)
+        fix = tracker.localise(drive.read_scan(int(i)), PosePrior.of(drive, int(i)))
         if fix.trusted:
             out[k] = fix.registration.T_map_lidar
     return out
@@ -98,8 +76,13 @@ def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tupl
     folder = scene.work / f"surveyed-anew-without-{without}"
     names = [name for name in scene.drive_names("v") if name != without]
     if not folder.exists():
-        drives, told = [_with_rtk(scene, name) for name in names], partial(progress, "surveying anew")
-        point_map, report = build_map(drives, scene.settings, progress=told)
+        drives, sigma = [], np.array([RTK_SIGMA_M] * 3 + [np.radians(RTK_SIGMA_DEG)] * 3)
+        for name in names:  # the error is smooth, as the first survey's: white noise averages out
+            drive, rng = scene.drive(name), np.random.default_rng([scene.seed, *name.encode()])
+            errors = ar1(1e-9 * np.diff(drive.stamps_ns), sigma, rng)
+            T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
+            drives.append(replace(drive, T_map_lidar_prior=T, prior_sigma_m=RTK_SIGMA_M, prior_sigma_deg=RTK_SIGMA_DEG))
+        point_map, report = build_map(drives, scene.settings, progress=partial(progress, "surveying anew"))
         with whole_folder(folder, sign="poses.npy") as made:
             write_map(point_map, made / "map")
             np.save(made / "poses.npy", np.concatenate([track.T_map_lidar for track in report.tracks]))
@@ -107,20 +90,13 @@ def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tupl
     return read_map(folder / "map"), rigid_between(np.load(folder / "poses.npy"), truth)
 
 
-def _with_rtk(scene: Scene, name: str) -> Drive:
-    """The drive with a survey vehicle's prior. Its error is smooth, as the first survey's: white noise averages out."""
-    rng = np.random.default_rng([scene.seed, *name.encode()])
-    drive, sigma = scene.drive(name), np.array([_RTK_M] * 3 + [np.radians(_RTK_DEG)] * 3)
-    errors = ar1(1e-9 * np.diff(drive.stamps_ns), sigma, rng)
-    T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
-    return replace(drive, T_map_lidar_prior=T, prior_sigma_m=_RTK_M, prior_sigma_deg=_RTK_DEG)
-
-
 def in_changed_areas(
     scene: Scene, truth: Truth, vehicle: str, maps: Mapping[str, tuple[PointMap, F64]]
 ) -> dict[str, PoseErrors]:
     """Errors of one vehicle's scans near changes, by map (each with its T_map_world); empty if it came near none."""
-    drive, scans = scene.drive(vehicle), scans_near_changes(scene, truth, vehicle)
+    corners = [np.zeros((0, 2)), *(np.asarray(o["footprint"]) for o in truth.objects)]
+    away_m = scene.true_poses(vehicle)[:, None, :2, 3] - np.concatenate(corners)[None]
+    drive, scans = scene.drive(vehicle), np.flatnonzero((np.linalg.norm(away_m, axis=2) <= NEAR_M).any(axis=1))
     if not len(scans):
         return {}
     T_true = scene.true_poses(vehicle)[scans]
@@ -229,8 +205,15 @@ def evaluate(
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
     jury = Jury(first_map, truth)
-    best = _best(scene, cases)
-    outcomes, entries = _scored(scene, cases, drives, jury, progress)
+    best = next((c.name for c in cases if c.name == scene.settings.voting.method), cases[0].name)
+    outcomes, entries = dict[str, CaseOutcome](), dict[str, CaseResult]()
+    for i, case in enumerate(cases):
+        progress("scoring", i, len(cases))
+        ballots = [drive.ballots[case.name] for drive in drives]
+        outcomes[case.name] = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
+        votes = [sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles) for ballot in ballots]
+        entries[case.name] = jury.of_update(outcomes[case.name], [d.sizes[case.name] for d in drives], votes)
+    progress("scoring", len(cases), len(cases))
     T_map_world = T_map_world_of(scene)
     maps = {"old map": (first_map, T_map_world), f"updated map ({best})": (outcomes[best].updated, T_map_world)}
     scored = time.perf_counter()
@@ -247,7 +230,9 @@ def evaluate(
         coverage=entries[best].coverage,
         settings=scene.settings.model_dump(mode="json"),
         map_shift=map_shift(scene),
-        localisation=localisation(scene, drives),
+        localisation={
+            d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives
+        },
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
         ceilings=jury.ceilings(),
         cases=entries,
@@ -272,30 +257,3 @@ def _readings(
     kept = [read_kept(pass_folder(scene, cases, name, True)) for name in scene.drive_names("v")]
     truths = {name: jury.truths[name] for name in SIDE_BY_SIDE}
     return swept(kept, jury.first_map.counts > 0, scene.settings, truths, None if only == "all" else only, progress)
-
-
-def _best(scene: Scene, cases: Sequence[Case]) -> str:
-    names = [case.name for case in cases]
-    return scene.settings.voting.method if scene.settings.voting.method in names else names[0]
-
-
-def _scored(
-    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress
-) -> tuple[dict[str, CaseOutcome], dict[str, CaseResult]]:
-    """By case: what the server makes of its ballots, and the scores."""
-    outcomes: dict[str, CaseOutcome] = {}
-    entries: dict[str, CaseResult] = {}
-    for i, case in enumerate(cases):
-        progress("scoring", i, len(cases))
-        ballots = [drive.ballots[case.name] for drive in drives]
-        outcome = fuse_case(scene.point_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
-        outcomes[case.name] = outcome
-        sizes = [drive.sizes[case.name] for drive in drives]
-        entries[case.name] = jury.of_update(outcome, sizes, [_state_bytes(ballot) for ballot in ballots])
-    progress("scoring", len(cases), len(cases))
-    return outcomes, entries
-
-
-def _state_bytes(ballot: Ballot) -> int:
-    """Bytes of the votes alone, without new points and other planes."""
-    return sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles)

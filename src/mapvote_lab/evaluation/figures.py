@@ -308,14 +308,10 @@ def reliability_diagram(found: Mapping[CellState, Reliability]) -> Figure:
         column[1].set_xlabel("probability that is told")
         column[1].set_xlim(0, 1)
         for axis in column:
-            _plain(axis)
+            axis.grid(alpha=0.25, lw=0.6)
+            axis.set_axisbelow(True)
+            axis.spines[["top", "right"]].set_visible(False)
     axes[0, 0].set_ylim(-0.03, 1.03)
     axes[0, 0].set_ylabel("share that did change")
     axes[1, 0].set_ylabel("cells")
     return figure
-
-
-def _plain(axis: Any) -> None:
-    axis.grid(alpha=0.25, lw=0.6)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)

@@ -14,7 +14,7 @@ from mapvote import plots as style
 from mapvote.core.geometry import transform
 from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap, all_points
-from mapvote.core.types import F32, F64, U8, Bool, CellState
+from mapvote.core.types import F32, F64, Bool, CellState
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation import figures
@@ -88,7 +88,9 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     nearest = _scan_near(evaluation, areas)
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "surfaces") if n in evaluation.outcomes}
-    panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
+    truth = np.full(256, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
+    truth[[1, 2, UNSCORED]] = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED
+    panels = [("Truth (strict)", truth[evaluation.truth.strict])]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "surfaces", *YARDSTICKS)}
     names = {n: case_name(n) for n in shown}
@@ -98,32 +100,14 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     caption = "What the server decided, cell by cell; yellow in the truth: unscored."
     yield "states", figures.cell_states(panels, evaluation.window, outlines=outlines), caption
     yield "table_iv", figures.score_bars(shown, names), "Table IV as bars, the paper's figures beside ours."
-    yield from _of_our_own(evaluation)
-
-
-def _of_our_own(evaluation: Evaluation) -> Iterator[tuple[str, Figure, str]]:
-    """The reliability of the probabilities, if the shown case is ours."""
-    if evaluation.best != "surfaces":
-        return
-    decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
-    found = {
-        state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
-        for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
-    }
-    caption = "Share of the cells that really changed, by the probability they were decided with (strict truth)."
-    yield "reliability", figures.reliability_diagram(found), caption
-
-
-def _as_states(truth: U8) -> U8:
-    """A truth grid in the colours of states; what is not scored looks undetermined."""
-    states = np.full(truth.shape, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
-    for value, state in (
-        (1, CellState.CHANGED_OCCUPIED),
-        (2, CellState.CHANGED_EMPTY),
-        (UNSCORED, CellState.UNDETERMINED),
-    ):
-        states[truth == value] = state
-    return states
+    if evaluation.best == "surfaces":
+        decisions, lattice = evaluation.outcomes["surfaces"].decisions, evaluation.first_map.lattice
+        found = {
+            state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
+            for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+        }
+        caption = "Share of the cells that really changed, by the probability they were decided with (strict truth)."
+        yield "reliability", figures.reliability_diagram(found), caption
 
 
 def _paths(evaluation: Evaluation) -> list[tuple[str, F64]]:

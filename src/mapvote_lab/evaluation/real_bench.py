@@ -43,7 +43,7 @@ from mapvote_lab.evaluation.real_street import (
     with_fewer_points,
     without_prior,
 )
-from mapvote_lab.evaluation.scores import NEIGHBOURS, determined, ratio
+from mapvote_lab.evaluation.scores import NEIGHBOURS, ratio
 
 NEAR_CELLS = 5
 """1.5 m: precision is counted this close to the things, because over a street it depends on their number."""
@@ -251,7 +251,7 @@ class Bench:
             "drive": self.name,
             "scans": self.scans,
             "ground": {k: v if np.isfinite(v) else None for k, v in asdict(self.ground).items()},
-            "unchanged": {name: unchanged_figures(run, case) for name, run in self.runs.items()},
+            "unchanged": {name: run.figures(case) for name, run in self.runs.items()},
             "changed": {
                 name: {
                     "precision_near": precision_near(asked, run.states[case], run.street.grid),
@@ -261,21 +261,6 @@ class Bench:
             },
             "skipped": self.skipped,
         }
-
-
-def unchanged_figures(run: RealRun, case: str) -> dict[str, float]:
-    """Counts, shares of cells and scans, and errors in metres (0 where no scan was localised)."""
-    return {
-        "ballots": float(run.ballots),
-        "determined_cells": float(np.count_nonzero(determined(run.states[case]))),
-        "false_share": run.changed_share(case, with_movers=False),
-        "false_share_with_movers": run.changed_share(case, with_movers=True),
-        "false_share_of_mapped": run.changed_share(case, with_movers=False, of_mapped=True),
-        "lost_share": run.lost_share,
-        "wrong_share": run.wrong_share,
-        "median_error_m": float(np.median(run.error_m)) if len(run.error_m) else 0.0,
-        "max_error_m": float(run.error_m.max(initial=0.0)),
-    }
 
 
 def bench(

@@ -21,7 +21,6 @@ from mapvote_lab.evaluation.real_bench import (
     FoundThings,
     precision_near,
     score,
-    unchanged_figures,
 )
 from mapvote_lab.evaluation.real_street import FalseChange, RealRun, is_changed, largest_false_changes
 from mapvote_lab.evaluation.tables import Sheet, write_text
@@ -30,7 +29,8 @@ from mapvote_lab.evaluation.tables import Sheet, write_text
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
     """The ground, the unchanged street, its poses and largest false changes, and what was cast into the scans."""
     unchanged = _unchanged(bench, case), _poses(bench, case), _largest(bench, case)
-    sheets = [_ground(bench), *unchanged, _changed(bench, case), _in_rain(bench, case), _skipped(bench)]
+    skipped = Sheet(f"{bench.name}: not run", ("run", "why"), list(bench.skipped.items()))
+    sheets = [_ground(bench), *unchanged, _changed(bench, case), _in_rain(bench, case), skipped]
     return [sheet for sheet in sheets if sheet.rows]
 
 
@@ -53,7 +53,7 @@ def _unchanged(bench: Bench, case: str) -> Sheet:
     headings = "run", "cells determined", "false, %", "with movers, %", "of mapped, %"
     rows = []
     for name, run in bench.runs.items():
-        f = unchanged_figures(run, case)
+        f = run.figures(case)
         shares = (100 * f[key] for key in ("false_share", "false_share_with_movers", "false_share_of_mapped"))
         figures = f"{f['determined_cells']:.0f}", *(f"{share:.3f}" for share in shares)
         rows.append((name, *(figures if run.ballots else ["no ballot", *["-"] * 3])))
@@ -64,7 +64,7 @@ def _poses(bench: Bench, case: str) -> Sheet:
     headings = "run", "ballots", "lost, %", "wrong, %", "median, m", "worst, m"
     rows = []
     for name, run in bench.runs.items():
-        f = unchanged_figures(run, case)
+        f = run.figures(case)
         errors = f"{100 * f['wrong_share']:.1f}", f"{f['median_error_m']:.3f}", f"{f['max_error_m']:.3f}"
         seen = run.ballots > 0
         rows.append(
@@ -87,8 +87,8 @@ def _largest(bench: Bench, case: str) -> Sheet:
 def _changed(bench: Bench, case: str) -> Sheet:
     headings = ("thing", "asked", "half found", "touched", "cell recall", "rays a scan")
     rows, said = [], []
-    for name in bench.changed:
-        said.append(f"{_precision(bench, case, name):.2f} ({name})")
+    for name, (run, asked) in bench.changed.items():
+        said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
         for f in [] if name == BUILT_IN_RAIN else _found(bench, case, name):
             rows.append((f.kind, str(f.things), str(f.half), str(f.touched), f"{f.cell_recall:.2f}", f"{f.rays:.0f}"))
     title = f"{bench.name}: cast into the scans, {case}; precision within 1.5 m of them {', '.join(said)}"
@@ -114,15 +114,6 @@ def _found(bench: Bench, case: str, name: str) -> list[FoundThings]:
     return score(asked, run.states[case])
 
 
-def _precision(bench: Bench, case: str, name: str) -> float:
-    run, asked = bench.changed[name]
-    return precision_near(asked, run.states[case], run.street.grid)
-
-
-def _skipped(bench: Bench) -> Sheet:
-    return Sheet(f"{bench.name}: not run", ("run", "why"), [(name, why) for name, why in bench.skipped.items()])
-
-
 _HALF_M = 8.0
 _MOST = 20
 """Close-ups."""
@@ -134,20 +125,20 @@ def draw_worst(bench: Bench, case: str, folder: Path) -> list[Path]:
     """Pictures into ``folder``: false changes of the run with most of them, and what was cast into the scans."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
+
+    def file_of(name: str) -> Path:
+        return folder / f"{name.replace(' ', '_').replace(',', '').replace('%', 'percent')}.png"
+
     if bench.runs:
         worst = max(bench.runs, key=lambda name: bench.runs[name].changed_share(case, with_movers=False))
         for name in dict.fromkeys([next(iter(bench.runs)), worst]):
             run = bench.runs[name]
-            written.append(folder / f"false_{_file_name(name)}.png")
+            written.append(file_of(f"false {name}"))
             draw_false_changes(run, case, largest_false_changes(run, case), written[-1])
     for name, (run, asked) in bench.changed.items():
-        written.append(folder / f"{_file_name(name)}.png")
+        written.append(file_of(name))
         draw_things(run, case, asked, written[-1])
     return written
-
-
-def _file_name(run: str) -> str:
-    return run.replace(" ", "_").replace(",", "").replace("%", "percent")
 
 
 def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], path: Path) -> None:

@@ -123,11 +123,6 @@ class RealRun:
         """Of the scans: abstained."""
         return 1.0 - len(self.error_m) / self.scans
 
-    @property
-    def wrong_share(self) -> float:
-        """Of the scans: voted from a place WRONG_M or more beside the true one."""
-        return float(np.count_nonzero(self.error_m >= WRONG_M)) / self.scans
-
     def changed_share(self, case: str, *, with_movers: bool, of_mapped: bool = False) -> float:
         """Share of determined cells (of those in which the map holds something) decided as changed, where nothing did.
 
@@ -136,6 +131,20 @@ class RealRun:
         scored = determined(self.states[case]) & (np.ones_like(self.movers) if with_movers else ~self.movers)
         scored &= self.street.mapped if of_mapped else np.ones_like(scored)
         return ratio(np.count_nonzero(is_changed(self.states[case]) & scored), np.count_nonzero(scored))
+
+    def figures(self, case: str) -> dict[str, float]:
+        """Counts, shares of cells and scans, and errors in metres (0 where no scan was localised)."""
+        return {
+            "ballots": float(self.ballots),
+            "determined_cells": float(np.count_nonzero(determined(self.states[case]))),
+            "false_share": self.changed_share(case, with_movers=False),
+            "false_share_with_movers": self.changed_share(case, with_movers=True),
+            "false_share_of_mapped": self.changed_share(case, with_movers=False, of_mapped=True),
+            "lost_share": self.lost_share,
+            "wrong_share": float(np.count_nonzero(self.error_m >= WRONG_M)) / self.scans,
+            "median_error_m": float(np.median(self.error_m)) if len(self.error_m) else 0.0,
+            "max_error_m": float(self.error_m.max(initial=0.0)),
+        }
 
 
 def is_changed(states: U8) -> Bool:

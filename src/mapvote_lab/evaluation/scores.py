@@ -37,11 +37,6 @@ def ratio(part: float | np.integer, whole: float | np.integer) -> float:
     return float(part / whole) if whole else 0.0
 
 
-def harmonic_mean(p: float, r: float) -> float:
-    """2 p r / (p + r), the F1 score of one class; 0.0 if both are 0."""
-    return ratio(2.0 * p * r, p + r)
-
-
 class ByClass(msgspec.Struct, frozen=True):
     """A number for each of :data:`CLASSES`; iterates in their order."""
 
@@ -72,7 +67,11 @@ class Scores(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, precision: ByClass, recall: ByClass) -> Scores:
         """All scores from the two."""
-        f1 = ByClass(*(harmonic_mean(p, r) for p, r in zip(precision, recall, strict=True)))
+
+        def harmonic_mean(p: float, r: float) -> float:
+            return ratio(2.0 * p * r, p + r)
+
+        f1 = ByClass(*map(harmonic_mean, precision, recall))
         return cls(precision, recall, f1, f1.mean, harmonic_mean(precision.mean, recall.mean))
 
 
@@ -84,18 +83,11 @@ def classes_of(states: U8) -> U8:
     return out
 
 
-def confusion(states: U8, truth: U8) -> NDArray[np.int64]:
-    """(3, 3) cells by [truth class, decided class]; truth 255 is not counted. ValueError on different shapes."""
-    if states.shape != truth.shape:
-        raise ValueError(f"states {states.shape} and truth {truth.shape} are not the same window")
-    scored = truth != UNSCORED
-    pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
-    return np.bincount(pairs, minlength=9).reshape(3, 3)
-
-
 def score_cells(states: U8, truth: U8) -> Scores:
     """Precision and recall of decided ``states`` (CellState or NO_VOTE) against ``truth`` (0, 1, 2 or 255)."""
-    table = confusion(states, truth)
+    scored = truth != UNSCORED
+    pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
+    table = np.bincount(pairs, minlength=9).reshape(3, 3)
     right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
     precision = ByClass(*(ratio(right[k], decided[k]) for k in range(3)))
     return Scores.of(precision, ByClass(*(ratio(right[k], true[k]) for k in range(3))))
@@ -287,50 +279,32 @@ def reliability(
     As the server tells them (:func:`mapvote.fusion.loss_budget.change_probability`); votes are of vehicles, so
     ``decisions`` are two-stage ones.
     """
-    rows, cols, votes, against, odds = _decided(decisions, lattice, state)
-    kinds = np.zeros(len(rows), dtype=np.int64)
-    states = np.full(len(rows), state, dtype=np.uint8)
-    said = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds.astype(np.int8))
-    r, c = rows - window.row0, cols - window.col0
-    inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
-    found = truth[r[inside], c[inside]]
-    scored = found != UNSCORED
-    return binned(said[inside][scored], found[scored] == (1 if state == CellState.CHANGED_OCCUPIED else 2))
-
-
-def binned(said: F64, true: Bool) -> Reliability:
-    """Of probabilities (n,) and whether what they speak of is so (n,)."""
-    which = np.minimum((said * BINS).astype(np.int64), BINS - 1)
-    cells = np.bincount(which, minlength=BINS)
-    with np.errstate(invalid="ignore"):
-        predicted = np.bincount(which, weights=said, minlength=BINS) / cells
-        share = np.bincount(which, weights=true, minlength=BINS) / cells
-    apart = np.where(cells > 0, np.abs(np.nan_to_num(predicted) - np.nan_to_num(share)), 0.0)
-    return Reliability(
-        predicted,
-        share,
-        cells,
-        ratio(float((apart * cells).sum()), len(said)),
-        ratio(float(((said - true) ** 2).sum()), len(said)),
-    )
-
-
-def _decided(
-    decisions: Mapping[TileIndex, Decision], lattice: Lattice, state: CellState
-) -> tuple[I64, I64, I64, I64, I64]:
-    """(rows, cols on the lattice, votes for it, votes for something else; undetermined ones say nothing; how sure those
-    for it are), (n,) each."""
     parts = [np.zeros((5, 0), dtype=np.int64)]
     for index, decision in decisions.items():
         tile = lattice.tile(index)
         r, c = np.nonzero(decision.states == state)
         told = decision.tally[r, c].astype(np.int64) // VOTE_UNIT
         votes = told[:, state]
-        others = told[:, : CellState.UNDETERMINED].sum(axis=1) - votes
-        odds = decision.odds.at(r * TILE_CELLS + c)
-        parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, others, odds]))
+        against = told[:, : CellState.UNDETERMINED].sum(axis=1) - votes  # undetermined ones say nothing
+        parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, against, decision.odds.at(r * TILE_CELLS + c)]))
     rows, cols, votes, against, odds = np.concatenate(parts, axis=1)
-    return rows, cols, votes, against, odds
+    beside = alike_beside(rows, cols, np.zeros(len(rows), dtype=np.int64))
+    states = np.full(len(rows), state, dtype=np.uint8)
+    said = change_probability(states, votes, against, beside, odds.astype(np.int8))
+    r, c = rows - window.row0, cols - window.col0
+    inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
+    found = truth[r[inside], c[inside]]
+    scored = found != UNSCORED
+    true = found[scored] == (1 if state == CellState.CHANGED_OCCUPIED else 2)
+    said = said[inside][scored]
+    which = np.minimum((said * BINS).astype(np.int64), BINS - 1)
+    cells = np.bincount(which, minlength=BINS)
+    with np.errstate(invalid="ignore"):
+        predicted = np.bincount(which, weights=said, minlength=BINS) / cells
+        share = np.bincount(which, weights=true, minlength=BINS) / cells
+    apart = np.where(cells > 0, np.abs(np.nan_to_num(predicted) - np.nan_to_num(share)), 0.0)
+    off = float((apart * cells).sum()), float(((said - true) ** 2).sum())
+    return Reliability(predicted, share, cells, ratio(off[0], len(said)), ratio(off[1], len(said)))
 
 
 PAPER_SCORES = {
