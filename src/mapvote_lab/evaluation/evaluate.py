@@ -206,14 +206,7 @@ def evaluate(
     truth, first_map = scene.truth, scene.point_map
     jury = Jury(first_map, truth)
     best = next((c.name for c in cases if c.name == scene.settings.voting.method), cases[0].name)
-    outcomes, entries = dict[str, CaseOutcome](), dict[str, CaseResult]()
-    for i, case in enumerate(cases):
-        progress("scoring", i, len(cases))
-        ballots = [drive.ballots[case.name] for drive in drives]
-        outcomes[case.name] = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
-        votes = [sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles) for ballot in ballots]
-        entries[case.name] = jury.of_update(outcomes[case.name], [d.sizes[case.name] for d in drives], votes)
-    progress("scoring", len(cases), len(cases))
+    outcomes, entries = _scored(scene, cases, drives, jury, progress)
     T_map_world = T_map_world_of(scene)
     maps = {"old map": (first_map, T_map_world), f"updated map ({best})": (outcomes[best].updated, T_map_world)}
     scored = time.perf_counter()
@@ -257,3 +250,18 @@ def _readings(
     kept = [read_kept(pass_folder(scene, cases, name, True)) for name in scene.drive_names("v")]
     truths = {name: jury.truths[name] for name in SIDE_BY_SIDE}
     return swept(kept, jury.first_map.counts > 0, scene.settings, truths, None if only == "all" else only, progress)
+
+
+def _scored(
+    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress
+) -> tuple[dict[str, CaseOutcome], dict[str, CaseResult]]:
+    """By case: what the server makes of its ballots, and the scores."""
+    first_map, outcomes, entries = scene.point_map, dict[str, CaseOutcome](), dict[str, CaseResult]()
+    for i, case in enumerate(cases):
+        progress("scoring", i, len(cases))
+        ballots = [drive.ballots[case.name] for drive in drives]
+        outcomes[case.name] = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
+        votes = [sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles) for ballot in ballots]
+        entries[case.name] = jury.of_update(outcomes[case.name], [d.sizes[case.name] for d in drives], votes)
+    progress("scoring", len(cases), len(cases))
+    return outcomes, entries
