@@ -175,7 +175,7 @@ def test_only_cells_that_are_scored_count_wherever_their_tile_lies() -> None:
     states[2, 3:7] = CellState.CHANGED_EMPTY
     tally = np.zeros((256, 256, 5), dtype=np.int32)
     tally[..., CellState.CHANGED_EMPTY] = 3 * VOTE_UNIT
-    decision = Decision(states, tally, 3, 0, 0)
+    decision = Decision(states, tally, states, 1)
     window = Grid(lattice, 256 + 1, 0, 4, 6)  # of a tile to the north, without the last changed cell
     truth = np.zeros((4, 6), dtype=np.uint8)
     truth[1, 3], truth[1, 4] = 2, 255
