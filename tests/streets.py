@@ -95,12 +95,12 @@ def drive_along(
 def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
     """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
     named DRIVE-001, DRIVE-002 and so on."""
-    name, road, k = drive.drive_id, RoadDriven(), 1
+    name, road, k = drive.drive_id, RoadDriven(cuts), 1
     vehicle.drive_id = stretch_name(name, k)
     for i, scan in enumerate(drive):
         vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
-        if cuts.due(vehicle.report, vehicle.done, road):
-            k, road = k + 1, RoadDriven()
+        if road.is_full(vehicle.report, vehicle.done):
+            k, road = k + 1, RoadDriven(cuts)
             yield vehicle.cut(stretch_name(name, k))
     vehicle.finish()
     yield vehicle.ballot

@@ -270,13 +270,13 @@ def test_a_drive_cut_into_ballots_has_every_scan_in_exactly_one_whenever_they_ar
 
 def test_a_ballot_is_closed_by_road_by_time_and_by_a_stop_whichever_comes_first() -> None:
     def closes(cuts: Cuts, x_of: Callable[[int], float]) -> int | None:
-        report, road = DriveReport(), RoadDriven()
+        report, road = DriveReport(), RoadDriven(cuts)
         for i in range(400):
             T = np.eye(4)
             T[0, 3] = x_of(i)
             report.stamps_ns.append(i * 10**9)
             report.T_map_lidar.append(T)
-            if cuts.due(report, i + 1, road):
+            if road.is_full(report, i + 1):
                 return i
         return None
 

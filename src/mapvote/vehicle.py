@@ -153,42 +153,36 @@ class Cuts:
     stop_m: float = 1.0
     """Two places nearer than this are one stop."""
 
-    def due(self, report: DriveReport, done: int, road: RoadDriven) -> bool:
-        """Whether the ballot of the first ``done`` scans of ``report`` is to be closed now; ``road`` is theirs."""
-        road.follow(report, done, self.stop_m)
-        if not done:
-            return False
-        age_s = 1e-9 * (road.last_ns - report.stamps_ns[0])
-        stood_s = 1e-9 * (road.last_ns - road.moved_ns) if road.moved else 0.0
-        return road.length_m >= self.length_m or age_s >= self.time_s or stood_s >= self.stop_s
-
 
 class RoadDriven:
-    """What a drive's localised scans show of its road: updated as scans are done, each read once."""
+    """The road of the ballot that is open, by its localised scans: each is read once, when it is done."""
 
-    def __init__(self) -> None:
-        self.followed = 0
-        """Scans read."""
-        self.moved = False
+    def __init__(self, cuts: Cuts) -> None:
+        self._cuts, self._read, self._length_m = cuts, 0, 0.0
+        self._moved = False
         """Whether the vehicle has left the place where it began."""
-        self.length_m = 0.0
-        self.last_ns = self.moved_ns = 0
+        self._last_ns = self._moved_ns = 0
         """Stamps of the last scan, and of the last one that was not at the present place."""
         self._last: F64 | None = None
         self._place: F64 | None = None
 
-    def follow(self, report: DriveReport, done: int, stop_m: float) -> None:
-        """Read those of the first ``done`` scans of ``report`` that were not read yet."""
-        lost = set(report.lost) if done > self.followed else set()
-        for i in range(self.followed, done):
-            self.last_ns, position = report.stamps_ns[i], report.T_map_lidar[i][:3, 3]
-            if i not in lost and (self._place is None or np.linalg.norm(position - self._place) > stop_m):
-                self.moved = self._place is not None
-                self._place, self.moved_ns = position, self.last_ns
+    def is_full(self, report: DriveReport, done: int) -> bool:
+        """Whether the ballot of the first ``done`` scans of ``report`` is to be closed now."""
+        lost, cuts = set(report.lost) if done > self._read else set(), self._cuts
+        for i in range(self._read, done):
+            self._last_ns, position = report.stamps_ns[i], report.T_map_lidar[i][:3, 3]
+            if i not in lost and (self._place is None or np.linalg.norm(position - self._place) > cuts.stop_m):
+                self._moved = self._place is not None
+                self._place, self._moved_ns = position, self._last_ns
             if i not in lost and self._last is not None:
-                self.length_m += float(np.linalg.norm(position - self._last))
+                self._length_m += float(np.linalg.norm(position - self._last))
             self._last = None if i in lost else position
-        self.followed = done
+        self._read = done
+        if not done:
+            return False
+        age_s = 1e-9 * (self._last_ns - report.stamps_ns[0])
+        stood_s = 1e-9 * (self._last_ns - self._moved_ns) if self._moved else 0.0
+        return self._length_m >= cuts.length_m or age_s >= cuts.time_s or stood_s >= cuts.stop_s
 
 
 def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:

@@ -40,14 +40,17 @@ def voxels(points: F64) -> set[tuple[int, int, int]]:
     return {tuple(voxel) for voxel in np.floor(points / CELL_SIZE).astype(int).tolist()}
 
 
-@settings(max_examples=5)
-@given(st.integers(0, 2**32 - 1))
-def test_of_each_voxel_the_first_point_that_was_offered_is_kept(seed: int) -> None:
+@settings(max_examples=6)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([30, 100_000]))
+def test_of_each_voxel_the_first_point_that_was_offered_is_kept_whenever_points_are_sorted(seed: int, at: int) -> None:
     rng = np.random.default_rng(seed)
-    offered = [rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 3.0), (20, 3)) for _ in range(4)]
+    offered = [rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 3.0), (20, 3)) for _ in range(6)]
     new = NewPoints(LATTICE)
-    for points in offered:
-        new.offer(points)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(voter, "_COMPACT_AT", at)
+        for points in offered:
+            new.offer(points)
+    assert (len(new._runs[0, 0]) > 1) == (at == 30)
     kept = np.concatenate([new.by_tile()(tile) for tile in ((-1, -1), (-1, 0), (0, -1), (0, 0))])
     everything = np.concatenate(offered)
     assert len(kept) == len(voxels(kept)) == len(voxels(everything))
@@ -100,17 +103,3 @@ def test_what_lies_beyond_the_local_grid_is_new_where_it_stands_near_and_unmappe
     near = ((points - origin)[:, :2] ** 2).sum(axis=1) < REACH_M**2
     np.testing.assert_array_equal(found, np.flatnonzero(inside & (cell < 0) & near & (z - foot >= 0.3) & unmapped))
     assert len(found) > 100
-
-
-def test_runs_that_are_sorted_on_the_way_keep_the_first_point_of_each_voxel(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(4)
-    offered = [rng.uniform((-3.0, -3.0, 1.0), (3.0, 3.0, 3.0), (90, 3)) for _ in range(12)]
-    at_once, on_the_way = NewPoints(LATTICE), NewPoints(LATTICE)
-    for points in offered:
-        at_once.offer(points)
-    monkeypatch.setattr(voter, "_COMPACT_AT", 100)
-    for points in offered:
-        on_the_way.offer(points)
-    assert len(on_the_way._runs[0, 0]) > 2
-    for tile in ((-1, -1), (-1, 0), (0, -1), (0, 0)):
-        np.testing.assert_array_equal(on_the_way.by_tile()(tile), at_once.by_tile()(tile))

@@ -213,7 +213,7 @@ class LiveDrive:
         self.name, self.number = name, outbox.begin(name)
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
-        self._road, self._poses = RoadDriven(), deque[tuple[int, F64]](maxlen=_POSES)
+        self._road, self._poses = RoadDriven(self._cuts), deque[tuple[int, F64]](maxlen=_POSES)
         self._waiting = deque[WaitingScan]()
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
@@ -369,7 +369,7 @@ class LiveDrive:
             self._cut(self.vehicle, newest)  # the version of the open ballot ends here, a newer one does not
         if self.vehicle is None:
             self.vehicle = self._make_vehicle(self._maps.current())
-            self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(), 0
+            self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(self._cuts), 0
         vehicle = self.vehicle
         if self.first is not None:
             self.checked_now = self.first.add(scan, prior, vehicle)
@@ -377,11 +377,11 @@ class LiveDrive:
         self.counts.observed += 1
         vehicle.observe(scan, prior)
         self._count_votes(vehicle)
-        if self._cuts.due(vehicle.report, vehicle.done, self._road):
+        if self._road.is_full(vehicle.report, vehicle.done):
             self._cut(vehicle, self._maps.current())
 
     def _cut(self, vehicle: Vehicle, newest: PointMap) -> None:
-        self._road, self._finished = RoadDriven(), 0
+        self._road, self._finished = RoadDriven(self._cuts), 0
         self._leave(vehicle.cut(stretch_name(self.name, self.number + 1), newest))
 
     def _position(self, prior: F64 | None) -> F64 | None:
