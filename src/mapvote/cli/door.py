@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,11 +70,8 @@ def api_at(
     from mapvote.client.connection import Connection
 
     if is_url(name):
-        server = Connection(name, key=key_in(key_file), timeout_s=600.0)
-        try:
+        with closing(Connection(name, key=key_in(key_file), timeout_s=600.0)) as server:
             yield server
-        finally:
-            server.close()
         return
     from mapvote.server.http.app import URL, in_process
     from mapvote.server.views.localisation_gate import gate_by
@@ -189,16 +186,11 @@ def store_url(name: str) -> str:
     return url_of(given)
 
 
-@contextmanager
-def opened_store(name: str) -> Iterator[Store]:
+def opened_store(name: str) -> closing[Store]:
     """An existing store, closed at the end."""
     from mapvote.server.store.store import Store
 
-    store = Store.open(store_url(name))
-    try:
-        yield store
-    finally:
-        store.close()
+    return closing(Store.open(store_url(name)))
 
 
 def who() -> str:

@@ -20,7 +20,7 @@ from mapvote.server.errors import Unavailable
 from mapvote.server.http import desk_routes, event_routes, operator_routes, page_routes, vehicle_routes
 from mapvote.server.http.event_routes import deliver
 from mapvote.server.http.schemas import unreadable, unusable
-from mapvote.server.http.security import Guard, Hosts, Probe, Watch
+from mapvote.server.http.security import Guard, Hosts, Watch
 from mapvote.server.http.services import READING, Services
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
@@ -75,8 +75,7 @@ def create_app(
     app.add_exception_handler(400, unreadable)
     app.add_exception_handler(RequestValidationError, unusable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.lookups, opened=opened, owner=owner)
-    probe = Probe(parts.check_ready)
-    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)
+    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, ready=parts.check_ready)
     return app
 
 

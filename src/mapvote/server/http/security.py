@@ -168,36 +168,9 @@ def _is_address(name: str) -> bool:
     return True
 
 
+PROBES = ("/livez", "/readyz")
+"""Who asks without a key, by any name of the server, gets a status without content."""
 _PROBE_S = 1.0
-
-
-class Probe:
-    """``/livez`` and ``/readyz`` for requests without a key, by any name of the server: a status without content.
-
-    ``ready`` raises Unavailable if no ballot can be taken now. It is called at most once a second.
-    """
-
-    PATHS = ("/livez", "/readyz")
-
-    def __init__(self, ready: Callable[[], Awaitable[object]]) -> None:
-        self._ready = ready
-        self._until, self._status = 0.0, 503
-
-    async def answer(self, path: str) -> Response:
-        """200, or 503 where the server is not ready."""
-        if path == "/livez":
-            return Response(status_code=200)
-        now = time.monotonic()
-        if now >= self._until:
-            self._until = now + _PROBE_S
-            try:
-                await self._ready()
-                self._status = 200
-            except Unavailable:
-                self._status = 503
-        return Response(status_code=self._status)
-
-
 log = structlog.get_logger("mapvote")
 
 
@@ -207,14 +180,16 @@ def is_ballot(scope: Scope) -> bool:
 
 
 class Watch:
-    """The outermost layer. No key, header or query is ever logged."""
+    """The outermost layer. No key, header or query is ever logged.
 
-    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, probe: Probe) -> None:
-        self._app = app
-        self._probe = probe
-        self._hosts = hosts
-        self._guard = guard
-        self._metrics = metrics
+    ``ready`` raises Unavailable if no ballot can be taken now. Probes call it once a second at most.
+    """
+
+    def __init__(
+        self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, ready: Callable[[], Awaitable[object]]
+    ) -> None:
+        self._app, self._hosts, self._guard, self._metrics, self._ready = app, hosts, guard, metrics, ready
+        self._probed, self._until = 503, 0.0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -239,8 +214,8 @@ class Watch:
             await self._app(scope, receive, watched)
         except MapvoteError as error:
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
-            probed = asks and scope["path"] in Probe.PATHS
-            answer = await self._probe.answer(scope["path"]) if probed else refuse(error)
+            probed = asks and scope["path"] in PROBES
+            answer = Response(status_code=await self._status(scope["path"])) if probed else refuse(error)
             await answer(scope, receive, watched)
         except asyncio.CancelledError:  # the server stops and waits no longer
             await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
@@ -252,3 +227,16 @@ class Watch:
             tell = log.warning if status >= 500 else log.info
             name = key.name if key else "-"
             tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))
+
+    async def _status(self, path: str) -> int:
+        """The answer to a probe."""
+        if path == "/livez":
+            return 200
+        if time.monotonic() >= self._until:
+            self._until = time.monotonic() + _PROBE_S
+            try:
+                await self._ready()
+                self._probed = 200
+            except Unavailable:
+                self._probed = 503
+        return self._probed

@@ -71,7 +71,8 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 
 def _desk_of(store: Store, found: Round) -> Desk:
     version, budget = found.newest.number, found.asked.settings.false_deletions
-    tiles = [_before_and_after(store, version, fused) for fused in found.changed]
+    before = [_tile(store, version, fused.index) for fused in found.changed]
+    tiles = [(tile, edited_tile(fused, tile)) for fused, tile in zip(found.changed, before, strict=True)]
     decided = [fused.record for fused in found.changed if fused.record is not None]
     objects = change_objects(
         [changed_cells(*pair, [(record, ())]) for pair, record in zip(tiles, decided, strict=True)]
@@ -92,7 +93,7 @@ def _desk_of(store: Store, found: Round) -> Desk:
         new.index: (fused.hashes, new) for fused, (_, new) in zip(found.changed, tiles, strict=True) if fused.hashes
     }
     clouds = b"".join(came_and_went(old, new) for old, new in tiles)
-    waiting = waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
+    waiting = _waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
     return Desk(version, [], pending, waiting, left_out, cells, edited, clouds)
 
 
@@ -135,11 +136,9 @@ def _verdict_json(review: Review) -> dict[str, Any]:
     }
 
 
-def _before_and_after(store: Store, version: int, fused: Fused) -> tuple[Tile, Tile]:
-    window = store.lattice.tile(fused.index)
+def _tile(store: Store, version: int, index: TileIndex) -> Tile:
     with store.database.reading() as connection:
-        before = load_tile(connection, window, tile_of(connection, version, fused.index))
-    return before, edited_tile(fused, before)
+        return load_tile(connection, store.lattice.tile(index), tile_of(connection, version, index))
 
 
 def _cells_of(change: ChangeObject) -> dict[TileIndex, Bool]:
@@ -161,19 +160,15 @@ def _meet(mine: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> b
 _WAITS = "waits."
 
 
-def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[dict[str, Any]]:
+def _waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[dict[str, Any]]:
     """Deletions from a version's tiles that only the ``budget`` prevents, as GeoJSON features in map metres.
 
     "waits" is the reason, "false_deletion" the largest probability among its cells that something that stands would be
     deleted, "drive_by" the middle of its cells.
     """
     waits = {one.index: one.pending for one in fused if len(one.pending.cells)}
-    tiles = {}
-    for index in waits:
-        window = store.lattice.tile(index)
-        with store.database.reading() as connection:
-            tiles[index] = load_tile(connection, window, tile_of(connection, version, index))
-    objects = change_objects([changed_cells(tile, _emptied(tile, waits[index])) for index, tile in tiles.items()])
+    tiles = [_tile(store, version, index) for index in waits]
+    objects = change_objects([changed_cells(tile, _emptied(tile, waits[tile.index])) for tile in tiles])
     features: list[dict[str, Any]] = to_geojson(objects, store.lattice, map_id=store.map_id)["features"]
     for change, feature in zip(objects, features, strict=True):
         rows, cols = change.where

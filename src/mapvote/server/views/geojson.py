@@ -100,19 +100,8 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
             "type": "Polygon" if single else "MultiPolygon",
             "coordinates": polygons[0] if single else polygons,
         },
-        "properties": {
-            "kind": change.kind,
-            "size": change.size,
-            "area_m2": round(change.area_m2, 2),
-            "height_m": round(change.height_m, 2),
-            "volume_m3": round(change.volume_m3, 2),
-            "cells": change.cells,
-            "points": change.points,
-            "votes_min": change.votes_min,
-            "votes_median": change.votes_median,
-            "against_median": change.against_median,
-            "share_for": None if change.share_for is None else round(change.share_for, 3),
-            "probability": None if change.probability is None else round(change.probability, 3),
+        "properties": {name: _rounded(name, getattr(change, name)) for name in _FACTS}
+        | {
             "first_seen": utc(change.first_seen_ns),
             "last_seen": utc(change.last_seen_ns),
             "versions": change.versions,
@@ -120,6 +109,17 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
             "near": near,
         },
     }
+
+
+_FACTS = (
+    *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
+    *("against_median", "share_for", "probability"),
+)
+_DIGITS = {"area_m2": 2, "height_m": 2, "volume_m3": 2, "share_for": 3, "probability": 3}
+
+
+def _rounded(name: str, value: Any) -> Any:
+    return value if value is None or name not in _DIGITS else round(value, _DIGITS[name])
 
 
 def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
