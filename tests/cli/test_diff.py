@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from command_line import typed
 from made_courts import CARS, made_court
-from mapvote.cli import app
 from mapvote.codec.ballot import decode
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.types import MapvoteError
@@ -23,11 +22,8 @@ def test_diff_says_where_b_lies_how_it_decided_and_what_left(tmp_path: Path) -> 
     write_pcd(tmp_path / "a.pcd", Cloud(made_court()))
     write_pcd(tmp_path / "b.pcd", Cloud(moved))
     files = ["--out", str(tmp_path / "d.geojson"), "--csv", str(tmp_path / "d.csv"), "--html", str(tmp_path / "d.html")]
-    result = CliRunner().invoke(app, ["diff", str(tmp_path / "a.pcd"), str(tmp_path / "b.pcd"), *files])
-    assert result.exit_code == 0, result.output
-    assert "turned by -57." in result.output
-    assert "by geometry alone" in result.output
-    assert "gone: 1 things" in result.output
+    said = typed("diff", tmp_path / "a.pcd", tmp_path / "b.pcd", *files)
+    assert all(told in said for told in ("turned by -57.", "by geometry alone", "gone: 1 things"))
     assert [f["properties"]["kind"] for f in json.loads((tmp_path / "d.geojson").read_text())["features"]] == ["gone"]
     assert (tmp_path / "d.csv").read_text().startswith("id,kind,")
     assert "<canvas" in (tmp_path / "d.html").read_text()
@@ -38,18 +34,14 @@ def test_a_map_without_ground_cannot_be_compared_and_says_so(tmp_path: Path) -> 
     above = court[court[:, 2] - 0.01 * court[:, 0] - 0.005 * court[:, 1] > 0.4]
     write_pcd(tmp_path / "a.pcd", Cloud(np.concatenate([above, above + 0.05])))
     write_pcd(tmp_path / "b.pcd", Cloud(court))
-    result = CliRunner().invoke(app, ["diff", str(tmp_path / "a.pcd"), str(tmp_path / "b.pcd")])
-    assert isinstance(result.exception, MapvoteError)
     with pytest.raises(MapvoteError, match="no ground"):
-        raise result.exception
+        typed("diff", tmp_path / "a.pcd", tmp_path / "b.pcd")
 
 
 def test_a_cloud_votes_by_its_file_and_says_that_no_free_space_is_learned(tmp_path: Path) -> None:
     write_pcd(tmp_path / "map.pcd", Cloud(made_court()))
     write_pcd(tmp_path / "robot.pcd", Cloud(made_court(CARS[1:], seed=2)))
     ballot = tmp_path / "robot.ballot"
-    said = ["vote", str(tmp_path / "robot.pcd"), "--map", str(tmp_path / "map.pcd"), "--out", str(ballot)]
-    result = CliRunner().invoke(app, said)
-    assert result.exit_code == 0, result.output
-    assert "no free space is learned" in result.output
+    said = typed("vote", tmp_path / "robot.pcd", "--map", tmp_path / "map.pcd", "--out", ballot)
+    assert "no free space is learned" in said
     assert decode(ballot.read_bytes()).vehicle == "robot"

@@ -8,111 +8,96 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from scipy.spatial import cKDTree
-from typer.testing import CliRunner
 
+from command_line import typed
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.cli import app
 from mapvote.codec.ballot import encode
 from mapvote.core.point_map import all_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import DriveWriter, read_map, write_pcd
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.server.store.store import Store
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
-    monkeypatch.setenv("COLUMNS", "200")
-    return CliRunner()
+from stores import NewStore
 
 
 def cloud() -> F64:
     return np.random.default_rng(1).uniform([-50, -50, 0], [50, 50, 5], (4000, 3))
 
 
-def invoke(run: CliRunner, *args: str | Path, code: int = 0) -> str:
-    result = run.invoke(app, [str(a) for a in args])
-    if isinstance(result.exception, MapvoteError):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.output
-
-
-def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: CliRunner) -> None:
+def test_import_then_info_then_export_keeps_every_point(tmp_path: Path) -> None:
     write_pcd(tmp_path / "a.pcd", Cloud(cloud()))
-    assert "4000 points in 4 tiles" in invoke(run, "import", tmp_path / "a.pcd", tmp_path / "m")
-    told = invoke(run, "info", tmp_path / "m")
+    assert "4000 points in 4 tiles" in typed("import", tmp_path / "a.pcd", tmp_path / "m")
+    told = typed("info", tmp_path / "m")
     assert "mapvote map" in told
     assert "never learned" in told, "free space"
     assert "4,000" in told
     for name in ("b.pcd", "b.las", "b.ply", "autoware"):
-        told = invoke(run, "export", tmp_path / "m", tmp_path / name)
+        told = typed("export", tmp_path / "m", tmp_path / name)
         assert "4000 points" in told
         assert "dropped: ground heights" in told
         away, partner = cKDTree(all_points(read_map(tmp_path / name))).query(all_points(read_map(tmp_path / "m")))
         assert away.max() < 1e-4
         assert len(set(partner.tolist())) == 4000
-        assert "4,000" in invoke(run, "info", tmp_path / name)
+        assert "4,000" in typed("info", tmp_path / name)
     with pytest.raises(MapvoteError, match="three numbers"):
-        invoke(run, "export", tmp_path / "m", tmp_path / "c.pcd", "--offset", "1,2")
-    invoke(run, "export", tmp_path / "m", tmp_path / "c.ply", "--offset", "100,0,0")
+        typed("export", tmp_path / "m", tmp_path / "c.pcd", "--offset", "1,2")
+    typed("export", tmp_path / "m", tmp_path / "c.ply", "--offset", "100,0,0")
     assert all_points(read_map(tmp_path / "c.ply"))[:, 0].max() < 0
 
 
-def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:
+def test_info_of_a_drive_and_doctor(tmp_path: Path) -> None:
     writer = DriveWriter(tmp_path / "d", "car-7", SENSORS["vlp16"], start_ns=10**18).open()
     for i in range(4):
         writer.write_scan(i, cloud().astype(np.float32))
     writer.close(10**18 + np.arange(4) * 10**8)
-    told = invoke(run, "info", tmp_path / "d")
+    told = typed("info", tmp_path / "d")
     for word in ("car-7", "vlp16, 16 beams, 10 Hz", "4 in 0.3 s", "prior       │ none"):
         assert word in told
-    told = invoke(run, "doctor", tmp_path / "d", code=1)
+    told = typed("doctor", tmp_path / "d", code=1)
     assert "no prior" in told
     assert "scan 1 is the same as the one before it (3 such scans of 4)" in told
     with pytest.raises(MapvoteError, match=r"z is never negative.* Check --columns"):
-        invoke(run, "build", tmp_path / "d", "--out", tmp_path / "m")
+        typed("build", tmp_path / "d", "--out", tmp_path / "m")
     (tmp_path / "d" / "velodyne" / "000000.bin").write_bytes(b"12345")
-    assert "not a multiple of 16" in invoke(run, "doctor", tmp_path / "d", code=1)
+    assert "not a multiple of 16" in typed("doctor", tmp_path / "d", code=1)
 
 
 @pytest.mark.slow
-def test_the_doctor_takes_maps_stores_and_no_server(tmp_path: Path, run: CliRunner) -> None:
+def test_the_doctor_takes_maps_stores_and_no_server(tmp_path: Path, new_store: NewStore) -> None:
     write_pcd(tmp_path / "a.pcd", Cloud(1000.0 * cloud()))
-    assert "millimetres, or centimetres?" in invoke(run, "doctor", tmp_path / "a.pcd", code=1)
+    assert "millimetres, or centimetres?" in typed("doctor", tmp_path / "a.pcd", code=1)
     with pytest.raises(MapvoteError, match="give the points in metres"):
-        invoke(run, "import", tmp_path / "a.pcd", tmp_path / "m")
-    Store.create(f"sqlite:///{tmp_path}/fleet.db", two_walls()).close()
-    assert "no operator has a valid key" in invoke(run, "doctor", tmp_path / "fleet.db")
+        typed("import", tmp_path / "a.pcd", tmp_path / "m")
+    new_store(name="fleet.db")
+    assert "no operator has a valid key" in typed("doctor", tmp_path / "fleet.db")
     with pytest.raises(MapvoteError, match="mapvote check http"):
-        invoke(run, "doctor", "http://127.0.0.1:1")
+        typed("doctor", "http://127.0.0.1:1")
 
 
-def test_info_of_a_ballot(tmp_path: Path, run: CliRunner) -> None:
+def test_info_of_a_ballot(tmp_path: Path) -> None:
     cells = {(r, c): CellState.CHANGED_OCCUPIED for r in range(3) for c in range(7)}
     ballot = make_ballot(two_walls(), {(0, 0): Say(states_plane(cells))}, "v9", "d")
     ballot = replace(ballot, scans=10, scans_localised=9)
     (tmp_path / "b.ballot").write_bytes(encode(ballot))
-    told = invoke(run, "info", tmp_path / "b.ballot")
+    told = typed("info", tmp_path / "b.ballot")
     for word in ("v9", "9 of 10 voted", "changed occupied", "21 cells"):
         assert word in told
 
 
-def test_info_of_nonsense_is_one_clear_error(tmp_path: Path, run: CliRunner) -> None:
+def test_info_of_nonsense_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(b"nonsense")
     with pytest.raises(MapvoteError, match="neither map nor drive, and no ballot"):
-        invoke(run, "info", tmp_path / "x.bin")
+        typed("info", tmp_path / "x.bin")
     with pytest.raises(MapvoteError, match="nothing is there"):
-        invoke(run, "info", tmp_path / "y")
+        typed("info", tmp_path / "y")
 
 
-def test_config_tells_value_and_source(tmp_path: Path, run: CliRunner) -> None:
+def test_config_tells_value_and_source(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[paper]\nn_min = 7\n")
-    told = invoke(run, "config", "--config", tmp_path / "s.toml")
+    told = typed("config", "--config", tmp_path / "s.toml")
     line = next(line for line in told.splitlines() if "paper.n_min" in line)
     assert " 7 " in line
     assert "default" not in line
-    toml = invoke(run, "config", "--toml")
+    toml = typed("config", "--toml")
     (tmp_path / "all.toml").write_text(toml)
-    assert invoke(run, "config", "--toml", "--config", tmp_path / "all.toml") == toml
+    assert typed("config", "--toml", "--config", tmp_path / "all.toml") == toml

@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 from typer.main import get_command
-from typer.testing import CliRunner
 
+from command_line import typed
 from live_server import mapvote
 from mapvote.cli import app, run
 from mapvote.cli.options import DRIVE_OPTIONS
@@ -23,20 +22,14 @@ from mapvote.formats.drives.options import SaidOfDrive
 VERBS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
 
 
-def ask(*words: str) -> str:
-    result = CliRunner().invoke(app, list(words), env={"COLUMNS": "160", "NO_COLOR": "1"}, prog_name="mapvote")
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 def test_the_version_is_the_packages() -> None:
     from importlib.metadata import version
 
-    assert ask("--version") == f"mapvote {version('mapvote')}\n"
+    assert typed("--version") == f"mapvote {version('mapvote')}\n"
 
 
 def test_help_groups_every_verb() -> None:
-    told = ask("--help")
+    told = typed("--help")
     for group in ("Drive", "Map", "Server", "Simulate and evaluate", "Set up"):
         assert f"─ {group} ─" in told
     assert "─ Commands ─" not in told  # where typer puts what has no group
@@ -44,13 +37,9 @@ def test_help_groups_every_verb() -> None:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_the_help_of_every_verb_ends_with_an_example(verb: str) -> None:
-    text = ask(verb, "--help")
+def test_the_help_of_every_verb_ends_with_an_example_and_explains_all_that_it_takes(verb: str) -> None:
+    text = typed(verb, "--help")
     assert f" mapvote {verb} " in text.split("╭─")[0].partition("Usage:")[2].partition("\n")[2]
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_everything_that_a_verb_takes_is_explained(verb: str) -> None:
     for parameter in get_command(app).commands[verb].params:  # type: ignore[attr-defined]
         assert getattr(parameter, "help", "") or parameter.name == "help", f"{verb}: {parameter.name}"
 
@@ -63,22 +52,11 @@ def test_a_shell_can_complete(shell: str) -> None:
     assert "_MAPVOTE_COMPLETE" in said.stdout
 
 
-def test_drive_options_are_those_of_open_drive() -> None:
+def test_drive_options_are_those_of_open_drive_for_every_verb_that_takes_a_drive() -> None:
     assert set(inspect.signature(open_drive).parameters) == {"path", "said"}
     assert set(DRIVE_OPTIONS) | {"vehicle", "frame"} == set(SaidOfDrive.__annotations__)
-
-
-@pytest.mark.parametrize("verb", ["build", "vote", "doctor"])
-def test_every_verb_that_takes_a_drive_takes_the_same_options(verb: str) -> None:
-    taken = {p.name for p in get_command(app).commands[verb].params}  # type: ignore[attr-defined]
-    assert set(DRIVE_OPTIONS) <= taken
-
-
-def test_import_and_export_take_what_is_there_and_what_to_write() -> None:
-    for verb in ("import", "export"):
-        arguments = [p for p in get_command(app).commands[verb].params if isinstance(p, typer.core.TyperArgument)]  # type: ignore[attr-defined]
-        assert [p.name for p in arguments][1] == "out"
-        assert len(arguments) == 2
+    for verb in ("build", "vote", "doctor"):
+        assert {p.name for p in get_command(app).commands[verb].params} >= set(DRIVE_OPTIONS)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -104,9 +82,7 @@ def test_a_mistake_is_one_line_on_stderr(
 
 
 def test_a_wrong_option_is_a_usage_error() -> None:
-    result = CliRunner().invoke(app, ["simulate", "corner", "--sed", "3"])
-    assert result.exit_code == 2
-    assert "No such option" in result.output
+    assert "No such option" in typed("simulate", "corner", "--sed", 3, code=2)
 
 
 def test_listing_the_verbs_imports_nothing_heavy() -> None:

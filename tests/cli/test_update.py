@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from command_line import typed
 from hand_made import make_ballot, two_walls
-from mapvote.cli import app
 from mapvote.codec.ballot import MOST_STEPS, encode
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
@@ -17,9 +16,8 @@ from stores import WALL, wall_gone
 
 
 @pytest.fixture
-def round_of_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def round_of_two(tmp_path: Path) -> list[str]:
     """A map and two ballots: its first wall is gone, but of the cell in the middle nobody is sure."""
-    monkeypatch.setenv("COLUMNS", "200")
     write_map(two_walls(), tmp_path / "map")
     say = wall_gone(odds=np.array([40, -MOST_STEPS, 40], np.int8))
     for name in "ab":
@@ -27,29 +25,17 @@ def round_of_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return [str(tmp_path / name) for name in ("map", "a.ballot", "b.ballot")]
 
 
-def update(*words: str | Path) -> str:
-    result = CliRunner().invoke(app, ["update", *map(str, words)], catch_exceptions=False)
-    return result.output
-
-
 def test_what_is_beyond_the_budget_stays_and_is_told_with_where_to_drive_by(
     round_of_two: list[str], tmp_path: Path
 ) -> None:
-    said = update(*round_of_two, "--out", tmp_path / "new", "--false-deletions", "0.01")
+    said = typed("update", *round_of_two, "--out", tmp_path / "new", "--false-deletions", "0.01")
     assert "6 deleted" in said
     assert "1 cell keeps its points: that something there still stands is likelier than 0.01. Drive by:" in said
     assert "3.4, 3.1" in said
     kept = read_map(tmp_path / "new").tiles[0, 0].obstacle_words
     assert [bool(kept[cell]) for cell in WALL] == [False, True, False]
-
-
-def test_without_a_budget_nothing_is_kept(round_of_two: list[str]) -> None:
-    said = update(*round_of_two, "--dry-run")
-    assert "9 deleted" in said
-    assert "Drive by" not in said
-
-
-@pytest.mark.parametrize("value", ["0", "-1", "2"])
-def test_a_budget_that_is_no_probability_is_refused(round_of_two: list[str], value: str) -> None:
-    with pytest.raises(MapvoteError, match="give a probability above 0"):
-        update(*round_of_two, "--dry-run", f"--false-deletions={value}")
+    said = typed("update", *round_of_two, "--dry-run")
+    assert ("9 deleted" in said, "Drive by" in said) == (True, False), "without a budget nothing is kept"
+    for value in ("0", "-1", "2"):
+        with pytest.raises(MapvoteError, match="give a probability above 0"):
+            typed("update", *round_of_two, "--dry-run", f"--false-deletions={value}")

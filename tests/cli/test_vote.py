@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from mapvote.cli import app
+from command_line import typed
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
@@ -33,20 +32,15 @@ def drive(folder: Path) -> Path:
     return folder
 
 
-def vote(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, ["vote", *map(str, arguments), "--trust-prior"], catch_exceptions=False)
-    return result.output
-
-
 def test_a_ballot_goes_to_the_server_whose_map_it_was_cast_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_map(map_from_points(street(20.05), map_id="street"), tmp_path / "map")
     recorded = drive(tmp_path / "v1")
     with running_server(tmp_path / "store.db", tmp_path / "map", tmp_path / "log") as url:
-        said = vote(recorded, "--map", url, "--send", url)
-        again = vote(recorded, "--map", url, "--send", url)
+        said = typed("vote", "--trust-prior", recorded, "--map", url, "--send", url)
+        again = typed("vote", "--trust-prior", recorded, "--map", url, "--send", url)
     monkeypatch.setattr("time.sleep", lambda seconds: None)
-    away = vote(recorded, "--map", url, "--send", url, "--vehicle", "v2")
+    away = typed("vote", "--trust-prior", recorded, "--map", url, "--send", url, "--vehicle", "v2")
     assert "Version 1 is kept here and used" in away
     assert f"{url} is away: the ballot waits" in away
     assert "20 of 20 scans localised" in said
@@ -56,4 +50,4 @@ def test_a_ballot_goes_to_the_server_whose_map_it_was_cast_on(tmp_path: Path, mo
 
 def test_a_ballot_needs_somewhere_to_go(tmp_path: Path) -> None:
     with pytest.raises(MapvoteError, match=r"--out BALLOT, --send URL"):
-        vote(tmp_path, "--map", tmp_path)
+        typed("vote", "--trust-prior", tmp_path, "--map", tmp_path)

@@ -12,12 +12,10 @@ import httpx2
 import pytest
 import structlog
 from fastapi.testclient import TestClient
-from typer.testing import CliRunner
 
-from command_line import type_in
+from command_line import type_in, typed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
-from mapvote.cli import app
 from mapvote.client import MapClient
 from mapvote.codec.ballot import encode
 from mapvote.core.types import MapvoteError
@@ -33,7 +31,7 @@ URL_WITH_PASSWORD = "postgresql+psycopg://mapvote:a-secret@127.0.0.1:9/mapvote"
 def refused(*arguments: object, **environment: str) -> str:
     """The error of `mapvote ARGUMENTS`."""
     with pytest.raises(MapvoteError) as error:
-        CliRunner().invoke(app, [str(argument) for argument in arguments], env=environment, catch_exceptions=False)
+        typed(*arguments, code=0, **environment)
     structlog.reset_defaults()  # `serve` logs to the runner's stderr, which is closed now
     return str(error.value)
 
@@ -131,8 +129,7 @@ def test_a_vehicle_takes_its_key_from_a_file_or_the_environment_never_from_the_c
     assert "--key-file" in shown
     assert "MAPVOTE_KEY" in shown
     asked = "vote", str(tmp_path), "--map", "x"
-    done = CliRunner().invoke(app, [*asked, "--send", "http://127.0.0.1:9", "--key", "a-secret"])
-    assert done.exit_code == 2
+    typed(*asked, "--send", "http://127.0.0.1:9", "--key", "a-secret", code=2)
     assert "holds no key" in refused(*asked, "--out", tmp_path / "o", "--key-file", tmp_path / "none")
 
 
