@@ -207,7 +207,7 @@ def summed(table: sa.Table) -> Sequence[str]:
 
 def is_sound(table: sa.Table, row: Any) -> bool:
     """Whether a row with all columns of its table's sum is what was written."""
-    return bool(row.sum == sum_of(*(getattr(row, name) for name in summed(table))))
+    return bool(row.sum == sum_of(*operator.attrgetter(*summed(table))(row)))
 
 
 REMEMBERED_BYTES = 128 << 20
