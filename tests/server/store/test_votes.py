@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.ballot import pack_points, unpack_points
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Memory
@@ -21,7 +20,6 @@ from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews
 from mapvote.server.store.integrity import ballot_name
 from mapvote.server.store.policy import Policy, RoundPolicy
-from mapvote.server.store.queries import Version
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
     Electorate,
@@ -103,24 +101,6 @@ def spoken(vote: TileVote) -> list[tuple[int, int]]:
     return [(int(r), int(c)) for r, c in np.argwhere(vote.states != NO_VOTE)]
 
 
-def test_a_standing_vote_counts_and_says_what_was_sent(store: Store) -> None:
-    free = words_plane({CELL: 0b11})
-    gone = words_plane({CELL: 0b10})
-    points = wall([OTHER], [0.75])
-    cast(store, "a", day=3, say=Say(states_plane({CELL: CE, OTHER: CO}), gone=gone, new_points=points, free=free))
-    assert judged(store, asked(store)) == {"a": ""}
-    (vote,) = counting(store, asked(store))
-    assert (vote.vehicle, vote.version, vote.tally) == ("a", 1, None)
-    assert vote.end_ns == (NOW_S - 97 * 86_400) * 10**9
-    assert vote.states is not None
-    assert (vote.states[CELL], vote.states[OTHER]) == (CE, CO)
-    assert vote.gone is not None
-    assert vote.free is not None
-    assert vote.new_points is not None
-    assert (vote.gone.words.tolist(), vote.free.words.tolist()) == ([0b10], [0b11])
-    assert vote.new_points.tobytes() == unpack_points(pack_points(points)).tobytes()
-
-
 def test_a_tally_is_read_as_a_tally(store: Store) -> None:
     tally = np.zeros((256, 256, 5), dtype=np.uint16)
     tally[CELL] = [1, 0, 0, 7, 2]
@@ -153,12 +133,6 @@ def test_a_round_is_asked_as_of_any_moment(store: Store) -> None:
     assert list(judged(store, asked(store, mark=second))) == ["a", "b"], "what was then stays what was then"
 
 
-def test_a_version_is_asked_of_again_with_the_minimum_age_that_it_had(store: Store) -> None:
-    policy = {"fuse": {"min_age_s": 90.0}}
-    version = Version(2, 1, "publish", None, NOW_S * 10**9, "anna", "", 7, policy)
-    assert Electorate.of(version).received_by_ns == (NOW_S - 90) * 10**9
-
-
 def test_ballots_cast_by_other_methods_or_settings_than_the_policy_asks_for_do_not_count(store: Store) -> None:
     cast(store, "a")
     cast(store, "b", method="paper")
@@ -173,15 +147,6 @@ def test_what_is_damaged_is_set_aside_on_its_tile(store: Store) -> None:
     seq = cast(store, "a", tiles=(HERE, BESIDE))
     assert judged(store, asked(store, set_aside=(ballot_name(seq, *HERE),))) == {"a": "damaged"}
     assert judged(store, asked(store, set_aside=(ballot_name(seq, *BESIDE),))) == {"a": ""}
-
-
-def test_votes_outside_the_window_do_not_count(store: Store) -> None:
-    for day, vehicle in enumerate("abc"):
-        cast(store, vehicle, day=10.0 * day)
-    assert judged(store, asked(store, fuse=FuseSettings(max_age_days=15))) == {"a": "window", "b": "", "c": ""}
-    few = judged(store, asked(store, fuse=FuseSettings(latest_vehicles=1)))
-    assert few == {"a": "window", "b": "window", "c": ""}
-    assert [vote.vehicle for vote in counting(store, asked(store, fuse=FuseSettings(latest_vehicles=1)))] == ["c"]
 
 
 def test_a_vote_counts_in_the_cells_that_have_not_changed_since(store: Store) -> None:
@@ -239,24 +204,21 @@ def recent(store: Store, question: Electorate) -> list[str]:
         return [vote.vehicle for vote in recent_votes(connection, tile, question)]
 
 
-def test_the_recent_past_is_of_every_vehicle_within_twice_the_days_that_a_thing_must_stay(store: Store) -> None:
+def test_the_recent_past_is_of_every_vehicle_within_twice_the_days_that_a_thing_must_stay(
+    store: Store, clock: Clock
+) -> None:
     for day, vehicle in ((0, "a"), (10, "b"), (20, "c"), (30, "d")):
         cast(store, vehicle, day=day)
     few = FuseSettings(latest_vehicles=1, stay_days=10, max_age_days=5)
     assert recent(store, asked(store, fuse=few)) == ["b", "c", "d"], "as old as the days, and just so"
     assert [vote.vehicle for vote in counting(store, asked(store, fuse=few))] == ["d"]
-
-
-def test_the_recent_past_knows_no_ballot_that_is_not_ready(store: Store, clock: Clock) -> None:
-    cast(store, "a")
-    cast(store, "b", method="paper")
-    damaged = cast(store, "c")
+    assert judged(store, asked(store, fuse=few)) == {**dict.fromkeys("abc", "window"), "d": ""}
     received = clock.now
     clock.now += 10**9
-    cast(store, "d", day=60)
-    question = asked(store, received_by_ns=received, set_aside=(ballot_name(damaged, *HERE),))
-    assert recent(store, question) == ["a"]
-    assert recent(store, asked(store, without=("a", "b", "c", "d"))) == []
+    damaged = cast(store, "e", day=30)
+    cast(store, "f", day=30, method="paper")
+    question = asked(store, fuse=few, received_by_ns=received, set_aside=(ballot_name(damaged, *HERE),))
+    assert recent(store, question) == ["b", "c", "d"], "none that is not ready"
 
 
 def test_votes_are_read_in_the_order_asked_for_and_no_tile_has_too_many(store: Store) -> None:
