@@ -60,12 +60,9 @@ def test_ground_is_never_deleted_and_everything_else_is_bit_identical() -> None:
     assert states[CELL] == EMPTY
     assert edited.points.tobytes() == np.concatenate([ground, other]).tobytes()
     assert edited.ground_z is tile.ground_z
-
-
-def test_heights_are_relative_to_the_ground_of_the_cell() -> None:
-    tile = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
-    _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
-    assert edited.points[:, 2].tolist() == pytest.approx([100.1])
+    hill = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
+    _, edited = fuse(hill, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
+    assert edited.points[:, 2].tolist() == pytest.approx([100.1]), "heights are above the ground of the cell"
 
 
 def test_right_state_with_false_points_injects_nothing() -> None:
@@ -137,6 +134,12 @@ def test_the_kernels_decide_as_the_plain_rule_does(seed: int, voters: int, rule:
     assert (states[1:] == NO_VOTE).all()
 
 
+def test_more_votes_than_sixteen_bits_hold_are_counted() -> None:
+    """4,096 vehicles times VOTE_UNIT is 65,536: one more than uint16 can say."""
+    states, tally = count([vote(str(i), states_plane({CELL: EMPTY})) for i in range(4096)], "columns", 4096)
+    assert (states[CELL], tally[CELL].tolist()) == (EMPTY, [0, 0, 0, 4096 * VOTE_UNIT, 0])
+
+
 @given(
     seed=st.integers(0, 2**32 - 1),
     voters=st.integers(1, 6),
@@ -174,14 +177,6 @@ def test_one_loud_liar_takes_no_wall_down_because_others_once_looked_through_it(
     assert fuse(tile, [*votes, second], SURE, "paper")[0][CELL] == EMPTY
 
 
-def test_more_votes_than_sixteen_bits_hold_are_counted() -> None:
-    """4,096 vehicles times VOTE_UNIT is 65,536: one more than uint16 can say."""
-    plane = states_plane({CELL: EMPTY})
-    states, tally = count([vote(str(i), plane) for i in range(4096)], "columns", 4096)
-    assert states[CELL] == EMPTY
-    assert tally[CELL].tolist() == [0, 0, 0, 4096 * VOTE_UNIT, 0]
-
-
 def test_states_over_a_window_of_tiles() -> None:
     decision, _ = fuse_tile(Tile.empty(LATTICE.tile((2, 3))), [vote("a", states_plane({CELL: EMPTY}))], "columns", KEEP)
     far, _ = fuse_tile(Tile.empty(LATTICE.tile((3, 5))), [vote("a", states_plane({CELL: OCCUPIED}))], "columns", KEEP)
@@ -215,12 +210,9 @@ def test_untouched_tiles_are_the_same_objects_and_the_same_ballot_twice_is_one_v
     keep = make_ballot(street, {(0, 0): Say(states_plane({(10, 10): 0}))}, vehicle="v2")
     after, _ = update_map(street, [gone(street), gone(street), keep], KEEP)
     assert after.tiles[0, 0] is street.tiles[0, 0]
-
-
-def test_a_building_where_the_map_had_no_tile(street: PointMap) -> None:
     built = Say(states_plane({(5, 5): CellState.CHANGED_OCCUPIED}), new_points=wall([(5, 5)], [0.45, 0.75]))
     after, _ = update_map(street, [make_ballot(street, {(4, 4): built}, vehicle=v) for v in "ab"], FuseSettings())
-    assert len(after.tiles[4, 4].points) == 2
+    assert len(after.tiles[4, 4].points) == 2, "where the map had no tile"
 
 
 @pytest.mark.parametrize(

@@ -102,20 +102,19 @@ def test_what_was_taken_is_stored_a_byte_a_changed_cell() -> None:
         unpack_agreed(data, states_plane())
 
 
-CHANGES = [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]
-
-
-def of(state: CellState, votes: int, against: int, beside: int) -> float:
-    asked = np.array([votes]), np.array([against]), np.array([beside])
-    return float(change_probability(np.array([state], np.uint8), *asked)[0])
-
-
-@pytest.mark.parametrize("state", CHANGES)
-def test_a_vote_more_and_a_cell_more_beside_it_raise_it_and_one_against_does_not(state: CellState) -> None:
-    assert of(state, 2, 0, 3) < of(state, 3, 0, 3)
-    assert of(state, 2, 0, 3) < of(state, 2, 0, 4)
-    assert of(state, 2, 1, 3) <= of(state, 2, 0, 3)
-    assert of(state, 10, 0, 8) == of(state, 3, 0, 8) < 1.0, "it was fitted to three vehicles"
+@pytest.mark.parametrize("state", [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY])
+def test_votes_and_cells_beside_raise_the_probability_of_a_change_and_who_stands_that_of_harm(state: int) -> None:
+    votes, against, beside = np.array([[2, 0, 3], [3, 0, 3], [2, 0, 4], [2, 1, 3], [3, 0, 8], [10, 0, 8]]).T
+    two, three, more_beside, denied, most, ten = change_probability(np.full(6, state, np.uint8), votes, against, beside)
+    assert two < min(three, more_beside)
+    assert denied <= two
+    assert most == ten < 1.0, "it was fitted to three vehicles"
+    by_standing = false_deletion_probability(np.array([0, 1, 3, 8]), np.full(4, 8, np.int8))
+    assert by_standing[0] < by_standing[1] < by_standing[2] == by_standing[3], "three are a row; more add nothing"
+    by_odds = false_deletion_probability(np.zeros(3, np.int64), np.array([-80, 0, 80], np.int8))
+    assert (np.diff(by_odds) < 0).all()
+    unsaid = false_deletion_probability(np.array([0, 1, 3, 8]), np.full(4, UNSAID, np.int8))
+    assert ((unsaid > 0) & (unsaid < 1)).all()
 
 
 @given(st.dictionaries(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), st.sampled_from([2, 3]), max_size=60))
@@ -157,12 +156,9 @@ def test_a_cell_beyond_the_budget_keeps_its_points_and_is_pending() -> None:
     assert waits.at((10, 10)) is None
     left, waits = updated(1.0, unsure, unsure)
     assert (left, len(waits.cells)) == (0, 0), "without a budget nothing waits"
-
-
-def test_one_who_is_sure_does_not_carry_two_who_are_not() -> None:
-    sure, unsure = said([MOST_STEPS] * 3), said([-MOST_STEPS] * 3)
-    assert updated(0.01, sure, unsure, unsure)[0] == 9
-    assert updated(0.01, sure, sure, unsure)[0] == 0
+    sure, none = said([MOST_STEPS] * 3), said([-MOST_STEPS] * 3)
+    assert updated(0.01, sure, none, none)[0] == 9, "one who is sure does not carry two who are not"
+    assert updated(0.01, sure, sure, none)[0] == 0
 
 
 def test_of_ballots_that_do_not_say_the_votes_and_what_stands_beside_are_asked() -> None:
@@ -193,17 +189,6 @@ def test_what_stands_beside_is_counted_as_by_hand(stands: set[tuple[int, int]], 
     rows, cols = ([min(max(at + step, 0), 255) for step in (-1, 0, 1)] for at in (row, col))
     around = [(r, c) for i, r in enumerate(rows) for j, c in enumerate(cols) if (i, j) != (1, 1)]
     assert standing_beside(states, np.array([cell])).tolist() == [sum(one in stands for one in around)]
-
-
-def test_what_stands_beside_raises_the_risk_and_sureness_lowers_it() -> None:
-    standing, odds = np.array([0, 1, 3, 8]), np.full(4, 8, np.int8)
-    by_standing = false_deletion_probability(standing, odds)
-    assert (np.diff(by_standing[:3]) > 0).all()
-    assert by_standing[2] == by_standing[3], "three are a row; more add nothing"
-    by_odds = false_deletion_probability(np.zeros(3, np.int64), np.array([-80, 0, 80], np.int8))
-    assert (np.diff(by_odds) < 0).all()
-    unsaid = false_deletion_probability(standing, np.full(4, UNSAID, np.int8))
-    assert ((unsaid > 0) & (unsaid < 1)).all()
 
 
 def test_waypoints_lie_in_the_middle_of_what_waits_the_largest_first() -> None:

@@ -11,7 +11,7 @@ from mapvote.codec.ballot import Odds
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I64, U8, CellState
+from mapvote.core.types import F32, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled
 from mapvote.fusion.tile_vote import TileVote
@@ -70,49 +70,38 @@ def test_of_a_wall_that_went_at_a_cells_border_only_the_cell_that_it_stood_in_ch
         shift = np.array([(TILE_CELLS - 144) * CELL_SIZE, 0, 0], np.float32)
         there, spill = (some[:, [1, 0, 2]] + shift for some in (there, spill))
         assert there[:, 0].max() > (TILE_CELLS - 2) * CELL_SIZE
-    points = np.concatenate([there, spill])
-    found = set(spilled(tile_of(points), [], states_of(points, CE)).tolist())
+    points, ground = np.concatenate([there, spill]), there * np.array([1, 1, 0], np.float32)  # says nothing
+    states = states_of(points, CE)
+    found = set(spilled(tile_of(np.concatenate([points, ground])), [], states).tolist())
     assert all_but_the_ends(found, cells_of(spill))
     assert not len(spilled(tile_of(points), [], states_of(spill, CE))), "the wall's own cell did not change"
 
 
-def test_of_a_wall_that_came_likewise_by_the_points_that_all_vehicles_offer() -> None:
-    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
-    points = np.concatenate([there, beyond])
-    votes = [vote_for(points[::2]), vote_for(points[1::2], "b"), TileVote(vehicle="c", end_ns=0, digest="c")]
-    found = set(spilled(Tile.empty(WINDOW), votes, states_of(points, CO)).tolist())
-    assert all_but_the_ends(found, cells_of(beyond))
+def roof() -> F32:
+    x, y = np.meshgrid(np.arange(BORDER_M - 0.09, BORDER_M + 0.6, 0.3), np.arange(40.05, 43.0, 0.3))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)]).astype(np.float32)
 
 
-def test_a_wall_in_the_corner_of_a_tile_is_judged_as_anywhere_else() -> None:
-    points = np.concatenate([wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)])
-    rows, cols = 133, round(BORDER_M / CELL_SIZE) - 1
-    moved = points - np.array([cols * CELL_SIZE, rows * CELL_SIZE, 0.0], np.float32)
-    assert 0 in cells_of(moved)
-    there, here = (spilled(tile_of(some), [], states_of(some, CE)) for some in (points, moved))
-    assert len(here)
-    assert (here == there - (rows * TILE_CELLS + cols)).all()
+def pole() -> F32:
+    x = np.tile(BORDER_M + np.array([-0.02, 0.02, 0.03]), 2)
+    return np.column_stack([x, np.full(6, 40.1), np.arange(6) * 0.3 + 0.45]).astype(np.float32)
+
+
+EDGE_M = TILE_CELLS * CELL_SIZE
 
 
 @pytest.mark.parametrize(
-    ("why", "spill"),
+    ("why", "points"),
     [
-        ("it holds points that no noise carries so far", spill_at(BORDER_M - 0.17)),
-        ("it holds as many points as the other", spill_at(BORDER_M - 0.05, every=1)),
+        ("it holds points that no noise carries so far", wall(BORDER_M + 0.05, spill_at(BORDER_M - 0.17))),
+        ("it holds as many points as the other", wall(BORDER_M + 0.05, spill_at(BORDER_M - 0.05, every=1))),
+        ("it lies flat", roof()),
+        ("it stands alone", pole()),
+        ("nothing is asked of the next tile", np.concatenate([wall(EDGE_M - 0.05), wall(0.05)])),
     ],
 )
-def test_the_cell_beside_a_wall_changed_too_if(why: str, spill: F32) -> None:
-    points = wall(BORDER_M + 0.05, spill)
+def test_the_cell_beside_another_changed_too_if(why: str, points: F32) -> None:
     assert not len(spilled(tile_of(points), [], states_of(points, CE))), why
-
-
-def test_what_lies_flat_or_stands_alone_spills_nothing() -> None:
-    x, y = np.meshgrid(np.arange(BORDER_M - 0.09, BORDER_M + 0.6, 0.3), np.arange(40.05, 43.0, 0.3))
-    roof = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)]).astype(np.float32)
-    x_pole = np.tile(BORDER_M + np.array([-0.02, 0.02, 0.03]), 2)
-    pole = np.column_stack([x_pole, np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
-    for points in (roof, pole.astype(np.float32)):
-        assert not len(spilled(tile_of(points), [], states_of(points, CE)))
 
 
 def test_six_points_make_a_plane_and_five_do_not() -> None:
@@ -124,20 +113,6 @@ def test_six_points_make_a_plane_and_five_do_not() -> None:
             points = np.concatenate([there - at, some])
             assert set(spilled(tile_of(points), [], states_of(points, CE)).tolist()) == found
     assert 0 in cells_of(beyond - corner)
-
-
-def test_ground_that_lies_in_changed_cells_says_nothing_of_them() -> None:
-    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
-    ground = np.column_stack([np.full(10, BORDER_M - 0.25), np.arange(10) * 0.3 + 40.15, np.zeros(10)])
-    points = np.concatenate([there, beyond, ground.astype(np.float32)])
-    states = states_of(np.concatenate([there, beyond]), CE)
-    assert all_but_the_ends(set(spilled(tile_of(points), [], states).tolist()), cells_of(beyond))
-
-
-def test_at_a_tiles_edge_nothing_is_asked_of_the_next_tile() -> None:
-    edge = TILE_CELLS * CELL_SIZE
-    points = np.concatenate([wall(edge - 0.05), wall(0.05)])
-    assert not len(spilled(tile_of(points), [], states_of(points, CE)))
 
 
 @given(st.lists(st.integers(0, 10**6), min_size=3, max_size=3), st.floats(-0.06, 0.06))
@@ -185,7 +160,8 @@ def test_of_a_slanted_wall_no_cell_is_given_up_that_holds_a_tenth_of_a_metre_of_
     rng, heading = np.random.default_rng(seed), np.radians(heading_deg)
     along = np.linspace(0.0, 6.0, 601)
     line = np.array([[30.0 + off_m, 30.0]]) + along[:, None] * [np.cos(heading), np.sin(heading)]
-    cells, held = np.unique(flat_of(line), return_counts=True)
+    at = np.floor(line / CELL_SIZE).astype(np.int64)
+    cells, held = np.unique(at[:, 1] * TILE_CELLS + at[:, 0], return_counts=True)
     u, z = np.meshgrid(np.arange(0.05, 6.0, 0.1), np.arange(0.45, 3.0, 0.15))
     across = rng.normal(0.0, 0.02, u.size)
     x = 30.0 + off_m + u.ravel() * np.cos(heading) - across * np.sin(heading)
@@ -193,11 +169,6 @@ def test_of_a_slanted_wall_no_cell_is_given_up_that_holds_a_tenth_of_a_metre_of_
     points = np.column_stack([x, y, z.ravel()]).astype(np.float32)
     given_up = spilled(tile_of(points), [], states_of(points, CE))
     assert not np.isin(given_up, cells[held >= 10]).any()
-
-
-def flat_of(points: F64) -> I64:
-    at = np.floor(points[:, :2] / CELL_SIZE).astype(np.int64)
-    return np.asarray(at[:, 1] * TILE_CELLS + at[:, 0])
 
 
 def test_what_spilled_is_told_as_empty_and_goes_with_its_wall_as_was_voted() -> None:

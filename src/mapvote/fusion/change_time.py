@@ -45,7 +45,7 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
     ``drives``: those that count, two-stage, each by itself; ``tally`` (256, 256, 5) of them, in VOTE_UNITs.
     """
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, CELLS)
-    flat, out = states.reshape(-1), states
+    flat, out = states.reshape(-1), states.copy()
     for before, after in ((_UO, _CE), (_UE, _CO)):
         cells = np.flatnonzero(planes[after] > quorum * VOTE_UNIT)
         cells = cells[(flat[cells] == before) | (flat[cells] == _UN)]
@@ -53,9 +53,7 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
             said, ends_ns, whose = said_in_order(drives, cells)
             turned = np.zeros(len(cells), dtype=np.bool_)
             _find_turns(said, ends_ns, whose, before, after, np.empty(len(whose), dtype=np.int64), turned)
-            found = cells[turned]
-            out = out.copy() if out is states and len(found) else out
-            out.reshape(-1)[found] = after
+            out.reshape(-1)[cells[turned]] = after
     return out
 
 
