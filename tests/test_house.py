@@ -160,6 +160,16 @@ def test_few_names_mean_two_things() -> None:
     assert twice((s.stem, s) for s in rooms if s.stem not in ("__init__", "__main__")) == {}
 
 
+def test_no_module_gives_a_constant_two_values() -> None:
+    """Two files that became one had a constant each of one name: the ground grew from other seeds, and no test saw."""
+    for source in SOURCES:
+        seen: dict[str, str] = {}
+        for node in ast.parse(source.read_text()).body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name, value = node.targets[0].id, ast.unparse(node.value)
+                assert seen.setdefault(name, value) == value or name in value, f"{source.relative_to(ROOT)}: {name}"
+
+
 def test_no_module_imports_itself_through_others() -> None:
     assert circles(imports(SOURCES, SRC)) == []
 

@@ -29,7 +29,7 @@ _GRADE = 0.15
 _AROUND_CELLS = 7
 _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
-_BROAD = 30
+_BROAD_SEED = 30
 """Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
 _FEW_TILES, _POINTS_A_TILE, _POINTS_AROUND = 64, 4000, 1000
 """A map of more tiles than 64 and one for each 4000 points is a street with strays, or not in metres: where a tile and
@@ -93,7 +93,7 @@ def lay_ground(
             ground[k * CELLS + cells], gap[k * CELLS + cells] = z, SEED
     if road:
         grow(start, heights, neighbours, ground, gap)
-    _sow(start, heights, neighbours, ground, gap, _BROAD if road else 2)
+    _sow(start, heights, neighbours, ground, gap, _BROAD_SEED if road else 2)
     grow(start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
     settled = settle(start, heights, neighbours, ground, gap)
