@@ -238,16 +238,6 @@ def test_by_surfaces_a_ballot_tells_what_was_taken_down_and_which_voxels_are_gon
         assert (gone[states != CellState.CHANGED_EMPTY] == 0).all()
 
 
-def test_by_surfaces_new_things_are_believed_only_where_the_map_knew_free_space() -> None:
-    unknown = street_map()
-    tiles = {t: replace(tile, free=np.zeros((256, 256), np.uint64)) for t, tile in unknown.tiles.items()}
-    known = {t: replace(tile, free=np.full((256, 256), ~np.uint64(0))) for t, tile in unknown.tiles.items()}
-    for free, state in ((tiles, CellState.UNCHANGED_EMPTY), (known, CellState.CHANGED_OCCUPIED)):
-        vehicle = drive(make(replace(unknown, tiles=free), Settings()))
-        assert state_at(vehicle, 8.25, 3.5) in (state, CellState.UNDETERMINED)
-    assert state_at(vehicle, 8.25, 3.5) == CellState.CHANGED_OCCUPIED
-
-
 def long_drive(n: int = 60) -> Drive:
     """Past the wall and back, 0.4 m a scan."""
     there = np.concatenate([np.linspace(-12.0, 0.0, n // 2), np.linspace(0.0, -12.0, n - n // 2)])

@@ -51,13 +51,17 @@ def importable(bin_: Path, modules: list[str]) -> list[str]:
     return subprocess.run([bin_ / "python", "-c", code], env=clean, capture_output=True, text=True).stdout.split()
 
 
+def import_a_map(bin_: Path, folder: Path) -> None:
+    write_pcd(folder / "city.pcd", Cloud(np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3))))
+    run(bin_, folder, "import", "city.pcd", "my_map")
+    assert "5,000" in run(bin_, folder, "info", "my_map")
+
+
 def test_the_wheel_alone_edits_maps_and_names_the_extra_that_a_verb_lacks(wheel: Path, tmp_path: Path) -> None:
     bin_ = install(tmp_path / "env", str(wheel))
     assert importable(bin_, BASE_LACKS) == []
     assert run(bin_, tmp_path, "--version").startswith("mapvote ")
-    write_pcd(tmp_path / "city.pcd", Cloud(np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3))))
-    run(bin_, tmp_path, "import", "city.pcd", "my_map")
-    assert "5,000" in run(bin_, tmp_path, "info", "my_map")
+    import_a_map(bin_, tmp_path)
     run(bin_, tmp_path, "export", "my_map", "tiles")
     run(bin_, tmp_path, "config", "--toml")
     for extra, words in TRIES.items():
@@ -82,6 +86,4 @@ def test_another_python_installs_and_runs_the_wheel(wheel: Path, python: str, tm
     subprocess.run([program, "-m", "venv", tmp_path / "env"], check=True, timeout=120)
     bin_ = tmp_path / "env" / "bin"
     subprocess.run([bin_ / "pip", "install", "-q", str(wheel)], check=True, timeout=900)
-    write_pcd(tmp_path / "city.pcd", Cloud(np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3))))
-    run(bin_, tmp_path, "import", "city.pcd", "my_map")
-    assert "5,000" in run(bin_, tmp_path, "info", "my_map")
+    import_a_map(bin_, tmp_path)
