@@ -323,6 +323,15 @@ def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_t
     assert found.tolist() == out
 
 
+def test_what_is_beyond_the_reach_in_the_plane_stays_out_wherever_the_sensor_is() -> None:
+    origin = np.array([20.0, -70.0, 900.0])
+    points = np.array([[3.0, 3.9, 50.0], [3.0, 4.1, 0.0], [-3.1, 4.0, 0.0], [-2.9, -4.0, -9.0]]) + origin
+    outside, out = np.full(4, -1, np.int32), np.zeros(4, np.bool_)
+    nothing, ground_z = np.zeros(4, np.bool_), np.zeros((1, 1), np.float32)
+    _leave_out(points, origin, 25.0, nothing, nothing, outside, ground_z, np.zeros(1, np.bool_), out)
+    assert out.tolist() == [False, True, True, False]
+
+
 @pytest.mark.parametrize("ground_m", [0.0, 6.3, -9.3])
 def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart(ground_m: float) -> None:
     road = wall([(r, c) for r in range(40) for c in range(40)], [0.05]) + np.array([0, 0, ground_m], np.float32)
