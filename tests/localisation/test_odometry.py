@@ -10,7 +10,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle, transfo
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, PosePrior, Registration, Scan
 from mapvote.localisation.ndt_map import MapWindow, NdtMap
-from mapvote.localisation.odometry import Tracker
+from mapvote.localisation.odometry import Tracker, _differ
 from streets import path, street, sweep, twist_of
 
 SETTINGS = NdtSettings()
@@ -208,6 +208,17 @@ def test_after_a_gap_the_old_motion_is_kept_and_a_lost_track_forgets_it() -> Non
     np.testing.assert_array_equal(tracker.twist, TWIST)
     tracker.move_to(np.eye(4), TENTH)
     assert not tracker.twist.any()
+
+
+@pytest.mark.parametrize(
+    ("axis", "change", "differ"), [(0, 0.39, False), (1, -0.41, True), (5, 0.019, False), (3, -0.021, True)]
+)
+def test_motions_bend_a_scan_differently_if_its_ends_or_points_20_m_away_move_by_2_cm(
+    axis: int, change: float, differ: bool
+) -> None:
+    """In 50 ms, from the middle of a scan to its end."""
+    twist = np.array([20.0, 1.0, 0.0, 0.1, 0.0, 0.3])
+    assert _differ(twist, twist + change * np.eye(6)[axis]) == differ
 
 
 def registered(position_sigma: F64, converged: bool = True, inlier_share: float = 1.0) -> Registration:
