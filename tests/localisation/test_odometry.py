@@ -1,6 +1,7 @@
 """A vehicle follows the street, knows when it is lost, and finds back."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, PosePrior, Registration, Scan
+from mapvote.localisation.ndt import refine
 from mapvote.localisation.ndt_map import MapWindow, NdtMap
 from mapvote.localisation.odometry import Tracker, _differ
 from streets import path, street, sweep, twist_of
@@ -219,6 +221,30 @@ def test_motions_bend_a_scan_differently_if_its_ends_or_points_20_m_away_move_by
     """In 50 ms, from the middle of a scan to its end."""
     twist = np.array([20.0, 1.0, 0.0, 0.1, 0.0, 0.3])
     assert _differ(twist, twist + change * np.eye(6)[axis]) == differ
+
+
+def test_a_scan_whose_motion_was_misjudged_is_registered_once_more_and_both_times_at_the_finest_level_alone(
+    tracker: Tracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker.localise(scan(0), prior(0))
+    tracker.twist = np.array([10.6, 0.0, 0.0, 0.0, 0.0, 0.0])
+    levels = []
+
+    def recorded(*how: Any) -> Registration:
+        levels.append(how[4])
+        return refine(*how)
+
+    monkeypatch.setattr("mapvote.localisation.odometry.refine", recorded)
+    assert off(tracker.localise(scan(1)).registration.T_map_lidar, 1) < 0.04
+    assert levels == [2, 2]
+
+
+@pytest.mark.parametrize(("reach", "level"), [(0.1, 2), (0.11, 1), (0.5, 1), (0.51, 0)])
+def test_the_farther_a_guess_may_be_off_the_coarser_the_first_level(reach: float, level: int) -> None:
+    tracker = elsewhere()
+    assert tracker._first_level(reach) == 0, "of a first scan nothing is known"
+    tracker.move_to(np.eye(4), TENTH)
+    assert tracker._first_level(reach) == level
 
 
 def registered(position_sigma: F64, converged: bool = True, inlier_share: float = 1.0) -> Registration:
