@@ -100,6 +100,16 @@ def test_a_kerb_and_a_sunken_yard_stay_ground_and_far_from_any_point_it_is_unkno
     assert np.isnan(ground[50, 50])
 
 
+@pytest.mark.parametrize(("rows", "begins"), [(5, False), (6, True)])
+def test_apart_from_the_driven_path_ground_begins_only_where_more_than_thirty_cells_agree(
+    rows: int, begins: bool
+) -> None:
+    """Farther from the street than ground goes on across a gap."""
+    patch = np.array([(0.3 * (90.5 + c), 0.3 * (90.5 + r), -3.0) for r in range(rows) for c in range(6)])
+    ground = ground_of(at(spread(12, y=(0, 10)), 0.0), patch, road=driven((0, 30), 5.0))
+    assert np.isfinite(ground[92, 92]) == begins
+
+
 def test_a_ramp_down_beside_a_retaining_wall_does_not_pull_the_street_down() -> None:
     """An underpass begins: the ramp falls to 3 m below the street, 0.3 m beside the lane."""
     xy = spread(5, 60_000)
