@@ -100,6 +100,8 @@ def test_feet_become_metres_of_the_same_place(case: tuple[int, float], seed: int
 
 def test_degrees_are_refused_with_the_command_that_projects_them() -> None:
     degrees = np.random.default_rng(0).uniform([139.65, 35.67, 0], [139.651, 35.671, 30], (200, 3))
+    with pytest.raises(MapvoteError, match="MAP --crs EPSG:32653"):
+        settle("f.las", MapFrame("EPSG:4326"), None, np.array([[137.9, 35.0, 0.0], [138.1, 35.0, 0.0]]))
     with pytest.raises(MapvoteError, match="MAP --crs EPSG:32654"):
         settle("f.las", MapFrame("EPSG:4326"), None, degrees)
     with pytest.raises(MapvoteError, match="look like degrees"):
@@ -113,6 +115,16 @@ def test_heights_are_named_where_the_file_names_them() -> None:
     one = np.zeros((1, 3))
     assert settle("f", MapFrame("EPSG:32654+3855"), None, one)[0].heights == "EGM2008 height"
     assert settle("f", MapFrame("EPSG:32654"), None, one)[0].heights == ""
+    for file, wanted, heights in (
+        (MapFrame(heights="of the file"), MapFrame("EPSG:32654", heights="wanted"), "of the file"),
+        (MapFrame(), MapFrame("EPSG:32654", heights="wanted"), "wanted"),
+        (MapFrame(heights="of the file"), MapFrame("EPSG:32654"), "of the file"),
+        (MapFrame("EPSG:4326", heights="of the file"), MapFrame("EPSG:32654"), "of the file"),
+        (MapFrame("EPSG:4326", heights="of the file"), MapFrame("EPSG:32654", heights="wanted"), "wanted"),
+        (MapFrame("EPSG:4979"), MapFrame("EPSG:32654"), "above the ellipsoid"),
+        (MapFrame("EPSG:32653", heights="of the file"), MapFrame("EPSG:32654"), "of the file"),
+    ):
+        assert settle("f", file, wanted, one)[0].heights == heights
     feet = settle("f", MapFrame("EPSG:6339+6360"), None, one)[1](np.array([[1.0, 1.0, 1.0]]))
     assert feet == pytest.approx(np.array([[1.0, 1.0, 1200 / 3937]]))
 
@@ -126,6 +138,8 @@ def test_geotiff_keys_name_a_system_and_its_units() -> None:
         frame_of_keys("f", {1024: 1, 3072: 32767})
     ones = np.ones((1, 3))
     assert settle("f", feet, None, ones)[1](ones) == pytest.approx(np.array([[0.3048, 0.3048, 1]]))
+    above = frame_of_keys("f", {1024: 1, 3072: 32654, 4096: 3855, 4099: 9002})
+    assert settle("f", above, None, ones)[1](ones) == pytest.approx(np.array([[1, 1, 0.3048]]))
     assert with_units("EPSG:32654", "metre", None) == "EPSG:32654"
 
 

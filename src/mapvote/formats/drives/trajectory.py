@@ -232,7 +232,7 @@ def _motions_of_quaternions(file: Path, rows: F64) -> F64:
     if not (off < 0.05).all():
         raise MapvoteError(f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion")
     if not len(rows):
-        return np.empty((0, 4, 4))
+        return geometry.poses_at(rows[:, :3])
     return geometry.poses_at(rows[:, :3], scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix())
 
 
