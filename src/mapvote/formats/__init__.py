@@ -21,7 +21,7 @@ from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.geo.frame import LOCAL, PROJECTOR, MapFrame, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import Convert, settle
-from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces, joined
+from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
@@ -33,7 +33,6 @@ __all__ = [
     "is_cloud",
     "open_drive",
     "read_T_map_lidar",
-    "read_cloud",
     "read_map",
     "write_map",
     "write_pcd",
@@ -87,24 +86,6 @@ def stream_cloud(path: Path | str) -> Iterator[Cloud]:
         if layout.recognised(path):
             return layout.stream(path)
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(MAPS)}")
-
-
-def read_cloud(path: Path | str) -> tuple[F64, dict[str, NDArray[Any]]]:
-    """All points of a map or cloud of any known format, and their fields: no tiles are cut, no ground is computed.
-
-    Returns points (n, 3), float64, map metres (feet become metres), and columns (n,) in the type that the file has, by
-    LAS's names: intensity, red, classification ... Points that are not finite stay. Of a map in pieces only the fields
-    that all pieces have are returned.
-
-    Raises MapvoteError if there is no map at ``path``, it is damaged, or its coordinates cannot be made metres.
-    """
-    path = Path(path)
-    if is_map_folder(path):
-        tiles = read_map_folder(path).tiles
-        cloud = joined([Cloud(tiles[index].points_map, fields=tiles[index].fields) for index in sorted(tiles)])
-    else:
-        cloud = joined(in_map_metres(str(path), stream_cloud(path)))
-    return cloud.points.astype(np.float64, copy=False), dict(cloud.fields)
 
 
 def is_cloud(path: Path | str) -> bool:

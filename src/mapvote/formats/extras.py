@@ -50,7 +50,7 @@ def read_text(file: Path) -> str:
 
 
 @contextmanager
-def reading(path: Path, kind: str, mend: str = "copy or export it again") -> Iterator[None]:
+def reading(path: Path, kind: str) -> Iterator[None]:
     """Whatever goes wrong within is one MapvoteError that names the file: libraries let through what numpy, struct and
     their own parsers raise. ``kind``: what the file is not a whole one of."""
     try:
@@ -60,7 +60,7 @@ def reading(path: Path, kind: str, mend: str = "copy or export it again") -> Ite
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:
-        raise MapvoteError(f"{path}: not a whole {kind} ({first_line(error)}); {mend}") from error
+        raise MapvoteError(f"{path}: not a whole {kind} ({first_line(error)}); copy or export it again") from error
 
 
 def first_line(error: BaseException) -> str:

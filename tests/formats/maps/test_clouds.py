@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +17,14 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from hand_made import save_pcd
-from mapvote.core.point_map import all_points, map_from_points
+from mapvote.core.point_map import all_fields, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats import export_map, read_cloud, read_map, stream_cloud, write_map, write_pcd
+from mapvote.formats import export_map, read_map, stream_cloud, write_map, write_pcd
 from mapvote.formats.maps.autoware import lay_version, stream_autoware, write_autoware
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, lattice_of
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.pcd import read_pcd_table
 from mapvote.formats.maps.ply_e57 import write_ply
-from mapvote.formats.maps.tiling import map_of
 
 ENCODINGS = "ascii", "binary", "binary_compressed"
 UTM = np.array([367_123.0, 3_951_876.0, 40.0])
@@ -45,7 +45,7 @@ def test_a_pcd_longer_than_its_header_says_is_refused_and_blank_lines_are_not(tm
         save_pcd(tmp_path / "a.pcd", points().astype(np.float32), encoding)
         with (tmp_path / "a.pcd").open("ab") as file:
             file.write(more)
-        for read in (read_cloud, read_pcd_table):
+        for read in (read_map, read_pcd_table):
             if whole:
                 read(tmp_path / "a.pcd")
             else:
@@ -62,7 +62,7 @@ def test_padding_between_fields_and_the_zeros_that_old_pcl_lets_follow_are_no_po
         b"WIDTH 40\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA binary\n"
     )
     (tmp_path / "a.pcd").write_bytes(head + table.tobytes() + bytes(4096 - len(head)))
-    assert np.array_equal(read_cloud(tmp_path / "a.pcd")[0], table["xyz"])
+    assert np.array_equal(joined(stream_cloud(tmp_path / "a.pcd")).points, table["xyz"])
     assert len(read_pcd_table(tmp_path / "a.pcd")) == 40
 
 
@@ -164,18 +164,16 @@ def test_a_utm_map_survives_a_round_trip(tmp_path: Path, name: str) -> None:
         assert after.georeference["crs"] == "EPSG:32654"
 
 
-@pytest.mark.parametrize("name", ["m.pcd", "m.las", "m.ply", "m"])
-def test_a_cloud_is_read_whole_in_map_metres_with_its_fields(tmp_path: Path, name: str) -> None:
-    """The same points from every format; a LAS holds them to 0.05 mm, a PCD and a map folder as float32."""
+@pytest.mark.parametrize(("name", "write"), [("m.pcd", write_pcd), ("m.las", write_las), ("m.ply", write_ply)])
+def test_a_map_comes_back_with_its_fields(tmp_path: Path, name: str, write: Any) -> None:
+    """The same points from every format; a LAS holds them to 0.05 mm, a PCD and a map as float32."""
     brightness = np.arange(500, dtype=np.uint16)
-    cloud = Cloud(points(), fields={"intensity": brightness})
-    write_map(map_of("test", [cloud]), tmp_path / "m")
-    {"m.pcd": write_pcd, "m.las": write_las, "m.ply": write_ply, "m": lambda *_: None}[name](tmp_path / name, cloud)
-    read, fields = read_cloud(tmp_path / name)
-    order = np.argsort(fields["intensity"])
-    assert read.dtype == np.float64
-    assert np.abs(read[order] - points()).max() < 1e-4
-    assert np.array_equal(fields["intensity"][order], brightness)
+    write(tmp_path / name, Cloud(points(), fields={"intensity": brightness}))
+    read = read_map(tmp_path / name)
+    columns = all_fields(read)
+    order = np.argsort(columns["intensity"])
+    assert np.abs(all_points(read)[order] - points()).max() < 1e-4
+    assert np.array_equal(columns["intensity"][order], brightness)
 
 
 def test_truncated_files_are_named(tmp_path: Path) -> None:

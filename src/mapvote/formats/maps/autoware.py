@@ -34,12 +34,12 @@ log = logging.getLogger("mapvote.formats")
 METADATA = "pointcloud_map_metadata.yaml"
 TILES = "pointcloud_map.pcd"
 """The folder of tiles really is called so, by Autoware's convention."""
-SIDE_M = 20
+_SIDE_M = 20
 HISTORY = ".mapvote_versions.json"
 """Beside tiles that ``mapvote export --follow`` wrote: which version has which."""
 FOLLOWED = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
 """How it names them: X_Y_HASH8.pcd."""
-CONTENT = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
+_CONTENT = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
 
 
 def is_autoware(path: Path) -> bool:
@@ -58,14 +58,14 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     except (yaml.YAMLError, ValueError) as error:
         raise MapvoteError(f"{file}: cannot be read ({first_line(error)})") from error
     if not isinstance(table, dict):
-        raise MapvoteError(f"{file}: not Autoware's metadata; {CONTENT}")
+        raise MapvoteError(f"{file}: not Autoware's metadata; {_CONTENT}")
     try:
         size = np.array([float(table.pop("x_resolution")), float(table.pop("y_resolution"))])
         corners = {str(name): np.array([float(v) for v in corner]) for name, corner in table.items()}
         if not corners or (size <= 0).any() or any(c.shape != (2,) for c in corners.values()):
             raise ValueError("no tiles, or a corner that is not [x, y]")
     except (KeyError, TypeError, ValueError) as error:
-        raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {CONTENT}") from error
+        raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {_CONTENT}") from error
     frame = _frame(path)
     _warn_of_unlisted(path, set(corners))
     for name, corner in corners.items():
@@ -110,10 +110,10 @@ def _frame(path: Path) -> MapFrame:
     return frame_of_projector(read_text(projector), str(projector)) if projector.is_file() else MapFrame()
 
 
-def write_autoware(path: Path, cloud: Cloud | CloudPieces, *, side_m: int = SIDE_M) -> None:
+def write_autoware(path: Path, cloud: Cloud | CloudPieces) -> None:
     """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
-    ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
+    Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
     cloud's frame (:func:`mapvote.formats.geo.frame.autoware_frame` chooses one that it has).
     """
     clouds = CloudPieces.of(cloud)
@@ -121,15 +121,15 @@ def write_autoware(path: Path, cloud: Cloud | CloudPieces, *, side_m: int = SIDE
     with whole_folder(path, sign=METADATA) as folder:
         (folder / TILES).mkdir()
         corners = {}
-        for (x, y), tile in squares(str(path), clouds, side_m):
+        for (x, y), tile in _squares(str(path), clouds):
             corners[f"{x}_{y}.pcd"] = x, y
             save_pcd(folder / TILES / f"{x}_{y}.pcd", tile)
-        (folder / METADATA).write_text(metadata(corners, side_m))
+        (folder / METADATA).write_text(_metadata(corners))
         (folder / PROJECTOR).write_text(projector)
 
 
-def squares(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
-    """A cloud cut along whole multiples of ``side_m``: (corner, float32 points and their intensity), by x, y.
+def _squares(where: str, cloud: Cloud | CloudPieces) -> Iterator[tuple[tuple[int, int], Cloud]]:
+    """A cloud cut along whole multiples of 20 m: (corner, float32 points and their intensity), by x, y.
 
     ``where`` is the place that they go to. MapvoteError if there are no points.
     """
@@ -142,7 +142,7 @@ def squares(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> Ite
     for piece in clouds:
         stored = piece.points.astype(np.float32)
         columns = {"points": stored} | {n: c for n, c in piece.fields.items() if n == "intensity"}
-        corner = np.floor(stored[:, :2].astype(np.float64) / side_m).astype(np.int64) * side_m
+        corner = np.floor(stored[:, :2].astype(np.float64) / _SIDE_M).astype(np.int64) * _SIDE_M
         order = np.lexsort((corner[:, 1], corner[:, 0]))
         seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
         for rows in np.split(order, seams) if len(order) else ():
@@ -153,9 +153,9 @@ def squares(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> Ite
         yield at, Cloud(fields.pop("points"), fields=fields)
 
 
-def metadata(corners: Mapping[str, tuple[int, int]], side_m: int = SIDE_M) -> str:
+def _metadata(corners: Mapping[str, tuple[int, int]]) -> str:
     """The text of pointcloud_map_metadata.yaml: the size of tiles, and the corner of each file."""
-    lines = [f"x_resolution: {side_m:.1f}", f"y_resolution: {side_m:.1f}"]
+    lines = [f"x_resolution: {_SIDE_M:.1f}", f"y_resolution: {_SIDE_M:.1f}"]
     return "\n".join([*lines, *(f"{name}: [{x}, {y}]" for name, (x, y) in corners.items())]) + "\n"
 
 
@@ -185,9 +185,9 @@ def laid_version(folder: Path) -> int | None:
     return history[-1].version if history and (folder / METADATA).is_file() else None
 
 
-def names_of(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> list[str]:
+def names_of(where: str, cloud: Cloud | CloudPieces) -> list[str]:
     """The files that a cloud's tiles would be; ``where`` is for messages."""
-    return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in squares(where, cloud, side_m)]
+    return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in _squares(where, cloud)]
 
 
 def lay_version(
@@ -196,7 +196,6 @@ def lay_version(
     version: int,
     *,
     keep: int = 3,
-    side_m: int = SIDE_M,
     known: Collection[str] = (),
 ) -> Change:
     """Show ``cloud`` (map metres, in a frame that Autoware supports) in ``folder``; only tiles that it lacks are
@@ -215,7 +214,7 @@ def lay_version(
     tiles.mkdir(parents=True, exist_ok=True)
     corners: dict[str, tuple[int, int]] = {}
     written = 0
-    for (x, y), tile in squares(str(folder), cloud, side_m):
+    for (x, y), tile in _squares(str(folder), cloud):
         name = f"{x}_{y}_{_hash8(tile)}.pcd"
         corners[name] = x, y
         if name not in known and not (tiles / name).is_file():
@@ -225,7 +224,7 @@ def lay_version(
     history = [laid for laid in _history(folder) if laid.version != version] + [_Laid(version, list(corners))]
     _write(folder / HISTORY, msgspec.json.encode(history[-keep - 1 :]))
     _write(folder / PROJECTOR, projector_of(cloud.frame).encode())
-    _write(folder / METADATA, metadata(corners, side_m).encode())
+    _write(folder / METADATA, _metadata(corners).encode())
     needed = {name for laid in history[-keep - 1 :] for name in laid.tiles}
     stale = [file for file in tiles.iterdir() if FOLLOWED.fullmatch(file.name) and file.name not in needed]
     for file in stale:
