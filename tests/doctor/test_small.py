@@ -12,6 +12,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.doctor import Finding
 from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
+from mapvote.doctor.prior import measure_time
 from mapvote.doctor.prior_fit import CANNOT_TELL, check_small, compare, fit_to_chain
 
 ROAD = Road("+z", 1.8, 0.4, np.array([0.0, 0.0, 1.0]), 0.02)
@@ -40,6 +41,10 @@ def smaller(T: F64, factor: float) -> F64:
     out = T.copy()
     out[:, :3, 3] *= factor
     return out
+
+
+def yawed(deg: float) -> F64:
+    return geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(deg))
 
 
 def run_of(T: F64, start: int, end: int, every: int = 3) -> Run:
@@ -76,7 +81,7 @@ def found_in(T: F64, prior: F64, sigma_m: float = 0.3, chain: Run | None = None)
 @pytest.mark.parametrize("curved", [False, True])
 def test_scale_and_heading_are_told_apart_within_their_errors(curved: bool) -> None:
     T = along(150.0, curved)
-    turned = smaller(straying(T, 0.02), 0.97) @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(3.0))
+    turned = smaller(straying(T, 0.02), 0.97) @ yawed(3.0)
     whole = fit_to_chain(turned, run_of(T, 0, len(T)))
     assert whole is not None
     assert whole.scale.value == pytest.approx(0.97, abs=2 * whole.scale.sigma)
@@ -99,6 +104,20 @@ def test_positions_four_per_cent_too_small_are_named_on_a_street_and_undecided_o
         assert "that may be chance" in unsure or int(unsure.split("show from ")[1].split("%")[0]) > 4, unsure
 
 
+@pytest.mark.parametrize(("rows", "severity"), [(2, "warning"), (5, "error")])
+def test_a_prior_that_is_late_is_named_with_its_seconds_where_speed_and_heading_change(
+    rows: int, severity: str
+) -> None:
+    T = [np.eye(4)]
+    for i in range(200):
+        step_m, turn = 0.7 + 0.4 * np.sin(i / 8), 0.03 * np.sin(i / 15)
+        T.append(T[-1] @ geometry.from_xyz_rpy(step_m, 0, 0, yaw=turn))
+    prior = np.stack([*T[:1] * rows, *T[:-rows]])
+    time = measure_time(prior, runs_of(np.stack(T)), np.arange(len(T)) * 100_000_000)
+    (found,) = check_small(evidence(np.stack(T), 0.05), prior, time)
+    assert (found.severity, found.what[:26]) == (severity, f"the prior is 0.{rows}0 s late (")
+
+
 def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:
     for curved in (False, True):
         T = along(120.0, curved)
@@ -116,16 +135,43 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
 def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_named_together() -> None:
     T = along(120.0)
     for yaw_deg, name in ((90, "x and y of the scans are swapped"), (180, "in reverse order")):
-        turned = [
-            Run(run.indices, C @ run.T_first_lidar @ geometry.inverse(C), run.fit)
-            for C in (geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg)),)
-            for run in runs_of(T)
-        ]
+        C = yawed(yaw_deg)
+        turned = [Run(run.indices, C @ run.T_first_lidar @ geometry.inverse(C), run.fit) for run in runs_of(T)]
         (error,) = compared(T, T, turned)
         assert error.severity == "error"
         assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
         assert "cannot decide which" in error.what
+
+
+@pytest.mark.parametrize(
+    ("scans_deg", "prior_deg", "name"),
+    [
+        (20, 0, "the scans are turned by 21.1 deg about z"),
+        (0, 20, "the prior's headings are off by 20.0 deg"),
+        (20, 15, "the prior's headings are off by 35.0 deg"),
+    ],
+)
+def test_of_scans_and_headings_the_side_that_is_turned_is_named_and_of_both_the_prior(
+    scans_deg: float, prior_deg: float, name: str
+) -> None:
+    T, (C, D) = along(150.0, curved=True), (yawed(deg) for deg in (scans_deg, prior_deg))
+    runs = [Run(run.indices, C @ run.T_first_lidar @ geometry.inverse(C), run.fit) for run in runs_of(T)]
+    (error,) = (f for f in compared(T @ D, T, runs) if f.severity == "error")
+    assert error.what.startswith(name)
+
+
+@pytest.mark.parametrize(
+    ("share", "name"),
+    [
+        (0.3, "the prior fits the scans in 2 of 6 places only; it does not between scans 62 and 185"),
+        (0.6, "between scans 155 and 185 the prior is 20.1 m off the scans' motion, elsewhere 0.0 m (2 of 6 places)"),
+    ],
+)
+def test_where_a_prior_stands_still_for_the_rest_of_the_drive_is_named(share: float, name: str) -> None:
+    T = along(150.0, curved=True)
+    held = np.minimum(np.arange(len(T)), int(share * len(T)))
+    assert [f.what for f in compared(T[held], T) if f.severity == "error"] == [name]
 
 
 def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
