@@ -154,13 +154,13 @@ def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Pat
     """Tables on the terminal; all numbers into the file ``json``, if one is wanted."""
     from rich.console import Console
 
+    from mapvote.formats.atomic import write_whole
     from mapvote_lab.evaluation.scores import to_json
-    from mapvote_lab.evaluation.tables import write_text
 
     for sheet in sheets:
         Console(width=140).print(sheet.to_rich())
     if json is not None:
-        write_text(to_json(result), json)
+        write_whole(json, to_json(result))
         print(f"{json}: all numbers")
 
 

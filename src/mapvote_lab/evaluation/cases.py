@@ -11,7 +11,7 @@ own tables, votes and verdicts (core/voting.py).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -132,27 +132,8 @@ _FAST = 1
 """zstd level: written once, read for every reading."""
 
 
-@dataclass(frozen=True, slots=True)
 class KeptDrive:
-    """What the scans of one drive say of each cell."""
-
-    windows: I32
-    """(scans, 4) row0, col0, rows, cols of each scan's local grid, from the truth's corner."""
-    sizes: I32
-    """(scans,) bytes of each scan's words."""
-    packed: bytes
-
-    def words(self) -> Iterator[tuple[int, int, U16]]:
-        """(row0, col0, words (rows, cols)) of each scan, rows and columns from the truth's corner."""
-        at = 0
-        for (row0, col0, rows, cols), size in zip(self.windows.tolist(), self.sizes.tolist(), strict=True):
-            raw = unpack_bytes(self.packed[at : at + size], 2 * rows * cols, "a kept scan")
-            yield row0, col0, np.frombuffer(raw, dtype="<u2").reshape(rows, cols)
-            at += size
-
-
-class Keeper:
-    """Packs what each observation of a drive says, over ``window``."""
+    """What the scans of one drive say of each cell of ``window``, packed scan by scan."""
 
     def __init__(self, window: Grid, sensor: Sensor, n_min: int) -> None:
         self.window, self.sensor, self.n_min = window, sensor, n_min
@@ -167,16 +148,22 @@ class Keeper:
             self._packed.append(pack_plane(sightings(seen, self.sensor, self.n_min), _FAST))
 
     def write(self, folder: Path) -> None:
-        """Into two files of ``folder``."""
-        (folder / "kept.words").write_bytes(b"".join(self._packed))
+        """Into a file of ``folder``."""
+        words = np.frombuffer(b"".join(self._packed), dtype=np.uint8)
         windows = np.array(self._windows, dtype=np.int32).reshape(-1, 4)
-        np.savez(folder / "kept.npz", windows=windows, sizes=np.array(list(map(len, self._packed)), dtype=np.int32))
+        np.savez(folder / "kept.npz", windows=windows, sizes=list(map(len, self._packed)), words=words)
 
 
-def read_kept(folder: Path) -> KeptDrive:
-    """What :meth:`Keeper.write` wrote."""
+Words = Sequence[tuple[int, int, bytes, tuple[int, int]]]
+"""Of each scan of a drive: row and column of its local grid from the truth's corner, its words packed, their shape."""
+
+
+def read_kept(folder: Path) -> Words:
+    """What :meth:`KeptDrive.write` wrote."""
     with np.load(folder / "kept.npz") as file:
-        return KeptDrive(file["windows"], file["sizes"], (folder / "kept.words").read_bytes())
+        ends, words = np.cumsum(file["sizes"]), file["words"].tobytes()
+        packed = [words[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+        return [(r, c, one, (h, w)) for (r, c, h, w), one in zip(file["windows"].tolist(), packed, strict=True)]
 
 
 PUBLISHED = "as_published"
@@ -218,13 +205,15 @@ def _cast(
                 tally[r, c, state] += weights[word]
 
 
-def tallies(drive: KeptDrive, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32]:
+def tallies(drive: Words, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32]:
     """(rows, cols, 5) votes in VOTE_UNITs of one drive by each rule, over the truth's window.
 
     ``mapped`` (rows, cols): where the map holds obstacle points.
     """
     found = {rule: np.zeros((*mapped.shape, N_STATES), dtype=np.int32) for rule in rules}
-    for row0, col0, words in drive.words():
+    for row0, col0, packed, shape in drive:
+        raw = unpack_bytes(packed, 2 * shape[0] * shape[1], "a kept scan")
+        words = np.frombuffer(raw, dtype="<u2").reshape(shape)
         for rule, tally in found.items():
             half = round(0.5 * rule[1].window_m / CELL_SIZE)
             margin = max(0, words.shape[0] // 2 - half)
@@ -237,7 +226,7 @@ def counting_rule(case: Case) -> Rule:
     return case.voting.model_copy(update={"two_stage": True}), case.paper
 
 
-def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) -> dict[str, tuple[U8, list[U8]]]:
+def decided(drives: Sequence[Words], mapped: Bool, cases: Sequence[Case]) -> dict[str, tuple[U8, list[U8]]]:
     """By case's name: (what the server decides, what each vehicle does), over the truth's window."""
     rules = list(dict.fromkeys(counting_rule(case) for case in cases))
     counted = [tallies(drive, mapped, rules) for drive in drives]
@@ -254,7 +243,7 @@ def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) ->
 
 
 def swept(
-    drives: Sequence[KeptDrive], mapped: Bool, settings: Settings, truths: Mapping[str, U8],
+    drives: Sequence[Words], mapped: Bool, settings: Settings, truths: Mapping[str, U8],
     only: str | None = None, progress: Progress = untold,
 ) -> dict[str, dict[str, dict[str, Scores]]]:  # fmt: skip
     """Scores by reading, case and truth: as ``settings`` read the paper, and one sentence at a time read otherwise.

@@ -23,11 +23,11 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import F64, Bool, CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, write_map
-from mapvote.formats.atomic import whole_file
+from mapvote.formats.atomic import whole_file, write_whole
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.localisation.localiser import GivenPoses
-from mapvote.plots import NEW, save
+from mapvote.plots import NEW, UNSURE, save
 from mapvote.server.store.store import Store, url_of
 from mapvote.server.views.cutout import Cutout, fragment
 from mapvote.server.views.history import changes_between, cutouts_between
@@ -41,7 +41,7 @@ from mapvote_lab.evaluation.real_report import draw_things
 from mapvote_lab.evaluation.real_street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
-from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables, write_text
+from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.simulation.processes import processes
 
 CASE = "surfaces"
@@ -89,7 +89,7 @@ def report_page(
     evaluation: Evaluation, story: Story, pictures: list[tuple[Path, str]], out: Path, cutouts: Sequence[Cutout] = ()
 ) -> str:
     """report.html's text: what happened, in the order in which it happened."""
-    drawn = {path.stem: (path, caption) for path, caption in pictures}
+    drawn, held = {path.stem: (path, caption) for path, caption in pictures}, story.published.held
     sections = [
         _what_happened(evaluation, [drawn["scans"], drawn["street"]]),
         ReportSection(
@@ -107,7 +107,16 @@ def report_page(
             ],
             [drawn["scan"], drawn["local_grid"], drawn["vote_curve"]],
         ),
-        _what_the_server_decided(story, [drawn["states"]]),
+        ReportSection(
+            "What the server decided",
+            [
+                "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
+                f"version {story.published.version} of the map, which the vehicles then download. Undetermined and "
+                "never seen cells keep what the map has.",
+                *([f"It held the version first, for an operator to look: {held}"] if held else []),
+            ],
+            [drawn["states"]],
+        ),
         _how_good(evaluation.result, drawn),
         beside_the_paper(evaluation.result),
         ReportSection(
@@ -122,19 +131,17 @@ def report_page(
         f"{built} built and {sum(a.objects for a, _, _ in story.areas) - built} demolished buildings; "
         f"the vote found {story.found} changed objects that its vehicles could see."
     )
-    return page(title, lead, _facts(evaluation.result, story), sections)
-
-
-def _facts(result: EvaluationResult, story: Story) -> list[tuple[str, str]]:
-    error = np.median([place.median_m for place in result.localisation.values()])
-    return [
+    error = np.median([place.median_m for place in evaluation.result.localisation.values()])
+    sent = np.mean(evaluation.result.cases[CASE].bytes_per_vehicle)
+    facts = [
         (story.found, "changed objects found"),
         (str(len(story.objects.false_m2)), "changes of 1 m² or more where nothing changed"),
         (f"{story.deleted:,}", "points deleted from the map"),
         (f"{story.added:,}", "points added to it"),
         (f"{100 * error:.1f} cm", "median localisation error"),
-        (f"{np.mean(result.cases[CASE].bytes_per_vehicle) / 1000:.0f} kB", "sent by each vehicle"),
+        (f"{sent / 1000:.0f} kB", "sent by each vehicle"),
     ]
+    return page(title, lead, facts, sections)
 
 
 def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSection:
@@ -148,20 +155,6 @@ def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSec
             "counted one vote a vehicle and edited the map.",
             f"Blue points were deleted and red ones added by that vote ({case_name(CASE)}: the paper's two votes "
             "on its 2D grid, with evidence by height). Dashed outlines are the truth, which no vehicle saw.",
-        ],
-        pictures,
-    )
-
-
-def _what_the_server_decided(story: Story, pictures: list[Picture]) -> ReportSection:
-    held = story.published.held
-    return ReportSection(
-        "What the server decided",
-        [
-            "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
-            f"version {story.published.version} of the map, which the vehicles then download. Undetermined and never "
-            "seen cells keep what the map has.",
-            *([f"It held the version first, for an operator to look: {held}"] if held else []),
         ],
         pictures,
     )
@@ -271,7 +264,6 @@ EACH = 2
 """New bodies of each kind."""
 SEED = 2
 """Of the simulated street, and of the places of new bodies. Not the seed that the method was developed on (1)."""
-MISSED = "#f2c230"
 
 
 def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path], None]) -> list[str]:
@@ -284,7 +276,8 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     cases, _ = choose_cases(settings, CASE)
     with processes(2) as compilers:
         compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
-        recording, length = first_scans(folder)
+        length = len(open_drive(folder))
+        recording = open_drive(folder, scans=f"0:{min(SCANS, length)}")
         scan = draw_scan(recording, out / "pictures" / "scan.png")
         show(scan)
         for done, compiled in enumerate(compiling):
@@ -320,7 +313,7 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
         (f"{100 * float(np.median(run.error_m)):.1f} cm", "median distance from the SLAM trajectory"),
     ]
     text = page(f"Three vehicles voted on {folder.name}", _LEAD, facts, _sections(folder, street, length, pictures))
-    write_text(text, out / "report.html")
+    write_whole(out / "report.html", text)
     lines = [f"{what}: {figure}" for figure, what in facts]
     return [*lines, f"{out / 'report.html'}: the story with pictures", f"{out / 'map'}: the map"]
 
@@ -329,12 +322,6 @@ _LEAD = (
     "A street is mapped from a part of a recording and driven by the rest. Bodies that never stood there are cast into "
     "the scans of the vehicles, so that the vote has something to find."
 )
-
-
-def first_scans(folder: Path) -> tuple[Drive, int]:
-    """The first SCANS scans of the drive at ``folder``, and how many it has."""
-    length = len(open_drive(folder))
-    return open_drive(folder, scans=f"0:{min(SCANS, length)}"), length
 
 
 def draw_scan(recording: Drive, path: Path) -> Path:
@@ -355,7 +342,7 @@ def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
     positions = street.T_map_lidar[:, :3, 3]
     middle = positions[len(positions) // 2]
     along = positions[-1] - positions[0]
-    road_z = float(np.median(positions[:, 2])) - _height_over_road(street)
+    road_z = float(np.median(positions[:, 2])) - float(street.built.tracks[0].heights.median_m)
     near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 70.0
     clouds, colours = [points[near]], [figures.shades(points[near, 2] - road_z)]
     for returns in cast:
@@ -363,15 +350,11 @@ def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
         found = np.zeros(len(returns), dtype=np.bool_)
         found[inside] = run.states[CASE][rows[inside], cols[inside]] == CellState.CHANGED_OCCUPIED
         clouds.append(returns)
-        colours.append(np.where(found[:, None], to_rgb(NEW), to_rgb(MISSED)).astype(np.float32))
+        colours.append(np.where(found[:, None], to_rgb(NEW), to_rgb(UNSURE)).astype(np.float32))
     behind = float(np.degrees(np.arctan2(-along[1], -along[0]))) + 25.0
     camera = figures.Camera((float(middle[0]), float(middle[1]), road_z), 75.0, behind, 38.0)
     panel = (f"{len(points):,} map points", np.concatenate(clouds), np.concatenate(colours))
-    save(figures.draw([panel], camera, legend=[("new, found", NEW), ("new, missed", MISSED)]), path)
-
-
-def _height_over_road(street: Street) -> float:
-    return float(street.built.tracks[0].heights.median_m)
+    save(figures.draw([panel], camera, legend=[("new, found", NEW), ("new, missed", UNSURE)]), path)
 
 
 def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tuple[Path, str]]) -> list[ReportSection]:
@@ -398,9 +381,6 @@ def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tupl
     ]
 
 
-SCENARIO, FULL_SCENARIO = "corner", "street"
-
-
 def demo(
     out: Path,
     *,
@@ -417,7 +397,7 @@ def demo(
     that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
     """
     settings, work = Settings(), out / "work"
-    scene = Scene(FULL_SCENARIO if full else SCENARIO, SEED, settings, work)
+    scene = Scene("street" if full else "corner", SEED, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     with processes(2) as compilers:
         compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
@@ -441,12 +421,14 @@ def demo(
     for name, point_map in (("map_before", evaluation.first_map), ("map_after", done.updated)):
         with whole_file(out / f"{name}.pcd") as partial:
             write_pcd(partial, Cloud(all_points(point_map)))
-    write_text(as_text(evaluation.result), out / "tables.txt")
-    write_text(to_json(evaluation.result), out / "results.json")
+    write_whole(out / "tables.txt", as_text(evaluation.result))
+    write_whole(out / "results.json", to_json(evaluation.result))
     write_map(done.updated, out / "map_after")
     areas = changed_areas(work / "server" / "store.db", done.version)
-    story = tell(evaluation, done, drives_bytes=size_of(work), kept=keep)
-    write_text(report_page(evaluation, story, pictures, out, areas), out / "report.html")
+    story = tell(
+        evaluation, done, drives_bytes=sum(f.stat().st_size for f in work.rglob("*") if f.is_file()), kept=keep
+    )
+    write_whole(out / "report.html", report_page(evaluation, story, pictures, out, areas))
     if not keep:
         shutil.rmtree(work)
     progress("server and pictures", 1, 1)
@@ -468,8 +450,3 @@ def changed_areas(store: Path, version: int) -> list[Cutout]:
         return cutouts_between(opened, 1, version, changes_between(opened, 1, version)) if version > 1 else []
     finally:
         opened.close()
-
-
-def size_of(folder: Path) -> int:
-    """Bytes of all files in a folder."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, CellState
+from mapvote.formats.atomic import write_whole
 from mapvote.plots import GONE, INK, NEW, STATE_COLOURS, UNSURE, save
 from mapvote_lab.evaluation.real_bench import (
     BUILT,
@@ -23,7 +24,7 @@ from mapvote_lab.evaluation.real_bench import (
     score,
 )
 from mapvote_lab.evaluation.real_street import FalseChange, RealRun, is_changed, largest_false_changes
-from mapvote_lab.evaluation.tables import Sheet, write_text
+from mapvote_lab.evaluation.tables import Sheet
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
@@ -38,7 +39,7 @@ def write_report(bench: Bench, case: str, sheets: list[Sheet], command: str, fol
     """tables.md, a page of the ``sheets`` with the ``command`` that made them, and pictures of the worst cells."""
     pictures = draw_worst(bench, case, folder)
     text = "\n".join([f"```\n{command}\n```\n", *(sheet.to_markdown() for sheet in sheets)])
-    write_text(text, folder / "tables.md")
+    write_whole(folder / "tables.md", text)
     return [folder / "tables.md", *pictures]
 
 

@@ -43,7 +43,7 @@ from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.cases import Case, Keeper, Progress, Rule, counting_rule, untold
+from mapvote_lab.evaluation.cases import Case, KeptDrive, Progress, Rule, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
@@ -272,7 +272,7 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
         localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
     vehicle = SharedPass(drive, point_map, scene.settings, cases, localise=localise)
     window = scene.truth.grid_on(point_map.lattice)
-    keeper = Keeper(window, drive.sensor, scene.settings.paper.n_min) if keep else None
+    keeper = KeptDrive(window, drive.sensor, scene.settings.paper.n_min) if keep else None
     for i, scan in enumerate(drive):
         observations = vehicle.observe(scan, PosePrior.of(drive, i))
         if keeper:

@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mapvote.formats.atomic import write_whole
 from mapvote_lab.evaluation.scores import (
     CLASSES,
     PAPER_F1,
@@ -282,8 +281,3 @@ def as_text(result: EvaluationResult) -> str:
     for sheet in tables(result):
         console.print(sheet.to_rich())
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
-
-
-def write_text(text: str, path: Path) -> None:
-    """Whole or not at all."""
-    write_whole(path, text)
