@@ -219,7 +219,7 @@ def _explained(
         return out
     clouds = [all_points(one) for one in maps]
     for k, cells in enumerate(alone):
-        mine = _in_cells(clouds[k], cells & ~left_out, window)
+        mine = clouds[k][window.value_at(cells & ~left_out, clouds[k])]
         fits = np.zeros(len(mine), dtype=np.bool_)
         for centre, T in motions:  # T moves b's points
             others = clouds[1 - k][_near(clouds[1 - k], centre)]
@@ -238,13 +238,6 @@ def _explained(
 
 def _near(points: F64, centre: F64) -> Bool:
     return np.asarray((np.abs(points[:, :2] - centre) < SIDE_M).all(axis=1))
-
-
-def _in_cells(points: F64, cells: Bool, window: Grid) -> F64:
-    rows, cols, inside = window.indices_of(points)
-    mine = np.zeros(len(points), dtype=np.bool_)
-    mine[inside] = cells[rows[inside], cols[inside]]
-    return points[mine]
 
 
 def differences(found: CellComparison, min_m2: float = 0.5) -> list[CloudChange]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,13 @@ class Grid:
         row -= self.row0
         col -= self.col0
         return row, col, (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
+
+    def value_at(self, plane: NDArray[Any], xy: NDArray[np.floating], outside: object = False) -> NDArray[Any]:
+        """(n,) what ``plane`` (rows, cols) of this window holds at points (n, 2+) in map metres."""
+        rows, cols, inside = self.indices_of(xy)
+        out = np.full(len(xy), outside, dtype=plane.dtype)
+        out[inside] = plane[rows[inside], cols[inside]]
+        return out
 
     def to_map(self, points: NDArray[np.float32]) -> NDArray[np.float64]:
         """Points (n, 3) whose x, y are metres from this window's corner, in map metres, float64."""

@@ -308,7 +308,11 @@ def yardsticks(
     nearest = [np.load(folder / "nearest.npy") for folder in folders]
     votes: I32 = np.sum([one_hot(states) for states in nearest], axis=0, dtype=np.int32)
     reference = reference_window(scene.point_map, scene.truth.grid_on(scene.point_map.lattice))
-    maps = [_read_evidence(folder / "evidence.npz", EvidenceMap(reference)) for folder in folders]
+    maps = []
+    for folder in folders:
+        maps.append(EvidenceMap(reference))
+        with np.load(folder / "evidence.npz") as file:
+            maps[-1].occupied[file["known"]], maps[-1].free[file["known"]] = file["occupied"], file["free"]
     evidence = combine(maps, reference), [combine([one], reference) for one in maps]
     return {"nearest": (plurality(votes), nearest), "evidence": evidence}, mean
 
@@ -344,25 +348,18 @@ def _measure(task: tuple[Scene, str, F64]) -> None:
     start = time.thread_time()
     states = nearest.states()
     at_end = (time.thread_time() - start) / max(len(there), 1)
+
+    def median_ms(seconds: Any) -> float:
+        return 1000.0 * float(np.median(seconds))
+
     tally_bytes = len(ballot.tiles) * TILE_CELLS * TILE_CELLS * N_STATES * 4
     cost = {  # milliseconds a scan, bytes of its grid
-        "case 5": (_median_ms(np.add(stages["see"], stages["vote"])), tally_bytes),
-        "nearest": (_median_ms(seconds["nearest"]) + 1000 * at_end, nearest.memory_bytes),
-        "evidence": (_median_ms(seconds["evidence"]), evidence.memory_bytes),
+        "case 5": (median_ms(np.add(stages["see"], stages["vote"])), tally_bytes),
+        "nearest": (median_ms(seconds["nearest"]) + 1000 * at_end, nearest.memory_bytes),
+        "evidence": (median_ms(seconds["evidence"]), evidence.memory_bytes),
     }
     with whole_folder(_folder(scene, name), sign="cost.json") as folder:
         np.save(folder / "nearest.npy", states)
         known = np.flatnonzero((evidence.occupied > 0) | (evidence.free > 0)).astype(np.int32)
         np.savez(folder / "evidence.npz", known=known, occupied=evidence.occupied[known], free=evidence.free[known])
         (folder / "cost.json").write_text(json.dumps(cost))
-
-
-def _median_ms(seconds: Any) -> float:
-    return 1000.0 * float(np.median(seconds))
-
-
-def _read_evidence(path: Path, into: EvidenceMap) -> EvidenceMap:
-    with np.load(path) as file:
-        into.occupied[file["known"]] = file["occupied"]
-        into.free[file["known"]] = file["free"]
-    return into

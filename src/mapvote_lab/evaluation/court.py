@@ -161,9 +161,7 @@ def _measured_as_far(T: F64, window: Grid, surveyed: Bool) -> F64:
     reach = _STRIDE_M * np.arange(1, int(_FAR_RANGE_M / _STRIDE_M) + 1)
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
     places = T[:2, 3] + ahead[:, None, :] * reach[None, :, None]
-    rows, cols, inside = window.indices_of(places.reshape(-1, 2))
-    known = np.zeros(len(rows), dtype=np.bool_)
-    known[inside] = surveyed[rows[inside], cols[inside]]
+    known = window.value_at(surveyed, places.reshape(-1, 2))
     return np.asarray(_STRIDE_M * (1 + np.logical_and.accumulate(known.reshape(_COLUMNS, -1), axis=1).sum(axis=1)))
 
 
@@ -235,22 +233,21 @@ def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
     grid = Grid(court.reference.lattice, int(rows[0]), int(cols[0]), *size)
     gone, new = np.zeros((2, *grid.shape), dtype=np.int64)
     offered = []
+
+    def far(points: F64, others: F64) -> F64:
+        return points[KDTree(others).query(points)[0] > _FAR_M]
+
     for cloud in court.sessions.values():
-        gone += cells_with(_far(before, all_points(cloud)), grid)
-        far = _far(map_obstacles(cloud), reference)
-        new += cells_with(far, grid)
-        offered.append(far[grid.indices_of(far)[2]])
+        gone += cells_with(far(before, all_points(cloud)), grid)
+        came = far(map_obstacles(cloud), reference)
+        new += cells_with(came, grid)
+        offered.append(came[grid.indices_of(came)[2]])
     states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
     states[gone >= 2] = CellState.CHANGED_EMPTY
     states[new >= 2] = CellState.CHANGED_OCCUPIED
     kept = before[states[grid.indices_of(before)[:2]] != CellState.CHANGED_EMPTY]
     come = [points[states[grid.indices_of(points)[:2]] == CellState.CHANGED_OCCUPIED] for points in offered]
     return _score("cloud to cloud", before, np.concatenate([kept, *come]), states, grid, shown)
-
-
-def _far(points: F64, others: F64) -> F64:
-    """Those of ``points`` (n, 3) that lie more than 0.6 m from every one of the ``others`` (m, 3)."""
-    return points[KDTree(others).query(points)[0] > _FAR_M]
 
 
 def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float = 0.0) -> np.ndarray:

@@ -346,9 +346,7 @@ def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
     near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 70.0
     clouds, colours = [points[near]], [figures.shades(points[near, 2] - road_z)]
     for returns in cast:
-        rows, cols, inside = street.grid.indices_of(returns)
-        found = np.zeros(len(returns), dtype=np.bool_)
-        found[inside] = run.states[CASE][rows[inside], cols[inside]] == CellState.CHANGED_OCCUPIED
+        found = street.grid.value_at(run.states[CASE] == CellState.CHANGED_OCCUPIED, returns)
         clouds.append(returns)
         colours.append(np.where(found[:, None], to_rgb(NEW), to_rgb(UNSURE)).astype(np.float32))
     behind = float(np.degrees(np.arctan2(-along[1], -along[0]))) + 25.0

@@ -96,10 +96,7 @@ def survey_site(street: Street) -> Site:
     reference = reference_window(street.point_map, street.grid)
 
     def ground(xy: F64) -> F64:
-        rows, cols, inside = street.grid.indices_of(xy)
-        out = np.full(len(xy), np.nan)
-        out[inside] = reference.ground_z[rows[inside], cols[inside]]
-        return out
+        return street.grid.value_at(reference.ground_z, xy, np.nan).astype(np.float64)
 
     return Site(cloud.points()[0], ground, street.T_map_lidar[:, :3, 3])
 

@@ -278,11 +278,9 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
         if keeper:
             keeper.watch(observations)
     observations = vehicle.finish()
-    report, lost = vehicle.report, set(vehicle.report.lost)
-    poses = np.full((len(drive), 4, 4), np.nan)
-    for i, T_map_lidar in enumerate(report.T_map_lidar):
-        if i not in lost:
-            poses[i] = T_map_lidar
+    report, poses = vehicle.report, np.full((len(drive), 4, 4), np.nan)
+    found = np.setdiff1d(np.arange(len(drive)), report.lost)
+    poses[found] = np.array(report.T_map_lidar)[found]
     with whole_folder(pass_folder(scene, cases, name, keep), sign="pass.json") as folder:
         if keeper:
             keeper.watch(observations)

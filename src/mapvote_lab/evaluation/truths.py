@@ -209,14 +209,7 @@ def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
     changed = np.isin(cells, (_OCCUPIED, _EMPTY))
     near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), NEIGHBOURS)
     beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
-    return kept[_at(truth, kept, beside)], added, removed
-
-
-def _at(truth: Truth, samples: F64, plane: Bool) -> Bool:
-    """(n,) what ``plane`` (rows, cols) holds at samples (n, 3); False outside it."""
-    rows, cols, inside = truth.grid.indices_of(samples)
-    inside[inside] = plane[rows[inside], cols[inside]]
-    return inside
+    return kept[truth.grid.value_at(beside, kept)], added, removed
 
 
 def _rims(truth: Truth, samples: F64) -> tuple[Bool, Bool]:
@@ -339,7 +332,7 @@ class Jury:
         """Over the truth's window."""
         self.truths = {name: judge(truth, self.first_map) for name, judge in TRUTHS.items()}
         """(rows, cols) of each, by name."""
-        scored = partial(_at, truth, plane=truth.strict != UNSCORED)
+        scored = partial(truth.grid.value_at, truth.strict != UNSCORED)
         self.points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth), scored)
         """What became of the first map's points."""
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
