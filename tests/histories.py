@@ -13,7 +13,7 @@ import numpy as np
 from hand_made import Say, make_ballot, two_walls, wall, words_plane
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.tile import Memory
+from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import Intake, Receipt, examine
@@ -24,7 +24,7 @@ from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
-from standing_clock import Clock
+from stores import Clock
 
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
@@ -102,7 +102,8 @@ class History:
         version = newest if rng.random() < 0.6 else rng.randint(max(1, newest - 3), newest)
         has_free = rng.random() < 0.7
         masks = rng.random() < self.masks
-        says = {c: self._say(c, version, masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
+        mapped = self.rules.versions[version].cells
+        says = {c: say(rng, self.there[c], mapped[c], masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
         if not says:
             return
         way = rng.choice(["", *self.ways])
@@ -123,16 +124,6 @@ class History:
         while about in taken:
             about -= 1
         return about
-
-    def _say(self, cell: Cell, version: int, masks: bool, has_free: bool) -> Spoken:
-        """Mostly the truth, as seen against that version."""
-        rng = self.rng
-        mapped = self.rules.versions[version].cells[cell].stands()
-        truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[mapped, self.there[cell]]
-        state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
-        gone = rng.choice([0b1110, 0b0110, 0b0010, 0]) if masks and state in (CE, UO) and rng.random() < 0.7 else 0
-        heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,)]) if state == CO else ()
-        return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 
     def _send(
         self, vehicle: str, drive: str, end_s: int, version: int, states: U8,
@@ -239,16 +230,29 @@ class History:
         tile = self.store.tile(newest, (0, 0))
         assert tile is not None
         self.hashes[newest] = self.store.tiles(newest)[0, 0].points
-        memory = tile.memory or Memory.none()
         expected = self.rules.versions[newest]
         assert (tile.free is not None) == expected.knows_free, f"{where}: knows of free space"
         for cell, wanted in expected.cells.items():
-            mine = tile.cells == cell[0] * 256 + cell[1]
-            heights = tuple(round(float(z), 2) for z in tile.points[mine, 2])
-            free = 0 if tile.free is None else int(tile.free[cell])
-            found = CellMap(heights, free, *(int(plane[cell]) for plane in memory.planes))
+            found = held_by(tile, cell)
             assert found == wanted, f"{where}: cell {cell} is {found}, by the rules {wanted}"
         assert len(tile.points) == sum(len(cell.heights) for cell in expected.cells.values()), where
+
+
+def say(rng: random.Random, there: bool, mapped: CellMap, masks: bool, has_free: bool) -> Spoken:
+    """Mostly the truth about a cell, as seen against what the map holds of it."""
+    truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[mapped.stands(), there]
+    state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
+    gone = rng.choice([0b1110, 0b0110, 0b0010, 0]) if masks and state in (CE, UO) and rng.random() < 0.7 else 0
+    heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,)]) if state == CO else ()
+    return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
+
+
+def held_by(tile: Tile, cell: Cell) -> CellMap:
+    """What a tile holds and remembers of a cell."""
+    heights = tile.points[tile.cells == cell[0] * 256 + cell[1], 2]
+    remembered = (int(n) for n in (tile.memory or Memory.none()).planes[:, cell[0], cell[1]])
+    free = 0 if tile.free is None else int(tile.free[cell])
+    return CellMap(tuple(round(float(z), 2) for z in heights), free, *remembered)
 
 
 @cache

@@ -1,8 +1,9 @@
-"""What vehicles send to a store in tests."""
+"""What vehicles send to a store in tests, and its clock."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from hand_made import Cell, Say, make_ballot, states_plane
 from mapvote.codec.ballot import Ballot, encode
@@ -15,6 +16,16 @@ NewStore = Callable[..., Store]
 """See conftest.py."""
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 """The cells of the wall in each tile of :func:`hand_made.two_walls`."""
+
+
+@dataclass
+class Clock:
+    """Of a store: nanoseconds since 1970. It stands until a test moves it on."""
+
+    now: int
+
+    def __call__(self) -> int:
+        return self.now
 
 
 def send(store: Store | Intake, *ballots: Ballot) -> list[Receipt]:

@@ -10,27 +10,18 @@ import numpy as np
 import pytest
 
 from hand_made import make_tile, states_plane, wall, words_plane
+from histories import held_by, say
 from mapvote.codec.sparse_columns import Words
 from mapvote.config import FuseSettings
-from mapvote.core.tile import Memory, Tile
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
-from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Spoken, Version, fuse
+from plain_rules import DAY_S, Cast, Cell, CellMap, Version, fuse
 
 WALL: list[Cell] = [(r, c) for r in (10, 11, 12) for c in (10, 11)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
 HEIGHTS = (0.05, 0.45, 0.75, 1.05, 1.65)
 START_S = 1_700_000_000
-
-
-def say(rng: random.Random, there: bool, seen_with: CellMap, masks: bool, has_free: bool) -> Spoken:
-    """Mostly the truth."""
-    truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[seen_with.stands(), there]
-    state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
-    gone = rng.choice([0b101110, 0b001110, 0b000110, 0b100010, 0]) if state in (CE, UO) and rng.random() < 0.7 else 0
-    heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,), (1.35,)]) if state == CO else ()
-    return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 
 
 def as_vote(cast: Cast, masks: bool) -> TileVote:
@@ -46,13 +37,6 @@ def as_vote(cast: Cast, masks: bool) -> TileVote:
         free=Words.of(free) if cast.has_free else None,
         version=cast.version,
     )
-
-
-def held_by(tile: Tile, cell: Cell) -> CellMap:
-    heights = tile.points[tile.cells == cell[0] * 256 + cell[1], 2]
-    changed, came_s, stays, stayed_s = (int(n) for n in (tile.memory or Memory.none()).planes[:, cell[0], cell[1]])
-    free = 0 if tile.free is None else int(tile.free[cell])
-    return CellMap(tuple(round(float(z), 3) for z in heights), free, changed, came_s, stays, stayed_s)
 
 
 @pytest.mark.parametrize("seed", range(24))

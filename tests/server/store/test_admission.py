@@ -31,7 +31,7 @@ from mapvote.server.store.admission import (
 )
 from mapvote.server.store.database import Remembered
 from mapvote.server.store.store import Store
-from standing_clock import Clock
+from stores import Clock
 
 
 def ballot(**more: object) -> Ballot:

@@ -35,8 +35,7 @@ from mapvote.server.store.queries import Version, oldest_kept, tile_as_of
 from mapvote.server.store.reviews import decide
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
-from standing_clock import Clock
-from stores import send
+from stores import Clock, send
 
 HERE = (0, 0)
 CELL, OTHER = WALL[0], WALL[1]

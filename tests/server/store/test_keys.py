@@ -16,8 +16,7 @@ from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.rollback import replay
 from mapvote.server.store.store import Store
-from standing_clock import Clock
-from stores import send
+from stores import Clock, send
 
 NOON = 1_700_000_000 * 10**9
 

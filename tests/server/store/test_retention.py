@@ -22,8 +22,7 @@ from mapvote.server.store.retention import clear
 from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.views.explain import explain_cell
-from standing_clock import Clock
-from stores import send
+from stores import Clock, send
 
 CELL = (20, 20)
 START_NS = 1_700_000_000 * 10**9

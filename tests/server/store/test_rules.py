@@ -23,7 +23,7 @@ from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema, votes
 from mapvote.server.store.database import remembered
 from mapvote.server.store.store import Store
-from standing_clock import Clock
+from stores import Clock
 
 MakeStore = Callable[[Clock], Store]
 

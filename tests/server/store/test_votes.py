@@ -30,8 +30,7 @@ from mapvote.server.store.votes import (
     standing_tiles,
     withdraw,
 )
-from standing_clock import Clock
-from stores import send
+from stores import Clock, send
 
 CELL, OTHER = (10, 10), (10, 11)
 HERE, BESIDE = (0, 0), (0, 1)

@@ -25,8 +25,7 @@ from mapvote.server.store.votes import withdraw
 from mapvote.server.views import explain
 from mapvote.server.views.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell
 from mapvote.server.views.history import last_events
-from standing_clock import Clock
-from stores import NewStore, send
+from stores import Clock, NewStore, send
 
 WALL, LAWN = (10, 10), (20, 20)
 START_NS = 1_700_000_000 * 10**9

@@ -22,8 +22,7 @@ from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.desk import desk, review
-from standing_clock import Clock
-from stores import NewStore, send
+from stores import Clock, NewStore, send
 
 MOST_STATEMENTS = 20
 FREE = FuseSettings(max_deleted_share=1.0, max_change_m2=1e6, max_freed_share=1.0)
