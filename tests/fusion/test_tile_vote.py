@@ -12,7 +12,7 @@ from mapvote.codec.sparse_columns import Words, nothing_reached
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, silenced
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, offered, silenced
 
 UO, UE, CO, CE, UN = CellState
 WINDOW = Lattice().tile((0, 0))
@@ -168,3 +168,5 @@ def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_othe
     assert one.intensity is not None
     assert sorted(zip(one.new_points[:, 0].tolist(), one.intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
     assert len(drive("v", 3, {}).measured()) == 0
+    points, bright, _, voters = offered([one], states_plane({(3, 3): CO, (16, 16): CO}), WINDOW)
+    assert sorted(zip(points[:, 0].tolist(), bright.tolist(), voters.tolist(), strict=True)) == [(1, 0, 0), (5, 77, 0)]
