@@ -25,7 +25,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows, remembered, sum_of
-from mapvote.server.store.policy import policy_in
+from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import (
     load_blob,
     load_memory,
@@ -57,10 +57,9 @@ class Votes:
     tile: TileIndex
     spoken: bytes
     """The cells that it votes on: 65536 bits, row by row."""
-    lowest_m: float | None = None
-    """Height of its lowest new point, map metres; None: it brings none."""
-    highest_m: float | None = None
-    stored: tuple[Any, ...] = field(default=(), repr=False)
+    heights_m: tuple[float, float] | None
+    """Of its lowest and highest new point, map metres; None: it brings none."""
+    stored: tuple[Any, ...] = field(repr=False)
     """Base, planes and sum, as the last columns of ``ballot_tiles``."""
 
 
@@ -130,9 +129,9 @@ def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
     packed = base, *(getattr(tile, plane) for plane in schema.BALLOT_PLANES)
     digest = sum_of(*packed)
     remembered.put(digest, planes)
-    heights = np.empty(0) if planes.new_points is None else planes.new_points[:, 2]
-    low, high = (float(heights.min()), float(heights.max())) if len(heights) else (None, None)
-    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), low, high, (*packed, digest))
+    z = () if planes.new_points is None else planes.new_points[:, 2]
+    heights = (float(np.min(z)), float(np.max(z))) if len(z) else None
+    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), heights, (*packed, digest))
 
 
 def _check_founded(ballot: Ballot) -> None:
@@ -160,7 +159,7 @@ class Intake:
         self._used: dict[str, _Used] = {}
         self._newest, self._tiles = 0, dict[TileIndex, TileHashes]()
         """The newest version, and its tiles."""
-        self._policy, self._cast_by, self._settings_hash = 0, "", ""
+        self._policy, self._asked = 0, RoundPolicy()
         """Number of the policy, and what it asks of a round's ballots."""
         self._lowest_m: dict[str, float] = {}
         """Lowest ground of a tile, by its plane's hash."""
@@ -210,8 +209,7 @@ class Intake:
     def _catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
         """Read what has changed of the map and the policy since the last ballots."""
         if policy != self._policy:
-            asked = policy_in(connection).round
-            self._policy, self._cast_by, self._settings_hash = policy, asked.cast_by, asked.settings_hash
+            self._policy, self._asked = policy, policy_in(connection).round
         if newest != self._newest:
             touched = tiles_set_between(connection, self._newest, newest) if self._newest else None
             for index in touched or ():
@@ -221,9 +219,12 @@ class Intake:
 
     def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
-        ballot, newest = one.ballot, self._newest
-        if self._cast_by != one.cast_by or not ballot.settings_hash.startswith(self._settings_hash):
-            return self._unlike(one)
+        ballot, newest, asked = one.ballot, self._newest, self._asked
+        if asked.cast_by != one.cast_by or not ballot.settings_hash.startswith(asked.settings_hash):
+            theirs = f"{one.cast_by}, settings {ballot.settings_hash[:16]}"
+            ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
+            mend = "vote again with the fleet's configuration (mapvote config)"
+            return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
         impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, self._tiles.keys())
@@ -247,12 +248,6 @@ class Intake:
             )
         return None if self._quota is None else self._over_quota(connection, one, now, self._quota)
 
-    def _unlike(self, one: Incoming) -> Conflict:
-        theirs = f"{one.cast_by}, settings {one.ballot.settings_hash[:16]}"
-        ours = f"{self._cast_by}, settings {self._settings_hash[:16] or 'of any kind'}"
-        mend = "vote again with the fleet's configuration (mapvote config)"
-        return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
-
     def _wrong_time(self, ballot: Ballot, now: int) -> MapvoteError | None:
         if ballot.end_ns > now + MAX_CLOCK_AHEAD_NS:
             return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
@@ -266,13 +261,13 @@ class Intake:
         The nearest tiles tell: itself and its neighbours, else those in reach.
         """
         for one in votes:
-            if one.lowest_m is None or one.highest_m is None:
+            if one.heights_m is None:
                 continue
+            low, high = one.heights_m
             near = _touched(one.tile, self._tiles) or [index for index in _around(one.tile) if index in self._tiles]
             ground_m = min((self._ground_m(connection, self._tiles[index].ground) for index in near), default=np.inf)
-            low_m, high_m = ground_m - MAX_BELOW_M, ground_m + MAX_ABOVE_M
-            if np.isfinite(ground_m) and not low_m <= one.lowest_m <= one.highest_m <= high_m:
-                span = f"{one.lowest_m:.1f} to {one.highest_m:.1f} m on tile {tile_key(one.tile)}"
+            if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low <= high <= ground_m + MAX_ABOVE_M:
+                span = f"{low:.1f} to {high:.1f} m on tile {tile_key(one.tile)}"
                 below = f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there"
                 return MapvoteError(
                     f"new points at {span} are not within {below}, {ground_m:.1f} m: is the vehicle on this level?"
