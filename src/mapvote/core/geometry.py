@@ -220,21 +220,21 @@ def _turned(M: F64, v: F64) -> F64:
     return np.asarray((M * v[:, None, :]).sum(axis=2))
 
 
-_SERIES = tuple(map(np.float32, (
+_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10 = map(np.float32, (
     3.33333333333329318027e-01, -1.99999999998764832476e-01, 1.42857142725034663711e-01, -1.11111104054623557880e-01,
     9.09088713343650656196e-02, -7.69187620504482999495e-02, 6.66107313738753120669e-02, -5.83357013379057348645e-02,
     4.97687799461593236017e-02, -3.65315727442169155270e-02, 1.62858201153657823623e-02,
-)))  # fmt: skip
-"""Of 1 - arctan(u) / u by powers of u squared."""
-_HIGH = tuple(map(np.float32, (0.46364760398864746, 0.7853981256484985, 0.9827936887741089, 1.570796251296997)))
+))  # fmt: skip
+"""Of 1 - arctan(u) / u by powers of u squared. An index into a tuple would be compiled for each place."""
+_H0, _H1, _H2, _H3 = map(np.float32, (0.46364760398864746, 0.7853981256484985, 0.9827936887741089, 1.570796251296997))
 """arctan of 1/2, 1, 3/2 and infinity, as near as float32 is below them."""
-_LOW = tuple(
-    map(np.float32, (5.01215824399992e-09, 3.774894707930798e-08, 3.447321716976148e-08, 7.549789415861596e-08))
+_L0, _L1, _L2, _L3 = map(
+    np.float32, (5.01215824399992e-09, 3.774894707930798e-08, 3.447321716976148e-08, 7.549789415861596e-08)
 )
 """What is left of each."""
 _PI, _PI_LEFT, _HALF_PI = np.float32(np.pi), np.float32(-8.7422776573e-08), np.float32(np.pi / 2.0)
-_AT_INFINITY = np.float32(_HIGH[3] + _LOW[3])
-_BOUNDS = tuple(map(np.float32, (0.4375, 0.6875, 1.1875, 2.4375, 2.0**25)))
+_AT_INFINITY = np.float32(_H3 + _L3)
+_B0, _B1, _B2, _B3, _B4 = map(np.float32, (0.4375, 0.6875, 1.1875, 2.4375, 2.0**25))
 """Between the branches; from the last one on, a ratio counts as infinite."""
 _ZERO, _ONE, _TWO, _MIDDLE = (np.float32(v) for v in (0.0, 1.0, 2.0, 1.5))
 
@@ -248,24 +248,23 @@ def azimuth(y: np.float32, x: np.float32) -> np.float32:
     every machine.
     """
     t = _ZERO if y == _ZERO else abs(y / x)  # at the origin itself too
-    first, second, third, fourth = t < _BOUNDS[0], t < _BOUNDS[1], t < _BOUNDS[2], t < _BOUNDS[3]
+    first, second, third, fourth = t < _B0, t < _B1, t < _B2, t < _B3
     # arctan t = h + l + arctan u, u = top / under. Nested choices would be branches again.
     top, under = _TWO * t - _ONE if second else t - _ONE, _TWO + t if second else t + _ONE
     top_, under_ = t - _MIDDLE if fourth else -_ONE, _ONE + _MIDDLE * t if fourth else t
     top, under = top if third else top_, under if third else under_
     top, under = t if first else top, _ONE if first else under
-    h, l = _HIGH[0] if second else _HIGH[1], _LOW[0] if second else _LOW[1]  # noqa: E741
-    h_, l_ = _HIGH[2] if fourth else _HIGH[3], _LOW[2] if fourth else _LOW[3]
+    h, l = _H0 if second else _H1, _L0 if second else _L1  # noqa: E741
+    h_, l_ = _H2 if fourth else _H3, _L2 if fourth else _L3
     h, l = h if third else h_, l if third else l_  # noqa: E741
     h, l = _ZERO if first else h, _ZERO if first else l  # noqa: E741
     u = top / under
     z = u * u
     w = z * z
-    a = _SERIES
-    odd = z * (a[0] + w * (a[2] + w * (a[4] + w * (a[6] + w * (a[8] + w * a[10])))))
-    even = w * (a[1] + w * (a[3] + w * (a[5] + w * (a[7] + w * a[9]))))
+    odd = z * (_A0 + w * (_A2 + w * (_A4 + w * (_A6 + w * (_A8 + w * _A10)))))
+    even = w * (_A1 + w * (_A3 + w * (_A5 + w * (_A7 + w * _A9))))
     turn = h - ((u * (odd + even) - l) - u)
-    turn = _AT_INFINITY if t >= _BOUNDS[4] else turn
+    turn = _AT_INFINITY if t >= _B4 else turn
     behind = _PI - (turn - _PI_LEFT)
     turn = behind if math.copysign(_ONE, x) < _ZERO else turn
     turn = _HALF_PI if (x == _ZERO) & (y != _ZERO) else turn
