@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import Executor
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager
 
 import httpx2
 import structlog
@@ -81,24 +81,18 @@ def create_app(
 
 async def keep_overview(parts: Services) -> None:
     """Make the overview of each new version, until it is cancelled; no tile is begun once the server stops."""
-    known = None
+    known, stop = None, parts.stopping.is_set
     while True:
-        with suppress(Unavailable):
+        try:
             newest = await parts.newest.put(None)
             if newest != known:
                 known = newest
-                await _make(parts, newest)
+                await to_thread.run_sync(parts.clouds.overview, newest, stop, limiter=parts.fetching)
+        except Unavailable:
+            pass
+        except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error
+            structlog.get_logger("mapvote").warning("overview", version=known, error=str(error)[:200])
         await asyncio.sleep(_EVERY_S)
-
-
-async def _make(parts: Services, version: int) -> None:
-    try:
-        make, stop = parts.clouds.overview, parts.stopping.is_set
-        await to_thread.run_sync(make, version, stop, limiter=parts.fetching)
-    except Unavailable:
-        raise
-    except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error
-        structlog.get_logger("mapvote").warning("overview", version=version, error=str(error)[:200])
 
 
 URL = "http://localhost"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import structlog
 from fastapi import APIRouter, Query, Request, Response
@@ -97,27 +97,32 @@ async def cancel_publishing(by: Operator, parts: Parts) -> Response:
 
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
-    with (
-        parts.metrics.publish_seconds.time(),
-        _unless_stopping(parts),
-        _logged_if_held(parts, by),
-        parts.publishing.watched(parts.fusing, by, ask.dry_run) as executor,
-    ):
+    with parts.metrics.publish_seconds.time(), _round(parts, by, ask.dry_run) as executor:
         if ask.dry_run:
             done = preview(parts.store, parent=ask.parent, gate=parts.gate, executor=executor)
         else:
-            done = publish(
-                parts.store,
-                by=by,
-                reason=ask.reason,
-                parent=ask.parent,
-                override=ask.override,
-                gate=parts.gate,
-                executor=executor,
-            )
+            said: dict[str, Any] = {"reason": ask.reason, "parent": ask.parent, "override": ask.override}
+            done = publish(parts.store, by=by, **said, gate=parts.gate, executor=executor)
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
     return _as_answer(done)
+
+
+@contextmanager
+def _round(parts: Services, by: str, dry_run: bool) -> Iterator[Executor]:
+    """An executor for a round, which can be seen and cancelled. A publish that the policy holds is an event for
+    listeners. A stopping server ends the threads that fuse: what they had not begun is cancelled, more is refused."""
+    try:
+        with parts.publishing.watched(parts.fusing, by, dry_run) as executor:
+            yield executor
+    except Held as error:
+        with parts.store.database.writing() as connection:
+            log_event(connection, parts.store.clock(), "held back", by, "; ".join(error.reasons))
+        raise
+    except (CancelledError, RuntimeError) as error:
+        if not parts.stopping.is_set():
+            raise
+        raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
 
 
 def _as_answer(done: Outcome) -> Published:
@@ -218,28 +223,6 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
     return as_json({"vehicles": [replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]})
 
 
-@contextmanager
-def _logged_if_held(parts: Services, by: str) -> Iterator[None]:
-    """A publish that the policy holds is an event for listeners."""
-    try:
-        yield
-    except Held as error:
-        with parts.store.database.writing() as connection:
-            log_event(connection, parts.store.clock(), "held back", by, "; ".join(error.reasons))
-        raise
-
-
-@contextmanager
-def _unless_stopping(parts: Services) -> Iterator[None]:
-    """A stopping server ends the threads that fuse: what they had not begun is cancelled, more is refused."""
-    try:
-        yield
-    except (CancelledError, RuntimeError) as error:
-        if not parts.stopping.is_set():
-            raise
-        raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
-
-
 @router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
 def policy(parts: Parts) -> Response:
     """The policy in force, who set it and why."""
@@ -299,7 +282,7 @@ async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Publishe
 
 
 def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
-    with _unless_stopping(parts), parts.publishing.watched(parts.fusing, by, ask.dry_run) as executor:
+    with _round(parts, by, ask.dry_run) as executor:
         return _as_answer(replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor))
 
 

@@ -137,17 +137,21 @@ class Hosts:
                 origin = value.decode("latin-1")
         if not host or not self._ours(host):
             raise Forbidden(f"{(host or '')[:80]!r} is not a name of this server: {_MEND}")
-        if origin is not None and not self._comes_from_us(origin, host):
+        theirs = "" if origin is None else origin.partition("://")[2].lower()
+        # Of IP addresses only the one that was addressed: another machine's page has an address too.
+        foreign = theirs != host.lower() and _name_in(theirs) not in self._allowed - {"localhost"}
+        if origin is not None and foreign:
             raise Forbidden(f"pages of {origin[:80]!r} may not use this server: {_MEND}")
 
     def _is_ours(self, host: str) -> bool:
         name = _name_in(host)
-        return name in self._allowed or _is_address(name)
-
-    def _comes_from_us(self, origin: str, host: str) -> bool:
-        """Of IP addresses only the one that was addressed: another machine's page has an address too."""
-        theirs = origin.partition("://")[2].lower()
-        return theirs == host.lower() or _name_in(theirs) in self._allowed - {"localhost"}
+        if name in self._allowed:
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
 
 
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?")
@@ -160,23 +164,10 @@ def _name_in(host: str) -> str:
     return (found[1] or found[2]) if found else ""
 
 
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
 PROBES = ("/livez", "/readyz")
 """Who asks without a key, by any name of the server, gets a status without content."""
 _PROBE_S = 1.0
 log = structlog.get_logger("mapvote")
-
-
-def is_ballot(scope: Scope) -> bool:
-    """Whether the request sends a ballot."""
-    return bool(scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/"))
 
 
 class Watch:
@@ -208,7 +199,8 @@ class Watch:
             sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
             authorization = None if sent is None else sent.decode("latin-1")
             peer = (scope["client"] or ("",))[0]
-            whose = await self._guard.who(authorization, peer, ballot=is_ballot(scope))
+            ballot = scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/")
+            whose = await self._guard.who(authorization, peer, ballot=ballot)
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
             await self._app(scope, receive, watched)

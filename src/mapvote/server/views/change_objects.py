@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -139,7 +139,6 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     np.minimum.at(bottom, cell[relevant], z[relevant])
     ground = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z).reshape(-1).astype(np.float64)
     ground = np.where(np.isnan(ground), bottom, ground)
-    votes, against, first, last, version, odds = _evidence(flat, states, decided)
     return ChangedCells(
         rows=index[0] * TILE_CELLS + flat // TILE_CELLS,
         cols=index[1] * TILE_CELLS + flat % TILE_CELLS,
@@ -147,12 +146,7 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
         top_m=top[flat] - ground[flat],
         bottom_m=bottom[flat] - ground[flat],
         points=np.maximum(n_came, n_went)[flat],
-        votes=votes,
-        against=against,
-        first_ns=first,
-        last_ns=last,
-        versions=version,
-        odds=odds,
+        **_evidence(flat, states, decided),
     )
 
 
@@ -232,25 +226,23 @@ def _object(
     )
 
 
-def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I32, I64, I64, I64, I8]:
-    """(votes, against, first_ns, last_ns, version, odds) of the changed cells, as the last decision for it counted
-    them."""
-    votes = np.zeros(len(flat), dtype=np.int32)
-    against = np.zeros(len(flat), dtype=np.int32)
-    version, odds = np.zeros(len(flat), dtype=np.int64), np.full(len(flat), UNSAID, dtype=np.int8)
-    first = np.full(len(flat), _NEVER)
-    last = np.full(len(flat), _UNTIL)
+def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, Any]:
+    """Votes, times, version and confidence of the changed cells, as the last decision for them counted them."""
+    n = len(flat)
+    votes, against, versions = (np.zeros(n, dtype=np.int64) for _ in range(3))
+    odds, first, last = np.full(n, UNSAID, dtype=np.int8), np.full(n, _NEVER), np.full(n, _UNTIL)
     for decision, drives in decided:
         agrees = decision.states.reshape(-1)[flat] == states
         tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
-        counted = tally[np.arange(len(flat)), states]
+        counted = tally[np.arange(n), states]
         others = tally[:, : CellState.UNDETERMINED].sum(axis=1) - counted
         votes = np.where(agrees, counted // VOTE_UNIT, votes)
         against = np.where(agrees, others // VOTE_UNIT, against)
-        version = np.where(agrees, decision.version, version)
+        versions = np.where(agrees, decision.version, versions)
         odds = np.where(agrees, decision.odds.at(flat), odds)
         for end_ns, drive in drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)
-    return votes.astype(np.int32), against.astype(np.int32), first, last, version, odds
+    counts = {"votes": votes.astype(np.int32), "against": against.astype(np.int32), "versions": versions}
+    return counts | {"first_ns": first, "last_ns": last, "odds": odds}

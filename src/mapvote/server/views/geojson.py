@@ -81,13 +81,12 @@ def _cell(value: Any) -> Any:
 
 def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
     """Ids of other large things whose box is within 15 m, nearest first."""
-    near = [(_distance_m(change, o), o.id) for o in objects if o is not change and o.size == "large"]
+    near, a = [], change.box
+    for other in objects:
+        if other is not change and other.size == "large":
+            gaps = [max(a[i] - other.box[i + 2], other.box[i] - a[i + 2], 0.0) for i in (0, 1)]
+            near.append((CELL_SIZE * math.hypot(*gaps), other.id))
     return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
-
-
-def _distance_m(a: ChangeObject, b: ChangeObject) -> float:
-    gaps = [max(a.box[i] - b.box[i + 2], b.box[i] - a.box[i + 2], 0.0) for i in (0, 1)]
-    return CELL_SIZE * math.hypot(*gaps)
 
 
 def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
@@ -143,17 +142,16 @@ MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
     """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
-    return collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
+    side, squares = TILE_CELLS * CELL_SIZE, []
+    for tile in tiles:
+        window = lattice.tile((tile["row"], tile["col"]))
+        x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))
+        ring = [[x, y], [x1, y], [x1, y1], [x, y1], [x, y]]
+        squares.append(({"type": "Polygon", "coordinates": [ring]}, dict(tile)))
+    return collection(squares)
 
 
 def collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
     """Things in map metres, each (geometry, properties), as GeoJSON."""
     features = [{"type": "Feature", "geometry": geometry, "properties": properties} for geometry, properties in things]
     return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
-
-
-def _square(lattice: Lattice, row: int, col: int) -> dict[str, Any]:
-    window = lattice.tile((row, col))
-    side = TILE_CELLS * CELL_SIZE
-    x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))
-    return {"type": "Polygon", "coordinates": [[[x, y], [x1, y], [x1, y1], [x, y1], [x, y]]]}
