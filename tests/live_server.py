@@ -28,12 +28,12 @@ def mapvote(*arguments: object) -> list[str]:
 
 
 @contextmanager
-def serving(*arguments: object, log: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def serving(*arguments: object, log: Path, settings: str = "") -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """(address, process) of `mapvote serve ARGUMENTS --port 0 --open`, which needs keys if any is issued; stopped at
-    the end."""
+    the end, when no traceback may be in the log. ``settings``: of a file, in TOML."""
     with log.open("a") as errors:
         environment = os.environ | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        command = mapvote("serve", *arguments, "--port", 0, "--open")
+        command = mapvote("serve", *arguments, *_config(log, settings), "--port", 0, "--open")
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
         assert process.stdout is not None
         try:
@@ -45,13 +45,20 @@ def serving(*arguments: object, log: Path) -> Iterator[tuple[str, subprocess.Pop
             process.terminate()
             process.wait(30)
             process.stdout.close()
+    assert "Traceback" not in log.read_text(), log.read_text()[-3000:]
+
+
+def _config(log: Path, settings: str) -> list[object]:
+    file = log.with_suffix(".toml")
+    file.write_text(settings)
+    return ["--config", file] if settings else []
 
 
 @contextmanager
-def serving_here(store: Path, *, log: Path, config: Path | None = None) -> Iterator[str]:
+def serving_here(store: Path, *, log: Path, settings: str = "") -> Iterator[str]:
     """Address of a server in a thread, open until a key is issued: for tests that neither stop nor measure it. It
-    costs no seconds of imports. ``log``: what it would say on stderr."""
-    settings, _ = load_with_sources(config)
+    costs no seconds of imports. ``log``: what it would say on stderr; ``settings`` as in :func:`serving`."""
+    read, _ = load_with_sources(Path(str(_config(log, settings)[1])) if settings else None)
     opened, switch_s = Store.open(f"sqlite:///{store}"), sys.getswitchinterval()
     servers: queue.Queue[serve._Server] = queue.Queue()
     addresses: queue.Queue[str] = queue.Queue()
@@ -62,7 +69,7 @@ def serving_here(store: Path, *, log: Path, config: Path | None = None) -> Itera
             servers.put(self)
 
     def run() -> None:
-        serve.serve(opened, settings, port=0, opened=True, ready=addresses.put)
+        serve.serve(opened, read, port=0, opened=True, ready=addresses.put)
 
     thread = threading.Thread(target=run)
     with log.open("a") as written, mock.patch.object(serve, "_Server", Kept):
@@ -83,3 +90,4 @@ def serving_here(store: Path, *, log: Path, config: Path | None = None) -> Itera
             sys.setswitchinterval(switch_s)
             gc.unfreeze()
             opened.close()
+    assert "Traceback" not in log.read_text(), log.read_text()[-3000:]

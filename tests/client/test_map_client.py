@@ -22,7 +22,7 @@ from mapvote.server.http.app import create_app
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from stores import send
+from stores import WALL, NewStore, vote_gone
 
 BALLOT = make_ballot(two_walls(), {(0, 0): Say(states_plane({(10, 10): CellState.UNCHANGED_OCCUPIED}))}, "a", "d1")
 Answer = tuple[int, dict[str, str]]
@@ -126,12 +126,10 @@ Served = tuple[Store, Counted, Callable[..., MapClient]]
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
+def served(new_store: NewStore, tmp_path: Path) -> Iterator[Served]:
     """A long street of ten tiles."""
-    cells = [(10, 10), (10, 11), (10, 12)]
-    tiles = {(0, c): make_tile(wall(cells, [0.05, 0.45 + 0.01 * c]), 0.001 * c, (0, c)) for c in range(10)}
-    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0))
-    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", make_map(tiles), policy)
+    tiles = {(0, c): make_tile(wall(WALL, [0.05, 0.45 + 0.01 * c]), 0.001 * c, (0, c)) for c in range(10)}
+    store = new_store(make_map(tiles), Policy(fuse=FuseSettings(max_deleted_share=1.0)))
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as app:
         counted = Counted(app)
 
@@ -141,14 +139,10 @@ def served(tmp_path: Path) -> Iterator[Served]:
             return made
 
         yield store, counted, client
-    store.close()
 
 
 def take_down_a_wall(store: Store, tile: tuple[int, int] = (0, 3)) -> None:
-    base = store.point_map()
-    for vehicle in ("a", "b"):
-        say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))
-        send(store, make_ballot(base, {tile: say}, vehicle))
+    vote_gone(store, tiles=[tile])
     assert publish(store).published
 
 
@@ -185,11 +179,11 @@ def test_a_server_that_was_restored_to_another_past_is_asked_for_everything(serv
 
 
 def test_a_server_set_up_anew_with_another_map_of_the_same_version_is_not_taken_for_the_old_one(
-    served: Served, tmp_path: Path
+    served: Served, new_store: NewStore
 ) -> None:
     _, _, client = served
     client().fetch()
-    other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", make_map({(0, 0): make_tile(wall([(7, 7)], [0.9]))}))
+    other = new_store(make_map({(0, 0): make_tile(wall([(7, 7)], [0.9]))}), name="other.db")
     with TestClient(create_app(other, opened=True), base_url="http://localhost") as app:
         made = client()
         made._server._http = app
@@ -197,7 +191,6 @@ def test_a_server_set_up_anew_with_another_map_of_the_same_version_is_not_taken_
     assert fetched.version == 1
     assert list(fetched.tiles) == [(0, 0)]
     assert fetched.tiles[0, 0].points.tobytes() == other.point_map().tiles[0, 0].points.tobytes()
-    other.close()
 
 
 def test_a_region_is_fetched_without_the_rest(served: Served) -> None:

@@ -100,9 +100,8 @@ def receiver() -> Iterator[tuple[str, Posts]]:
 def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
     store: Store, tmp_path: Path, receiver: tuple[str, Posts]
 ) -> None:
-    config = tmp_path / "mapvote.toml"
-    config.write_text(f'[server]\nwebhook_url = "{receiver[0]}"\nwebhook_secret = "{SECRET}"\n')
-    with serving(tmp_path / "s.db", "--open", "--config", config, log=tmp_path / "log") as (url, _):
+    settings = f'[server]\nwebhook_url = "{receiver[0]}"\nwebhook_secret = "{SECRET}"\n'
+    with serving(tmp_path / "s.db", settings=settings, log=tmp_path / "log") as (url, _):
         vote(url, tmp_path / "home")
         headers, body = receiver[1].get(timeout=30)
     told = Webhook(SECRET).verify(body, headers)

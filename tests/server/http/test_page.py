@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -85,6 +86,14 @@ def enter(browser: Chromium, chosen: str) -> None:
     press(browser, "Enter")
 
 
+@contextmanager
+def page_of(browser: Chromium, store: Path | str, home: Path) -> Iterator[str]:
+    """The address of the page, once it shows all of a store."""
+    with serving(store, log=home / "log") as (url, _):
+        ready(browser, url)
+        yield url
+
+
 def ready(browser: Chromium, url: str) -> None:
     browser.open(url)
     browser.wait("performance.getEntriesByName('all-in-view').length", 60)
@@ -93,8 +102,7 @@ def ready(browser: Chromium, url: str) -> None:
 
 @pytest.mark.slow
 def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _):
-        ready(browser, url)
+    with page_of(browser, store, tmp_path) as url:
         assert "0 built" in browser.text("#tally")
         assert browser.text("#labels").startswith("× demolished 4 m")
         colours = """(() => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
@@ -153,8 +161,7 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
     browser: Chromium, database_url: str, tmp_path: Path
 ) -> None:
     village(database_url)
-    with serving(database_url, "--open", log=tmp_path / "log") as (url, _):
-        ready(browser, url)
+    with page_of(browser, database_url, tmp_path):
         enter(browser, "document.querySelector('#pending button')")
         assert browser.text("#labels").startswith("pending: ×")
         marked = f"{PIXELS}('#2f62c4')"
@@ -186,8 +193,7 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
 
 @pytest.mark.slow
 def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _):
-        ready(browser, url)
+    with page_of(browser, store, tmp_path):
         enter(browser, "document.querySelector('#pending button')")
         change = browser.run("document.querySelector('#pending button').dataset.change")
         asked = {"change": change, "verdict": "accepted", "comment": "I was there"}
@@ -202,8 +208,7 @@ def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, sto
 
 @pytest.mark.slow
 def test_what_lies_in_the_middle_is_chosen_by_keyboard(browser: Chromium, store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _):
-        ready(browser, url)
+    with page_of(browser, store, tmp_path):
         for key, canvas in (("3", "#cloud"), ("2", "#map")):
             press(browser, key)
             enter(browser, f"document.querySelector('{canvas}')")
@@ -213,8 +218,7 @@ def test_what_lies_in_the_middle_is_chosen_by_keyboard(browser: Chromium, store:
 
 @pytest.mark.slow
 def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _):
-        ready(browser, url)
+    with page_of(browser, store, tmp_path):
         enter(browser, "document.querySelector('#changes button')")
         browser.wait("location.hash.includes('change=')")
         asked = "a[href], button, select, input, textarea, summary"
@@ -238,8 +242,7 @@ def test_axe_finds_nothing_and_nothing_is_cut_off(
     size = {"width": width // zoom, "height": height // zoom, "deviceScaleFactor": zoom, "mobile": False}
     browser.call("Emulation.setDeviceMetricsOverride", **size)
     try:
-        with serving(store, "--open", log=tmp_path / "log") as (url, _):
-            ready(browser, url)
+        with page_of(browser, store, tmp_path):
             browser.run("document.querySelector('#changes button').click()")
             browser.call("Runtime.evaluate", expression=AXE.read_text())
             told = "axe.run().then(r => r.violations.map(v => `${v.id}: ${v.nodes.map(n => n.html)}`))"

@@ -23,8 +23,8 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     store = Store.create(f"sqlite:///{home / 's.db'}", two_walls())
     says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
     send(store, *[make_ballot(two_walls(), says, vehicle, "d1") for vehicle in ("a", "b")])
-    (home / "server.toml").write_text('[server]\nhosts = ["maps.example.org"]\n')
-    with serving_here(home / "s.db", config=home / "server.toml", log=home / "log") as address:
+    settings = '[server]\nhosts = ["maps.example.org"]\n'
+    with serving_here(home / "s.db", settings=settings, log=home / "log") as address:
         yield address
     assert store.current() == 1
     store.close()

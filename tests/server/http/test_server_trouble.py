@@ -11,6 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx2
@@ -29,6 +30,12 @@ from postgres_cluster import PostgresCluster
 from stores import send
 
 CELL = (10, 10)
+
+
+@contextmanager
+def served(store: Path | str, home: Path) -> Iterator[tuple[httpx2.Client, subprocess.Popen[str]]]:
+    with serving(store, log=home / "log") as (url, process), httpx2.Client(base_url=url, timeout=60.0) as http:
+        yield http, process
 
 
 def put(http: httpx2.Client, vehicle: str, drive: str) -> httpx2.Response:
@@ -79,10 +86,7 @@ def test_no_room_for_the_file_to_grow(tmp_path: Path) -> None:
     """As on a full disk, without being root: the process may not make its files longer than 3 MB for a while."""
     url = f"sqlite:///{tmp_path / 'store.db'}"
     Store.create(url, two_walls()).close()
-    with (
-        serving(tmp_path / "store.db", log=tmp_path / "log") as (address, process),
-        httpx2.Client(base_url=address, timeout=60.0) as http,
-    ):
+    with served(tmp_path / "store.db", tmp_path) as (http, process):
         before = resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (3 << 20, resource.RLIM_INFINITY))
         acknowledged = send_until_refused(http)
         assert acknowledged
@@ -125,10 +129,7 @@ def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path
     """As Linux does after a write error: the file system is read-only from one moment to the next, with files open."""
     url = f"sqlite:///{ext4 / 'store.db'}"
     Store.create(url, two_walls()).close()
-    with (
-        serving(ext4 / "store.db", log=tmp_path / "log") as (address, _),
-        httpx2.Client(base_url=address, timeout=60.0) as http,
-    ):
+    with served(ext4 / "store.db", tmp_path) as (http, _):
         for vehicle, drive in (("v0", "d0"), ("v1", "d1")):
             assert put(http, vehicle, drive).status_code == 201
         subprocess.run(["mount", "-o", "remount,abort", str(ext4)], check=True, capture_output=True)
@@ -137,12 +138,8 @@ def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path
         assert_refused(http.request("POST", "/v1/publish", json={"override": True}))
     subprocess.run(["umount", str(ext4)], check=True)
     subprocess.run(["mount", "-o", "loop", str(tmp_path / "image"), str(ext4)], check=True)
-    with (
-        serving(ext4 / "store.db", log=tmp_path / "log") as (address, _),
-        httpx2.Client(base_url=address, timeout=60.0) as http,
-    ):
+    with served(ext4 / "store.db", tmp_path) as (http, _):
         assert_well_again(http, url, {"d0", "d1"})
-    assert "Traceback" not in (tmp_path / "log").read_text()
 
 
 @pytest.mark.slow
@@ -150,7 +147,7 @@ def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
     postgres_cluster: PostgresCluster, postgres_url: str, tmp_path: Path
 ) -> None:
     Store.create(postgres_url, two_walls()).close()
-    with serving(postgres_url, log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url, timeout=60.0) as http:
+    with served(postgres_url, tmp_path) as (http, _):
         assert put(http, "v1", "before").status_code == 201
         postgres_cluster.stop()
         try:
@@ -168,7 +165,6 @@ def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
         for path in ("/healthz", "/readyz"):
             assert http.get(path).status_code == 200
     assert standing(postgres_url) == {"before", "after"}
-    assert "Traceback" not in (tmp_path / "log").read_text()
 
 
 TILES = [(row, col) for row in range(20) for col in range(20)]
@@ -214,8 +210,8 @@ def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: fl
             connected.set()
             published.append(http.request("POST", "/v1/publish", json={"override": True}).status_code)
 
-    (tmp_path / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
-    with serving(tmp_path / "s.db", "--config", tmp_path / "server.toml", log=tmp_path / "log") as (url, process):
+    settings = "[server]\ndrives_a_day = 1000000\n"
+    with serving(tmp_path / "s.db", settings=settings, log=tmp_path / "log") as (url, process):
         senders = [
             threading.Thread(target=send_until_stopped, args=(url, f"v{i}", point_map, acknowledged)) for i in range(4)
         ]
@@ -236,4 +232,3 @@ def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: fl
     assert len(store.point_map().tiles) == len(TILES)
     store.close()
     assert acknowledged <= standing(f"sqlite:///{tmp_path / 's.db'}")
-    assert "Traceback" not in (tmp_path / "log").read_text()
