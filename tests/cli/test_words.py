@@ -139,21 +139,15 @@ def examples() -> list[str]:
     return [line.strip() for text in helps for line in text.splitlines() if re.match(r"\s*mapvote ", line)]
 
 
-def run_here(slow: bool) -> list[str]:
-    """Examples to run, but for those that a page has word for word."""
-    on_a_page = {line for _, lines in SHELL for line in lines}
-    lines = [line for line in examples() if not_run(line) is None and line not in on_a_page]
-    return [line for line in lines if bool(re.search(SLOW, line)) == slow]
-
-
-@pytest.mark.parametrize("line", run_here(slow=False))
-def test_the_example_of_a_help_works(line: str, made: Path, desk: Desk) -> None:
-    run_all([line], made, desk)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("line", run_here(slow=True))
-def test_the_long_example_of_a_help_works(line: str, made: Path, desk: Desk) -> None:
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, marks=[pytest.mark.slow] if is_slow([line]) else [])
+        for line in examples()
+        if not_run(line) is None and not any(line in lines for _, lines in SHELL)
+    ],
+)
+def test_the_example_of_a_help_works_if_no_page_has_it_word_for_word(line: str, made: Path, desk: Desk) -> None:
     run_all([line], made, desk)
 
 
