@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from mapvote.client import MapClient
     from mapvote.core.grid import Lattice, TileIndex
     from mapvote.core.point_map import PointMap
-    from mapvote.core.types import U8
     from mapvote.doctor import Finding
     from mapvote.formats.maps.autoware import Change
     from mapvote.fusion.fuse import Decision
@@ -67,16 +66,13 @@ def info(
             _print_standings(found["vehicles"])
             return
         found["published"] = when(found.pop("published_ns"))
-        title, rows = "store", [(key.replace("_", " "), _readable(value)) for key, value in found.items()]
+        shown = [(key, f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
+        title, rows = "store", [(key.replace("_", " "), value) for key, value in shown]
     else:
         with waiting(f"reading {path}"):
             title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic)
     Console(highlight=False).print(Text(f"{path}: {title}", style="bold"), soft_wrap=True)
     print_table(("", ""), [(Text(name, "cyan"), value) for name, value in rows])
-
-
-def _readable(value: int | str) -> str:
-    return f"{value:,}" if isinstance(value, int) else value
 
 
 def _print_standings(found: list[dict[str, Any]]) -> None:
@@ -349,9 +345,13 @@ def update(
 
         mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated
     """
+    import numpy as np
+
     from mapvote.codec.ballot import decode
     from mapvote.config import load_with_sources
+    from mapvote.core.grid import CELL_SIZE
     from mapvote.formats import write_map
+    from mapvote.formats.atomic import whole_file
     from mapvote.fusion.fuse import states_over, update_map
 
     if out is None and not dry_run:
@@ -381,29 +381,14 @@ def update(
         after, decisions = update_map(before, ballots, settings)
     if cells is not None:
         states, grid = states_over(before.lattice, decisions)
-        _write_cells(cells, states, grid.x0, grid.y0)
+        with whole_file(cells) as part, part.open("wb") as file:
+            np.savez_compressed(file, states=states, x0=grid.x0, y0=grid.y0, cell_size=CELL_SIZE)
     if out is not None and not dry_run:
         with waiting(f"writing {out}"):
             write_map(after, out)
     _report(decisions, len({ballot.vehicle for ballot in ballots}), settings.min_votes)
     _report_pending(decisions, before.lattice, settings.false_deletions)
     print(f"updated map: {out}" if out is not None and not dry_run else "dry run: no map written")
-
-
-def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
-    """Decided states over the window of all ballots, written whole or not at all."""
-    import numpy as np
-
-    from mapvote.core.grid import CELL_SIZE
-    from mapvote.formats.atomic import whole_file
-
-    with whole_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, states=states, x0=x0, y0=y0, cell_size=CELL_SIZE)
-
-
-def _copies(decisions: dict[TileIndex, Decision]) -> Counter[tuple[str, str]]:
-    """On how many tiles a vehicle's drive is a copy of another's, by the two."""
-    return Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
 
 
 def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int) -> None:
@@ -420,7 +405,8 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
         print_table(("tile", *headings), rows)
     added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
-    for (vehicle, heard), tiles in sorted(_copies(decisions).items()):
+    copies = Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
+    for (vehicle, heard), tiles in sorted(copies.items()):
         where = f"{tiles} tile{'s' if tiles > 1 else ''}"
         print(f"{vehicle} sent a copy of {heard}'s ballot, on {where}: the two count as one vehicle there")
     if vehicles < min_votes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,13 +45,18 @@ def serve(
     from mapvote.server.store.policy import Policy
 
     if upgrade:
-        _upgrade(store_url(store))
+        from mapvote.server.store.migrate import upgrade as upgrade_schema
+        from mapvote.server.store.store import existing
+
+        with closing(existing(store_url(store))) as database:
+            before, after = upgrade_schema(database)
+        print(f"schema {after}: nothing to do" if before == after else f"schema {before} is now {after}")
         return
     settings, sources = load_with_sources(config)
     first = Policy.of(settings) if config is not None or _of_policy(sources) else None
     with waiting(f"opening {store}"):
         opened, new = open_or_create(store_url(store), map_path, first, read=sound_map)
-    try:
+    with closing(opened):
         if not new:
             _refuse_policy(sources)
         log_as_json()
@@ -59,20 +64,6 @@ def serve(
             key = issue(opened, "operator", "operator", by=who())
             print(f"key of the operator, shown this once: {key}", flush=True)
         run(opened, settings, host=host, port=port, opened=open_, ready=lambda url: print(f"serving {url}", flush=True))
-    finally:
-        opened.close()
-
-
-def _upgrade(url: str) -> None:
-    from mapvote.server.store.migrate import upgrade as upgrade_schema
-    from mapvote.server.store.store import existing
-
-    database = existing(url)
-    try:
-        before, after = upgrade_schema(database)
-    finally:
-        database.close()
-    print(f"schema {after}: nothing to do" if before == after else f"schema {before} is now {after}")
 
 
 def _of_policy(sources: Mapping[str, str]) -> list[str]:

@@ -35,6 +35,7 @@ from mapvote.server.http.services import Parts, own, services
 from mapvote.server.store.admission import Receipt, examine
 from mapvote.server.store.votes import withdraw
 from mapvote.server.views.geojson import utc
+from mapvote.server.views.history import origin_of
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()
@@ -54,13 +55,11 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
 @router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
 def versions(parts: Parts, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by."""
-    listed = []
-    for v in parts.store.versions():
-        entry = {name: getattr(v, name) for name in ("number", "parent", "kind", "target", "published_by", "reason")}
-        listed.append(entry | {"created": utc(v.created_ns), "policy": v.policy})
+    found = parts.store.versions()
+    listed = [origin_of(v) | {"created": utc(v.created_ns)} for v in found]
     if format == "csv":
-        return as_table([{name: value for name, value in entry.items() if name != "policy"} for entry in listed])
-    return as_json({"versions": listed})
+        return as_table(listed)
+    return as_json({"versions": [one | {"policy": v.policy} for one, v in zip(listed, found, strict=True)]})
 
 
 @router.get(

@@ -6,7 +6,6 @@ import base64
 import html
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
@@ -34,20 +33,10 @@ Box = tuple[float, float, float, float]
 """x0, y0, x1, y1, map metres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cutout:
-    """The points around a change, those deleted and those added."""
-
-    name: str
-    facts: str
-    x: float
-    """Lower-left corner, map metres."""
-    y: float
-    box: Box
-    """Bounds of the change itself."""
-    height_m: float
-    clouds: Mapping[str, bytes]
-    """kept, removed and added, each as :func:`mapvote.server.views.point_lod.cloud_bytes`."""
+Cutout = dict[str, Any]
+"""The points around a change, for the page: "name", "facts"; "x" and "y" of the lower-left corner and the "box" of the
+change itself in map metres, its "height"; and the clouds "kept", "removed" and "added", each as
+:func:`mapvote.server.views.point_lod.cloud_bytes` in base64."""
 
 
 def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
@@ -73,7 +62,8 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
         ):
             found[kind].append(_inside(points, window, far))
     clouds = {kind: cloud_bytes(*pack(_thinned(np.concatenate(some)), ground)) for kind, some in found.items()}
-    return Cutout(name, facts, window.x0, window.y0, box, height_m, clouds)
+    told = {"name": name, "facts": facts, "x": window.x0, "y": window.y0, "box": box, "height": height_m}
+    return told | {kind: base64.b64encode(cloud).decode() for kind, cloud in clouds.items()}
 
 
 def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
@@ -99,18 +89,13 @@ def fragment(cutouts: Sequence[Cutout]) -> str:
     """HTML to insert into a page: a 3D view of the changes, one at a time. It makes no request."""
     viewer = resources.files("mapvote.server.http") / "viewer"
     modules = {name: (viewer / name).read_text() for name in _MODULES}
-    data = [
-        {"name": c.name, "facts": c.facts, "x": c.x, "y": c.y, "box": c.box, "height": c.height_m}
-        | {kind: base64.b64encode(cloud).decode() for kind, cloud in c.clouds.items()}
-        for c in cutouts
-    ]
     return (
         f"<style>{(viewer / 'standalone.css').read_text()}</style>"
         '<div class="cutouts"><div class="stage">'
         '<canvas tabindex="0" aria-label="The cloud. Drag to turn it, arrow keys move."></canvas></div>'
         '<p class="row" role="group" aria-label="Which change"></p>'
         '<p class="row" role="group" aria-label="Before or after"></p><p class="told"></p></div>'
-        f'<script type="application/json" id="cutouts">{_safe(data)}</script>'
+        f'<script type="application/json" id="cutouts">{_safe(cutouts)}</script>'
         f'<script type="application/json" id="modules">{_safe(modules)}</script>'
         f'<script type="module">{(viewer / "bundle.js").read_text()}</script>'
     )

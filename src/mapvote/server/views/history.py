@@ -27,6 +27,7 @@ from mapvote.server.store.decisions import Standing, cells_in, records_of
 from mapvote.server.store.integrity import set_aside
 from mapvote.server.store.keys import hash_of
 from mapvote.server.store.queries import (
+    Version,
     current_number,
     load_blob,
     load_tile,
@@ -89,10 +90,15 @@ def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
     return ", ".join(names) or "none"
 
 
+def origin_of(version: Version) -> dict[str, Any]:
+    """Where a version comes from."""
+    columns = ("number", "parent", "kind", "target", "published_by", "reason")
+    return {name: getattr(version, name) for name in columns}
+
+
 def log_of(store: Store, last: int) -> dict[str, Any]:
     """The versions, oldest first, and the ``last`` so many events, newest first."""
-    columns = ("number", "parent", "kind", "target", "created_ns", "published_by", "reason")
-    versions = [{name: getattr(version, name) for name in columns} for version in store.versions()]
+    versions = [origin_of(version) | {"created_ns": version.created_ns} for version in store.versions()]
     return {"versions": versions, "events": last_events(store, last) if last else []}
 
 
