@@ -381,8 +381,8 @@ def update(
         after, decisions = update_map(before, ballots, settings)
     if cells is not None:
         states, grid = states_over(before.lattice, decisions)
-        with whole_file(cells) as part, part.open("wb") as file:
-            np.savez_compressed(file, states=states, x0=grid.x0, y0=grid.y0, cell_size=CELL_SIZE)
+        with whole_file(cells) as part, part.open("wb") as npz:
+            np.savez_compressed(npz, states=states, x0=grid.x0, y0=grid.y0, cell_size=CELL_SIZE)
     if out is not None and not dry_run:
         with waiting(f"writing {out}"):
             write_map(after, out)
