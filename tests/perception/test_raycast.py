@@ -158,6 +158,9 @@ def test_points_of_a_cell_are_counted_and_marked_at_their_heights() -> None:
     assert view.counts[rows[0], cols[0]] == 4
     assert int(view.hit[rows[0], cols[0]]) == 0b1010 | 1 << 63, "and whatever is higher than a word in its last bit"
     assert view.counts.sum() == 4
+    corner = np.array([[reference.grid.x0 + 0.1, reference.grid.y0 + 0.1, 0.7]])
+    at_corner = cast_rays(corner, np.array([0.0, 0.0, 1.8]), np.ones(1, bool), np.zeros(1, bool), reference)
+    assert (at_corner.counts[0, 0], at_corner.hit[0, 0]) == (1, 0b100), "the window's first cell, too"
 
 
 def test_what_lies_in_the_sensors_own_cell_proves_nothing() -> None:
@@ -250,6 +253,16 @@ def test_a_beam_lost_here_and_there_is_not_the_sky_and_where_hardly_anything_ans
     sky = azimuths_of(sky_of((elevation < 0.0) & ~packets))
     assert not ((sky > 42.0) & (sky < 78.0)).any()
     assert len(sky_of(elevation < -25.0).reach) == 0, "the vehicle's own roof"
+
+
+def test_a_quarter_of_the_rays_of_every_sector_that_answered_is_enough() -> None:
+    sensor = replace(SENSOR, azimuth_step_deg=360.0 / FANS)
+    a = np.pi / FANS  # between the edges of sectors
+    turned = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    lowest = np.sort(BEAMS)
+    some = [len(sky_of(directions(sensor)[2] <= lowest[k - 1], sensor, R=turned).reach) for k in (7, 8)]
+    assert len(BEAMS) == 32
+    assert some[0] == 0 < some[1]
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
