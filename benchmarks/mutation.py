@@ -34,7 +34,7 @@ DECIDING = [
 TESTS = {
     "core/voting": "core/test_voting.py fusion/test_fuse.py",
     "core/ground": "core/test_ground.py",
-    "fusion/fuse": "fusion/test_fuse.py fusion/test_spent.py fusion/test_distrust.py fusion/test_rules_of_fusion.py",
+    "fusion/fuse": "fusion/test_fuse.py fusion/test_distrust.py fusion/test_rules_of_fusion.py",
     "fusion/tile_vote": "fusion/test_tile_vote.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/edit": "fusion/test_edit.py fusion/test_fuse.py fusion/test_rules_of_fusion.py",
     "fusion/change_time": "fusion/test_change_time.py fusion/test_rules_of_fusion.py",
