@@ -5,6 +5,7 @@ The street: a road, two rows of walls with gaps; the car turns gently, so that a
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -92,14 +93,30 @@ def test_what_is_wrong_with_a_drive_is_named_one_fault_and_two(tmp_path: Path, s
     assert verdict(rights, found) == LESS.get(kind, "right"), found
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind in kinds_of("maps") if " + " in kind or "shifted" in kind])
-def test_what_is_wrong_with_a_map_shows_by_a_drive(sound: Recording, kind: str) -> None:
+LIES = {
+    "shifted by 5 m": r"shifted by 5\.00 m \(x \+3\.00, y \+4\.00, z .0\.00; \+-0\.07\) against the prior",
+    "shifted by 300 km": r"the map covers \(299904, -77\) to \(300134, 77\), 299887 m away",
+    "turned by 10 deg": r"turned about z by 10\.00 deg \(\+-0\.37\) against .* \(4 places\)",
+    "pitched by 3 deg + scaled by 1.03": r"tilted by 3\.00 deg \(\+-0\.50\), scaled by 1\.0300 \(\+-0\.0019\)",
+    "mirrored, y negated": "the map is mirrored against the scans: 4 mirrored scans fit it, unmirrored none",
+    "in feet": "the map is in feet: made metres, it fits 6 of 6 scans checked",
+    "bent": "the drive fits the map nowhere: at best to 0.33",
+}
+"""How maps lie on the drive, in words."""
+ON_MAP = [kind for kind in kinds_of("maps") if " + " in kind or "shifted" in kind or kind in LIES]
+
+
+QUICK = "turned by 10 deg", "pitched by 3 deg + scaled by 1.03", "mirrored, y negated"
+
+
+@pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in ON_MAP])
+def test_what_is_wrong_with_a_map_shows_by_a_drive_and_is_measured(sound: Recording, kind: str) -> None:
     rights, change = kinds_of("maps")[kind]
     found, point_map = examine_points("map", Cloud(change(sound_street())))
     assert point_map is not None
     found += check_on_map(drive_of(sound), poses(), point_map)[0]
     assert verdict(rights, found) == "right", found
+    assert any(re.search(LIES.get(kind, ""), what) for what in serious(found)), found
 
 
 def drive_of(sound: Recording) -> Drive:
@@ -145,8 +162,7 @@ def test_healthy_simulated_drives_and_those_of_kitti_raise_no_alarm(tmp_path: Pa
 @pytest.mark.parametrize(
     ("numbers", "name"),
     [
-        (1 / 0.3048, "in feet"),
-        pytest.param(1 / 0.0254, "in inches", marks=pytest.mark.slow),
+        (1 / 0.0254, "in inches"),
         pytest.param(0.3048, "converted as if they were feet", marks=pytest.mark.slow),
     ],
 )
@@ -161,26 +177,6 @@ def test_of_a_map_that_is_not_in_metres_the_unit_is_named(sound: Recording, numb
     assert found is not None
     assert name in found.what
     assert "fits 6 of 6 scans" in found.what
-
-
-@pytest.mark.slow
-def test_drive_and_map_that_do_not_belong_together(tmp_path: Path, sound: Recording) -> None:
-    sound.write(tmp_path / "d")
-    elsewhere = map_from_points(sound_street() + np.array([5000.0, 0, 0]))
-    assert "do not overlap" in serious(diagnose(tmp_path / "d", None, elsewhere).findings)[0]
-    lower = map_from_points(sound_street() - np.array([0, 0, 40.0]))
-    assert (
-        "shifted by 40.00 m (x -0.00, y +0.00, z -40.00" in serious(diagnose(tmp_path / "d", None, lower).findings)[0]
-    )
-    larger = map_from_points(1.04 * sound_street())
-    found = serious(diagnose(tmp_path / "d", None, larger).findings)
-    assert any("scaled by 1.0" in what for what in found), found
-    feet = map_from_points(sound_street()[::4] / 0.3048)
-    assert "the map is in feet" in serious(diagnose(tmp_path / "d", None, feet).findings)[0]
-    bare = sound_street()
-    bare = bare[bare[:, 0] < -30]
-    corner = map_from_points(np.concatenate([bare, [[10.0, 5.0, 0.0]]]))
-    assert "fits the map nowhere" in serious(diagnose(tmp_path / "d", None, corner).findings)[0]
 
 
 def test_nothing_there_is_one_error() -> None:
