@@ -42,7 +42,7 @@ TESTS = {
     "perception/fans": "perception/test_fans.py perception/test_raycast.py",
     "server/store/publish": "server/store/test_publish_limits.py server/views/test_rounds.py",
     "doctor/map_fit": "doctor/test_drives.py",
-    "doctor/prior_fit": "doctor/test_small.py doctor/test_drives.py",
+    "doctor/prior_fit": "doctor/test_small.py",
     "formats/drives/trajectory": "formats/drives",
     "formats/geo/units": "formats/geo/test_frames.py",
 }

@@ -7,7 +7,6 @@ import resource
 import shutil
 import signal
 import struct
-import subprocess
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from bag_recorder import CLOUD, START, Recorder
 from hand_made import save_pcd
-from live_server import mapvote
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
@@ -266,20 +264,6 @@ def test_a_damaged_laz_file_is_one_clear_error(tmp_path: Path, laz: bytes, damag
     path.write_bytes(content)
     with pytest.raises(MapvoteError, match=r"bad\.laz: not a whole LAS or LAZ file .*copy"):
         read_map(path)
-
-
-def test_the_command_line_says_one_line_about_a_damaged_laz_file(tmp_path: Path, laz: bytes) -> None:
-    content = bytearray(laz)
-    many_chunks(content)
-    path = tmp_path / "bad.laz"
-    path.write_bytes(content)
-    done = subprocess.run(
-        mapvote("import", path, tmp_path / "out"), capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.returncode == 1
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert "bad.laz" in done.stderr
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_that_may_not_be_read_or_is_gone(tmp_path: Path, good: Path) -> None:
