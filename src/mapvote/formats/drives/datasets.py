@@ -1,17 +1,9 @@
-"""Public datasets as their authors lay them out: KITTI raw, KITTI-360, nuScenes, Boreas, MulRan, Newer College, Oxford.
+"""Public datasets as their authors lay them out (docs/formats.md lists their files): KITTI raw (Geiger et al. 2013),
+KITTI-360 (Liao et al. 2022), nuScenes (Caesar et al. 2020), Boreas (Burnett et al. 2023), MulRan (Kim et al. 2020),
+Newer College (Ramezani et al. 2020), Oxford (Radar) RobotCar (Barnes et al. 2020).
 
-KITTI raw (Geiger et al. 2013): velodyne_points/data/*.bin with timestamps, oxts/data/*.txt as prior.
-KITTI-360 (Liao et al. 2022): the same layout below data_3d_raw/SEQUENCE; poses of the GPS/IMU in data_poses/SEQUENCE,
-calibration/ beside. The world is local metres with z up.
-nuScenes (Caesar et al. 2020): samples and sweeps of LIDAR_TOP, poses and calibration from its tables. A scene is a
-drive. Its LiDAR looks along y; points and mount are turned so that x is forward.
-Boreas (Burnett et al. 2023): lidar/MICROSECONDS.bin of six columns, applanix/lidar_poses.csv.
-MulRan (Kim et al. 2020): Ouster/NANOSECONDS.bin of four columns, global_pose.csv.
-Newer College (Ramezani et al. 2020): raw_format/ouster_scan/cloud_SECONDS_NANOSECONDS.pcd,
-ground_truth/registered_poses.csv.
-Oxford (Radar) RobotCar (Barnes et al. 2020): velodyne_left/MICROSECONDS.bin, four rows of float32; gps/ins.csv. Its
-frames have x forward, y right and z down; points are turned so that y is left and z up. The mount comes from
-extrinsics/velodyne_left.txt of the SDK, if that lies beside the drive, or from --mount.
+KITTI-360's world is local metres with z up. nuScenes' LiDAR looks along y: points and mount are turned so that x is
+forward. Oxford's frames have x forward, y right and z down: points are turned so that y is left and z up.
 """
 
 from __future__ import annotations
