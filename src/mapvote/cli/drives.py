@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapvote.cli.door import client_of, key_in, map_at, region_in, usable_drives
-from mapvote.cli.options import Config, DrivePath, KeyFile, with_drive_options
+from mapvote.cli.options import Config, KeyFile, with_drive_options
 from mapvote.cli.terminal import print_table, progress, waiting
 from mapvote.core.types import MapvoteError
 
@@ -112,7 +112,7 @@ def _frame(report: BuildReport) -> str:
 
 @with_drive_options
 def vote(
-    drive_path: DrivePath,
+    drive_path: Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")],
     where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
     out: Annotated[Path | None, typer.Option(metavar="BALLOT", help="write the ballot to this file")] = None,
     send: Annotated[

@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapvote.cli.door import api_at, is_store, is_url, key_in, look_at_points, map_at, opened_store, sound_map, when
-from mapvote.cli.options import (
-    Config,
-    FalseDeletions,
-    KeyFile,
-    MapPath,
-    MinVotes,
-    Projector,
-    Rate,
-    Topic,
-    with_drive_options,
-)
+from mapvote.cli.options import Config, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
 from mapvote.core.types import MapvoteError
 
@@ -328,13 +318,21 @@ _MOST_WAYPOINTS = 10
 
 
 def update(
-    map_path: MapPath,
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")],
     ballot_files: Annotated[list[Path], typer.Argument(metavar="BALLOT...", help="ballots of one round")],
     out: Annotated[Path | None, typer.Option(metavar="MAP", help="the updated map to write, a folder")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="decide and report, but write no map")] = False,
     cells: Annotated[Path | None, typer.Option(metavar="NPZ", help="also write the decided states of cells")] = None,
-    min_votes: MinVotes = None,
-    false_deletions: FalseDeletions = None,
+    min_votes: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; default: the settings")
+    ] = None,
+    false_deletions: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="keep the points of a cell if the probability of a false deletion is higher than this, e.g. 0.01",
+        ),
+    ] = None,
     config: Config = None,
 ) -> None:
     """Fuse ballots offline and edit the map: add, delete, keep.

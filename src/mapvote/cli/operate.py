@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapvote.cli.door import api_at, is_url, sound_map, store_url, when, who
-from mapvote.cli.options import Config, KeyFile, Reason, StoreName, StoreOrUrl
+from mapvote.cli.options import Config, KeyFile, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
 from mapvote.core.types import MapvoteError
 
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 
 def serve(
-    store: StoreName,
+    store: Annotated[
+        str,
+        typer.Argument(metavar="STORE", help="an SQLite file, a postgresql+psycopg:// URL, or - for $MAPVOTE_STORE"),
+    ],
     map_path: Annotated[Path | None, typer.Option("--map", metavar="MAP", help="first map of a new STORE")] = None,
     host: Annotated[str, typer.Option(metavar="ADDRESS", help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="port to listen on; 0: any free one")] = 8080,

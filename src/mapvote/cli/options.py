@@ -16,8 +16,6 @@ DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and ev
 """Headings of ``mapvote --help``."""
 
 Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings file; `mapvote config` lists all settings")]
-DrivePath = Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")]
-MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")]
 Scenario = Annotated[
     str,
     typer.Argument(
@@ -26,10 +24,6 @@ Scenario = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="seed of layout, clutter, traffic and noise")]
-StoreName = Annotated[
-    str,
-    typer.Argument(metavar="STORE", help="an SQLite file, a postgresql+psycopg:// URL, or - for $MAPVOTE_STORE"),
-]
 StoreOrUrl = Annotated[
     str, typer.Argument(metavar="STORE|URL", help="a STORE (file, database URL or -), or its server's URL")
 ]
@@ -37,18 +31,6 @@ KeyFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="file with the key for the server; default: the key in $MAPVOTE_KEY")
 ]
 Reason = Annotated[str, typer.Option(metavar="TEXT", help="a comment that the log keeps")]
-MinVotes = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; default: the settings")
-]
-
-FalseDeletions = Annotated[
-    float | None,
-    typer.Option(
-        metavar="P",
-        help="keep the points of a cell if the probability of a false deletion is higher than this, e.g. 0.01",
-    ),
-]
-
 Rate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, for a drive without times")
 ]
