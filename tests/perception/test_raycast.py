@@ -243,6 +243,11 @@ def test_beside_a_house_the_sky_begins_a_sector_later() -> None:
     assert not ((sky > 90.0 - wide) & (sky < 180.0 + wide)).any()
     assert (sky < 90.0 - 2.0 * wide).any()
     assert (sky > 180.0 + 2.0 * wide).any()
+    pole = np.abs(azimuth - 45.0 - 0.5 * wide) < 0.3 * wide  # in one sector alone
+    sky = azimuths_of(sky_of((elevation < 0.0) | pole))
+    assert not ((sky > 45.0 - wide) & (sky < 45.0 + 2.0 * wide)).any()
+    assert (np.abs(sky - 45.0 + 1.5 * wide) < 0.5 * wide).any()
+    assert (np.abs(sky - 45.0 - 2.5 * wide) < 0.5 * wide).any()
 
 
 def test_a_beam_lost_here_and_there_is_not_the_sky_and_where_hardly_anything_answered_nothing_is_told() -> None:
