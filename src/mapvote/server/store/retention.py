@@ -15,11 +15,10 @@ import sqlalchemy as sa
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
+from mapvote.server.store.database import MOST_ASKED
 from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, version_of
 from mapvote.server.store.store import Store
-
-_AT_ONCE = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +101,6 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
 
 def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
     columns = sa.tuple_(*(table.c[name] for name in key))
-    for start in range(0, len(rows), _AT_ONCE):
-        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + _AT_ONCE]]
+    for start in range(0, len(rows), MOST_ASKED):
+        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + MOST_ASKED]]
         connection.execute(table.delete().where(columns.in_(some)))
