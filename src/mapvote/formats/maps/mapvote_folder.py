@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -113,18 +115,19 @@ def read_map_folder(path: Path) -> PointMap:
         raise MapvoteError(f"{path / MANIFEST}: names a tile by no row and column ({error})") from error
 
     def load(index: TileIndex) -> Tile:
-        planes = _planes(path, named[index])
-        try:
-            tile = unpack_tile(manifest.lattice.tile(index), named[index], planes)
-        except MapvoteError as error:
-            raise MapvoteError(f"{path}: tile {tile_key(index)}: {error}; copy the map again") from error
+        with _whole(path, index):
+            tile = unpack_tile(manifest.lattice.tile(index), named[index], _planes(path, named[index]))
         if not (np.isfinite(tile.points).all() and ((tile.points[:, :2] >= 0) & (tile.points[:, :2] < _SIDE_M)).all()):
             raise MapvoteError(f"{path}: tile {tile_key(index)} holds a point outside it or not finite; copy it again")
         return tile
 
-    tiles = in_memory_if_small(LazyTiles(load, {index: _points(path, hashes) for index, hashes in named.items()}))
-    if isinstance(tiles, LazyTiles):
-        for hashes in named.values():
+    n_points = {}
+    for index, hashes in named.items():
+        with _whole(path, index), (path / "planes" / hashes.points).open("rb") as file:
+            n_points[index] = points_in_plane(file.read(FRAME_HEAD), hashes.points)
+    tiles = in_memory_if_small(LazyTiles(load, n_points))
+    for index, hashes in named.items() if isinstance(tiles, LazyTiles) else ():
+        with _whole(path, index):
             for name, frame in _planes(path, hashes).items():
                 check_plane(frame, hashes.planes()[name])
     driven = tuple(_positions(data, path) for data in manifest.driven)
@@ -132,22 +135,21 @@ def read_map_folder(path: Path) -> PointMap:
     return PointMap(manifest.map_id, manifest.lattice, tiles, *about)
 
 
+@contextmanager
+def _whole(path: Path, index: TileIndex) -> Iterator[None]:
+    """Whatever is wrong within is one MapvoteError that names a tile of the map at ``path``, or the file."""
+    try:
+        yield
+    except OSError as error:
+        what = f"{error.filename}: {error.strerror}, but the manifest lists it; copy the map again"
+        raise MapvoteError(what) from error
+    except MapvoteError as error:
+        raise MapvoteError(f"{path}: tile {tile_key(index)}: {error}; copy the map again") from error
+
+
 def _planes(path: Path, hashes: TileHashes) -> dict[str, bytes]:
     """The frames of a tile's planes, by name."""
-    return {name: _bytes_of(path / "planes" / digest) for name, digest in hashes.planes().items()}
-
-
-def _points(path: Path, hashes: TileHashes) -> int:
-    """How many points a tile has."""
-    return points_in_plane(_bytes_of(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
-
-
-def _bytes_of(file: Path, most: int = -1) -> bytes:
-    try:
-        with file.open("rb") as opened:
-            return opened.read(most)
-    except OSError as error:
-        raise MapvoteError(f"{file}: {error.strerror}, but the manifest lists it; copy the map again") from error
+    return {name: (path / "planes" / digest).read_bytes() for name, digest in hashes.planes().items()}
 
 
 def _positions(data: bytes, path: Path) -> F64:
