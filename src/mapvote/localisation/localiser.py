@@ -65,12 +65,7 @@ class Localiser:
     Without a prior, and when no place holds for long, the whole map is searched.
     """
 
-    def __init__(
-        self,
-        point_map: PointMap,
-        settings: Settings,
-        sensor: Sensor,
-    ) -> None:
+    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
         self.map_around = MapWindow(point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
@@ -87,7 +82,8 @@ class Localiser:
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
-            self._waiting.append(_Waiting(_nowhere(scan), None))
+            nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
+            self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None))
             return self._decide(len(self._waiting), False)
         fix = self.tracker.localise(scan, None if prior is None else self._corrected(prior))
         self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
@@ -207,11 +203,6 @@ class Localiser:
                 self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
             decided.append(fix)
         return decided
-
-
-def _nowhere(scan: Scan) -> Fix:
-    """A scan of which nothing is known."""
-    return Fix(scan, Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False), scan.points, False)
 
 
 class GivenPoses:

@@ -82,10 +82,7 @@ class Judge:
     def judge(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty. ``quick``: other places are found
         less well, for a third less work; what does not hold then should be judged again."""
-        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
-        standing = few[stands_above_ground(few, T_map_lidar)]
-        expected, known = self._expected(ndt_map, standing, T_map_lidar)
-        here = self._likelihood(ndt_map, standing, T_map_lidar) / expected
+        few, standing, expected, known, here = self._here(ndt_map, points_lidar, T_map_lidar)
         best, lead = None, here
         for other in self._others(ndt_map, few, standing, T_map_lidar, quick):
             ahead = here - self._likelihood(ndt_map, standing, other) / expected
@@ -96,26 +93,25 @@ class Judge:
         return Verdict(here, known, lead, best)
 
     def fit(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> float:
-        """The verdict's fit alone."""
-        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
-        standing = few[stands_above_ground(few, T_map_lidar)]
-        expected, known = self._expected(ndt_map, standing, T_map_lidar)
-        return self._likelihood(ndt_map, standing, T_map_lidar) / expected if known >= MIN_KNOWN else 0.0
+        """The verdict's fit alone; 0 where too little is known."""
+        *_, known, here = self._here(ndt_map, points_lidar, T_map_lidar)
+        return here if known >= MIN_KNOWN else 0.0
 
     def holds(self, verdict: Verdict) -> bool:
         """Whether the verdict confirms the pose."""
         return verdict.fit >= MIN_FIT and verdict.known >= MIN_KNOWN and verdict.lead >= MIN_LEAD
 
-    def _expected(self, ndt_map: NdtMap, standing: F64, T: F64) -> tuple[float, float]:
-        """(mean likelihood that the standing points should have, share of them where the map has been)."""
-        coarse, fine = ndt_map.levels[0], ndt_map.levels[-1]
+    def _here(self, ndt_map: NdtMap, points_lidar: F64, T: F64) -> tuple[F64, F64, float, float, float]:
+        """(points that are looked at; those of them that stand; mean likelihood that these should have; share of them
+        where the map has been; how well they fit)."""
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
+        standing = few[stands_above_ground(few, T)]
         points = standing @ T[:3, :3].T + T[:3, 3]
-        known = _is_near_map(points, coarse)
-        if not known.any():
-            return 1.0, 0.0
-        mapped = _self_likelihood(points, fine, self.range_sigma_m)
-        usual = float(mapped.mean()) if len(mapped) else 1.0
-        return max(usual * float(known.mean()), 1e-6), float(known.mean())
+        near, expected, known = _is_near_map(points, ndt_map.levels[0]), 1.0, 0.0
+        if near.any():
+            mapped, known = _self_likelihood(points, ndt_map.levels[-1], self.range_sigma_m), float(near.mean())
+            expected = max((float(mapped.mean()) if len(mapped) else 1.0) * known, 1e-6)
+        return few, standing, expected, known, self._likelihood(ndt_map, standing, T) / expected
 
     def _likelihood(self, ndt_map: NdtMap, standing: F64, T: F64) -> float:
         return fitness(ndt_map, [in_rows(standing)] * len(ndt_map.levels), T, len(ndt_map.levels) - 1)
