@@ -1,7 +1,6 @@
 """How many votes on a cell the server fuses a second, from ballots in the store to what would be published.
 
     python benchmarks/fusion.py                        # 25 to 200 vehicles, 4 to 16 tiles
-    python benchmarks/fusion.py --planes states        # votes alone: no delete masks, no points, no free space
     python benchmarks/fusion.py --publish --tiles 16   # a publish of three vehicles, from the plan to the commit
 
 A run is `preview()`: it reads every ballot from the database, decompresses it, checks which cells count,
@@ -89,9 +88,9 @@ class Fleet:
     """Vehicles that vote on all tiles of a store, one after another. No two say the same of a tile: such would be
     copies."""
 
-    def __init__(self, store: Store, tiles: Sequence[TileIndex], most: int, planes: str) -> None:
+    def __init__(self, store: Store, tiles: Sequence[TileIndex], most: int) -> None:
         rng = np.random.default_rng(1)
-        self.store, self.tiles, self.base, self.planes = store, tiles, store.point_map(), planes
+        self.store, self.tiles, self.base = store, tiles, store.point_map()
         self.kinds = [said(rng) for _ in range(max(most, 40))]
         self.vehicles, self.bytes = 0, 0
 
@@ -99,8 +98,6 @@ class Fleet:
         """So many more."""
         for vehicle in range(self.vehicles, self.vehicles + vehicles):
             says = {tile: self.kinds[(vehicle + i) % len(self.kinds)] for i, tile in enumerate(self.tiles)}
-            if self.planes == "states":
-                says = {tile: Say(say.states) for tile, say in says.items()}
             data = encode(make_ballot(self.base, says, f"v{vehicle:03}", "d", end_ns=DAY_NS + vehicle))
             self.bytes += len(data)
             (receipt,) = Intake(self.store).write([examine(data)])
@@ -156,16 +153,15 @@ def numpy_whole_tile(connection: sqlite3.Connection, tile: TileIndex) -> tuple[U
 PEERS = {"numpy": numpy_tile, "numpy, whole": numpy_whole_tile}
 
 
-def measure(folder: Path, vehicles: int, n_tiles: int, planes: str, repeats: int) -> dict[str, Any]:
+def measure(folder: Path, vehicles: int, n_tiles: int, repeats: int) -> dict[str, Any]:
     """Milliseconds of CPU a tile, the median of ``repeats`` turns after one to warm up. Every turn has one vehicle
     more."""
     tiles = [(0, col) for col in range(n_tiles)]
-    file = folder / f"{planes}_{vehicles}_{n_tiles}.db"
+    file = folder / f"{vehicles}_{n_tiles}.db"
     store = Store.create(f"sqlite:///{file}", street(tiles))
-    fleet = Fleet(store, tiles, vehicles + repeats + 1, planes)
+    fleet = Fleet(store, tiles, vehicles + repeats + 1)
     fleet.vote(vehicles - 1)
-    peers = {name: peer for name, peer in PEERS.items() if planes == "all" or peer is numpy_tile}
-    cpu: dict[str, list[float]] = {name: [] for name in ("mapvote", "mapvote, 1 new", *peers)}
+    cpu: dict[str, list[float]] = {name: [] for name in ("mapvote", "mapvote, 1 new", *PEERS)}
 
     def timed(name: str, act: Callable[[], object]) -> None:
         start = time.process_time()
@@ -181,7 +177,7 @@ def measure(folder: Path, vehicles: int, n_tiles: int, planes: str, repeats: int
         database.remembered.clear()
         timed("mapvote", partial(preview, store, policy))
         with closing(sqlite3.connect(file)) as connection:
-            for name, peer in peers.items():
+            for name, peer in PEERS.items():
                 timed(name, lambda connection=connection, peer=peer: [peer(connection, tile) for tile in tiles])
     store.close()
     file.unlink()
@@ -243,7 +239,6 @@ def publishes(folder: Path, n_tiles: int, repeats: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--planes", choices=("all", "states"), default="all")
     parser.add_argument("--vehicles", type=int, nargs="+", default=[25, 50, 100, 200])
     parser.add_argument("--tiles", type=int, nargs="+", default=[4, 16])
     parser.add_argument("--repeats", type=int, default=5)
@@ -254,7 +249,7 @@ def main() -> None:
             publishes(Path(name), tiles, options.repeats)
         for vehicles in () if options.publish else options.vehicles:
             for tiles in options.tiles:
-                print(measure(Path(name), vehicles, tiles, options.planes, options.repeats), flush=True)
+                print(measure(Path(name), vehicles, tiles, options.repeats), flush=True)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.geometry import inverse
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import all_points
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
 from mapvote.localisation.prepare import deskew, motion_at
@@ -201,15 +201,6 @@ def judge(out: Path, drive: Drive, map_path: Path, T_true: F64, sources: dict[st
     return "\n".join(rows)
 
 
-def map_of(out: Path, name: str, surveys: list[Drive]) -> Path:
-    """Made once."""
-    path = out / f"map_{name}"
-    if not path.exists():
-        built: PointMap = build_map(surveys)[0]
-        write_map(built, path)
-    return path
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
@@ -222,6 +213,14 @@ def main() -> None:
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     sources = {"ours": Path(__file__).parents[1] / "src"} | ({"other": options.source} if options.source else {})
     print("| drive | stage | side | CPU ms: median / mean / worst | times ours, means |\n|---|---|---|---|---|")
+
+    def judged(name: str, folder: Path, surveys: list[Drive], poses: Path) -> None:
+        map_path = options.out / f"map_{name}"
+        if not map_path.exists():
+            write_map(build_map(surveys)[0], map_path)
+        T_true = read_T_map_lidar(poses, folder)
+        print(judge(options.out, open_drive(folder), map_path, T_true, sources, options.last), flush=True)
+
     for scene in options.street:
         from mapvote_lab.simulation import simulate
 
@@ -229,15 +228,12 @@ def main() -> None:
         folder = options.out / scene.replace(":", "_")
         if not folder.exists():
             simulate(scenario, folder, int(seed), overrides={"sensor": sensor[0]} if sensor else {})
-        map_path = map_of(options.out, folder.name, [open_drive(one) for one in sorted(folder.glob("survey_*"))])
-        T_true = read_T_map_lidar(folder / "truth" / "v1" / "poses.txt", folder / "v1")
-        print(judge(options.out, open_drive(folder / "v1"), map_path, T_true, sources, options.last), flush=True)
+        surveys = [open_drive(one) for one in sorted(folder.glob("survey_*"))]
+        judged(folder.name, folder / "v1", surveys, folder / "truth" / "v1" / "poses.txt")
     for folder in options.kitti:
         if not (folder / "poses.txt").is_file():
             raise MapvoteError(f"{folder} has no poses.txt")
-        map_path = map_of(options.out, folder.name, [open_drive(folder, scans="::2")])
-        T_true = read_T_map_lidar(folder / "poses.txt", folder)
-        print(judge(options.out, open_drive(folder), map_path, T_true, sources, options.last), flush=True)
+        judged(folder.name, folder, [open_drive(folder, scans="::2")], folder / "poses.txt")
 
 
 if __name__ == "__main__":
