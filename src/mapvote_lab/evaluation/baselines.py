@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from mapvote_lab.evaluation.scene import (
     sources_digest,
 )
 from mapvote_lab.evaluation.scores import Cost, map_obstacles
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.simulation.processes import mapping
 
 LAYERS = 64
 """Voxels of a column, as in the map's column words: 19.2 m above the road."""
@@ -299,8 +298,8 @@ def yardsticks(
         (scene, drive.vehicle, drive.T_map_lidar) for drive in drives if not _folder(scene, drive.vehicle).exists()
     ]
     progress("yardsticks", 0, len(tasks))
-    with processes(workers) if workers > 1 and len(tasks) > 1 else nullcontext() as pool:
-        list(pool.map(_measure, tasks) if pool else map(_measure, tasks))
+    with mapping(workers if len(tasks) > 1 else 1) as run:
+        list(run(_measure, tasks))
     folders = [_folder(scene, drive.vehicle) for drive in drives]
     costs = [json.loads((folder / "cost.json").read_text()) for folder in folders]
     beams = scene.drive(drives[0].vehicle).sensor.beams

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +20,7 @@ from mapvote.formats.drives.scan_folder import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
 from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
 from mapvote_lab.simulation.lidar import Caster, measure, sweep
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.simulation.processes import Run, mapping
 from mapvote_lab.simulation.routes import Route, make_routes
 from mapvote_lab.simulation.scenario import Scenario, load_scenario
 from mapvote_lab.simulation.truth import (
@@ -69,7 +68,7 @@ def simulate(
         writers = [_writer(partial, route, stage).open() for route in stage.routes]
         for route in stage.routes:
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
-        with _pool(workers or _processes(stage)) as run:
+        with mapping(workers or _processes(stage)) as run:
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
             survey, vehicles, densest, passed = _drive_all(stage, partial, run, progress)
             T = T_map_street(spec)
@@ -137,25 +136,12 @@ def _writer(folder: Path, route: Route, stage: Stage) -> DriveWriter:
     )
 
 
-_Run = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[_Run]:
-    """A map over tasks whose results come in the order of the tasks: in this process or in spawned ones."""
-    if workers == 1:
-        yield map
-        return
-    with processes(workers) as pool:
-        yield pool.map
-
-
 def _processes(stage: Stage) -> int:
     """One per core where a drive is long enough to pay for starting them."""
     return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
 
 
-def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32, I32, Bool]:
+def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) -> tuple[I32, I32, I32, Bool]:
     """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still,
     (rows, cols) the most of them that one scan of a vehicle had on built bodies, and (rows, cols) where a vehicle's
     ray passed the place of a demolished surface."""

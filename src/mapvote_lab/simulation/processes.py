@@ -7,9 +7,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -41,6 +41,16 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
                         os.kill(process.pid or 0, signal.SIGUSR1)
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
+
+
+@contextmanager
+def mapping(workers: int) -> Iterator[Run]:
+    """A map over tasks whose results come in the order of the tasks: in this process, or in more spawned ones."""
+    with processes(workers) if workers > 1 else nullcontext() as pool:
+        yield pool.map if pool else map
 
 
 class _Pool(ProcessPoolExecutor):
