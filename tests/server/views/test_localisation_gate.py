@@ -12,7 +12,7 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.views.localisation_gate import GateResult, Localised, compare, gate, gate_by, pass_or_hold
+from mapvote.server.views.localisation_gate import Localised, compare, gate, gate_by, pass_or_hold
 from streets import drive_along, path, street, sweep, twist_of
 
 NDT, SETTINGS = NdtSettings(), GateSettings()
@@ -44,30 +44,30 @@ def street_map(points: F64) -> PointMap:
     return map_from_points(points, map_id="street")
 
 
-def run(old: F64, new: F64, world: F64) -> GateResult:
+def run(old: F64, new: F64, world: F64) -> tuple[str, list[str]]:
     return gate(street_map(old), street_map(new), drive_through(world), SETTINGS, NDT)
 
 
 def test_a_map_that_followed_when_a_house_was_lost_or_built_passes() -> None:
     gap = without(-22.0, 0.0)
     lost, built = run(STREET, gap, world=gap), run(gap, STREET, world=STREET)
-    assert (lost.verdict, lost.scans_compared, built.verdict) == ("pass", 20, "pass"), (lost.reasons, built.reasons)
-    assert {m.name: m.gain for m in built.measures}["inlier share"] > 0.0
+    assert (lost[0], built[0]) == ("pass", "pass"), (lost, built)
+    assert any(told.startswith("inlier share") and "(gain +0." in told for told in built[1])
 
 
 def test_a_version_that_demolishes_houses_that_still_stand_is_held_and_says_why() -> None:
     wrong = without(-22.0, 22.0)
-    result = run(STREET, wrong, world=STREET)
-    assert result.verdict == "hold"
-    assert any("inlier share" in reason for reason in result.reasons)
+    verdict, reasons = run(STREET, wrong, world=STREET)
+    assert verdict == "hold"
+    assert any("inlier share" in reason for reason in reasons)
 
 
 def test_a_drive_elsewhere_says_nothing() -> None:
     far = np.concatenate([STREET, [[500.0, 500.0, 1.0]]])
-    result = run(STREET, far, world=STREET)
-    assert result.verdict == "abstain"
-    assert "only 0 of 20 scans" in result.reasons[0]
-    assert "needs 20" in result.reasons[0]
+    verdict, reasons = run(STREET, far, world=STREET)
+    assert verdict == "abstain"
+    assert "only 0 of 20 scans" in reasons[0]
+    assert "needs 20" in reasons[0]
 
 
 def test_without_priors_or_with_another_map_it_says_what_to_do() -> None:

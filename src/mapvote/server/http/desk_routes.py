@@ -11,7 +11,7 @@ from pydantic import Field
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
-from mapvote.server.http.page_routes import AS_BYTES, packed
+from mapvote.server.http.page_routes import packed
 from mapvote.server.http.schemas import (
     AS_CSV,
     PLAIN,
@@ -23,6 +23,7 @@ from mapvote.server.http.schemas import (
     as_json,
     as_table,
     problems,
+    sends_bytes,
 )
 from mapvote.server.http.services import Parts, Reviewer, Services
 from mapvote.server.store.reviews import undo
@@ -64,12 +65,7 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
 
 
-@router.get(
-    "/v1/desk/clouds",
-    responses=problems(403) | AS_BYTES,
-    response_class=Response,
-    summary="Points that a publish would add and delete",
-)
+@router.get("/v1/desk/clouds", summary="Points that a publish would add and delete", **sends_bytes(403))
 async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Response:
     """Tile by tile, two clouds each, as `/v1/clouds/changed` gives them."""
     return packed(request, (await _look(parts)).clouds, "no-store")

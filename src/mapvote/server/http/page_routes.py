@@ -10,7 +10,7 @@ import html
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
@@ -28,13 +28,13 @@ from mapvote.server.http.schemas import (
     as_json,
     as_table,
     problems,
+    sends_bytes,
 )
 from mapvote.server.http.services import Parts, Reviewer, name_of
 from mapvote.server.views.explain import evidence
 from mapvote.server.views.point_lod import N_LEVELS
 from mapvote.server.views.vehicles import paths
 
-AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
 _OPEN = b"""<p class="open-server" role="alert">This server is open: every user of this machine can vote, publish and
@@ -51,35 +51,20 @@ _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".
 router = APIRouter()
 
 
-@router.get(
-    "/v1/clouds/overview",
-    responses=problems(404) | AS_BYTES,
-    response_class=Response,
-    summary="A whole version, coarse",
-)
+@router.get("/v1/clouds/overview", summary="A whole version, coarse", **sends_bytes(404))
 def overview(request: Request, parts: Parts, version: VersionQuery | None = None) -> Response:
     """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
     number = parts.store.current() if version is None else version
     return packed(request, parts.clouds.overview(number), "private, no-cache")
 
 
-@router.get(
-    "/v1/clouds/changed",
-    responses=problems(404) | AS_BYTES,
-    response_class=Response,
-    summary="Points added and deleted between two versions",
-)
+@router.get("/v1/clouds/changed", summary="Points added and deleted between two versions", **sends_bytes(404))
 def changed(request: Request, parts: Parts, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
     return packed(request, parts.clouds.changed(old, new), _FOR_EVER)
 
 
-@router.get(
-    "/v1/clouds/{points}/{ground}/{level}",
-    responses=problems(404) | AS_BYTES,
-    response_class=Response,
-    summary="One level of detail of a tile",
-)
+@router.get("/v1/clouds/{points}/{ground}/{level}", summary="One level of detail of a tile", **sends_bytes(404))
 def level_of(
     request: Request,
     parts: Parts,
@@ -94,12 +79,7 @@ def level_of(
     return packed(request, parts.clouds.levels(hashes).part(level), _FOR_EVER)
 
 
-@router.get(
-    "/v1/evidence/{row}/{col}",
-    responses=problems(403) | AS_BYTES,
-    response_class=Response,
-    summary="Votes cell by cell",
-)
+@router.get("/v1/evidence/{row}/{col}", summary="Votes cell by cell", **sends_bytes(403))
 def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
     """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
 

@@ -413,11 +413,17 @@ KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=l
 KeyIssued = _answer("KeyIssued", "The only time that the key is seen.", key=str)
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
+AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     """For the OpenAPI document: the refusals that every route knows, and these."""
     return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
+
+
+def sends_bytes(*codes: int) -> dict[str, Any]:
+    """The arguments of a route that answers bytes, or with these refusals."""
+    return {"responses": problems(*codes) | AS_BYTES, "response_class": Response}
 
 
 def as_json(content: object) -> Response:

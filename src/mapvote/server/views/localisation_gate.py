@@ -88,32 +88,24 @@ class Measure:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class GateResult:
-    """The gate's verdict and its reasons."""
-
-    verdict: Verdict
-    """pass: at least as good. hold: worse. abstain: undecided by this drive."""
-    reasons: tuple[str, ...]
-    scans_compared: int = 0
-    measures: tuple[Measure, ...] = ()
-
-
 def gate_by(ndt: NdtSettings) -> Gate:
     """The gate of the policy's reference drive; an abstention lets the version through. MapvoteError if the drive is
     missing."""
 
     def reasons(asked: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
         settings = GateSettings.model_validate(asked.model_dump(exclude={"drive"}))
-        result = gate(old, new, open_drive(Path(asked.drive)), settings, ndt)
-        structlog.get_logger("mapvote").info("gate", verdict=result.verdict, reasons=list(result.reasons))
-        return list(result.reasons) if result.verdict == "hold" else []
+        verdict, why = gate(old, new, open_drive(Path(asked.drive)), settings, ndt)
+        structlog.get_logger("mapvote").info("gate", verdict=verdict, reasons=why)
+        return why if verdict == "hold" else []
 
     return reasons
 
 
-def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt: NdtSettings) -> GateResult:
-    """Localise a reference drive in both maps; pass only if the new one is at least as good within tolerance.
+def gate(
+    old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt: NdtSettings
+) -> tuple[Verdict, list[str]]:
+    """Localise a reference drive in both maps: "pass" only if the new one is at least as good within tolerance, "hold"
+    if it is worse, "abstain" if this drive does not decide; and the reasons.
 
     ``drive`` needs prior poses in the map's frame, good to a metre or two. MapvoteError if it has none, or if the maps
     are not two versions of one map.
@@ -129,10 +121,8 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "
             f"{REACH_M:g} m of what changed; the gate needs {MIN_SCANS}"
         )
-        return GateResult("abstain", (reason,))
-    pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], ndt)
-    measures = compare(pairs, settings)
-    return GateResult(*pass_or_hold(measures), len(chosen), measures)
+        return "abstain", [reason]
+    return pass_or_hold(compare(localise_in_both(old, new, drive, [int(i) for i in chosen], ndt), settings))
 
 
 def scans_near(old: PointMap, new: PointMap, T_map_lidar_prior: F64, reach_m: float) -> np.ndarray:
@@ -189,15 +179,15 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
     return tuple(out)
 
 
-def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, tuple[str, ...]]:
+def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, list[str]]:
     """hold if any figure is worse than tolerated; pass if none can be; else abstain."""
     worse = [str(m) for m in measures if m.worse]
     if worse:
-        return "hold", tuple(f"vehicles would localise worse: {text}" for text in worse)
+        return "hold", [f"vehicles would localise worse: {text}" for text in worse]
     unsure = [str(m) for m in measures if not m.surely_good]
     if unsure:
-        return "abstain", tuple(f"the scans leave open whether this got worse: {text}" for text in unsure)
-    return "pass", tuple(str(m) for m in measures)
+        return "abstain", [f"the scans leave open whether this got worse: {text}" for text in unsure]
+    return "pass", [str(m) for m in measures]
 
 
 def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F64], ndt: NdtSettings) -> Localised:
