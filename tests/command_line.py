@@ -12,7 +12,7 @@ from mapvote.cli import app
 
 
 def typed(*words: object, code: int = 0, **environment: str) -> str:
-    """All that the program says to these words, and ends with this code; errors are raised as the program raises them."""
+    """All that the program says to these words, ending with this code; errors are raised as the program raises them."""
     return _run(words, code, environment).output
 
 
