@@ -75,14 +75,8 @@ def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: 
         f"{p['votes_median']:g} votes for it, {p['against_median']:g} against"
     )
     (x0, y0), (x1, y1) = p["box"]
-    return cut_out(
-        f"{kind} at {0.5 * (x0 + x1):.0f}, {0.5 * (y0 + y1):.0f}",
-        facts,
-        (x0, y0, x1, y1),
-        p["height_m"],
-        tiles,
-        lattice,
-    )
+    name = f"{kind} at {0.5 * (x0 + x1):.0f}, {0.5 * (y0 + y1):.0f}"
+    return cut_out(name, facts, (x0, y0, x1, y1), p["height_m"], tiles, lattice)
 
 
 def fragment(cutouts: Sequence[Cutout]) -> str:

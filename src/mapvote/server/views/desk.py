@@ -127,13 +127,7 @@ def verdict_of(review: Review) -> dict[str, Any]:
 
 
 def _verdict_json(review: Review) -> dict[str, Any]:
-    return {
-        "seq": review.seq,
-        "verdict": review.verdict,
-        "by": review.by,
-        "comment": review.comment,
-        "at_ns": review.at_ns,
-    }
+    return {name: getattr(review, name) for name in ("seq", "verdict", "by", "comment", "at_ns")}
 
 
 def _tile(store: Store, version: int, index: TileIndex) -> Tile:

@@ -71,16 +71,6 @@ class Measure:
     """Half width of the one-sided 95 % confidence bound of ``gain``, over blocks of neighbouring scans."""
     tolerance: float
 
-    @property
-    def worse(self) -> bool:
-        """The measured loss is larger than tolerated."""
-        return self.gain < -self.tolerance
-
-    @property
-    def surely_good(self) -> bool:
-        """Even the lower bound is within the tolerance."""
-        return self.gain - self.uncertainty >= -self.tolerance
-
     def __str__(self) -> str:
         return (
             f"{self.name} {self.old:.3f} -> {self.new:.3f} "
@@ -180,11 +170,11 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
 
 
 def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, list[str]]:
-    """hold if any figure is worse than tolerated; pass if none can be; else abstain."""
-    worse = [str(m) for m in measures if m.worse]
+    """hold if any figure is worse than tolerated; pass if none can be, even at its lower bound; else abstain."""
+    worse = [str(m) for m in measures if m.gain < -m.tolerance]
     if worse:
         return "hold", [f"vehicles would localise worse: {text}" for text in worse]
-    unsure = [str(m) for m in measures if not m.surely_good]
+    unsure = [str(m) for m in measures if not m.gain - m.uncertainty >= -m.tolerance]
     if unsure:
         return "abstain", [f"the scans leave open whether this got worse: {text}" for text in unsure]
     return "pass", [str(m) for m in measures]
