@@ -122,6 +122,16 @@ def test_a_wall_that_went_shows_what_stands_behind_it_and_one_that_stands_does_n
     assert not (rows[1] == CO).any()
 
 
+def test_free_space_is_told_of_columns_of_which_the_map_knows_none_and_never_of_mapped_voxels() -> None:
+    tile, known = town((WALL, HEIGHTS)).tiles[0, 0], np.zeros((TILE_CELLS, TILE_CELLS), np.uint64)
+    known[:, :105] = 0b10
+    free = after(make_map({(0, 0): replace(tile, free=known)}), standing_at(OLD_Y)).free
+    assert free is not None
+    assert [bool(free[ROW + 5, c]) for c in (100, 110)] == [False, True]
+    assert not (free & tile.obstacle_words).any()
+    assert free[ROW, 110], "beside and above the wall"
+
+
 def test_what_some_rays_crossed_goes_with_its_wall_and_what_few_scans_or_no_ray_crossed_does_not() -> None:
     def half_unseen(but: int) -> Callable[[int, U64], None]:
         """Half of the wall is out of sight in all scans but the first ones."""
