@@ -127,6 +127,7 @@ def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(store: Store, r
         heard: list[tuple[dict[str, str], bytes]] = []
         while len(heard) < posts or (posts == 0 and not known()):
             await asyncio.sleep(0.02)
+            assert not task.done(), task
             if not receiver[1].empty():
                 heard.append(receiver[1].get())
         while posts and known()[0] < newest_event(store):
