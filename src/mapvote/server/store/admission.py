@@ -159,7 +159,7 @@ class Intake:
         self._used: dict[str, _Used] = {}
         self._newest, self._tiles = 0, dict[TileIndex, TileHashes]()
         """The newest version, and its tiles."""
-        self._policy, self._asked = 0, RoundPolicy()
+        self._policy, self._asked, self._cast_by = 0, RoundPolicy(), ""
         """Number of the policy, and what it asks of a round's ballots."""
         self._lowest_m: dict[str, float] = {}
         """Lowest ground of a tile, by its plane's hash."""
@@ -210,6 +210,7 @@ class Intake:
         """Read what has changed of the map and the policy since the last ballots."""
         if policy != self._policy:
             self._policy, self._asked = policy, policy_in(connection).round
+            self._cast_by = self._asked.cast_by
         if newest != self._newest:
             touched = tiles_set_between(connection, self._newest, newest) if self._newest else None
             for index in touched or ():
@@ -220,9 +221,9 @@ class Intake:
     def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
         ballot, newest, asked = one.ballot, self._newest, self._asked
-        if asked.cast_by != one.cast_by or not ballot.settings_hash.startswith(asked.settings_hash):
+        if self._cast_by != one.cast_by or not ballot.settings_hash.startswith(asked.settings_hash):
             theirs = f"{one.cast_by}, settings {ballot.settings_hash[:16]}"
-            ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
+            ours = f"{self._cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
             mend = "vote again with the fleet's configuration (mapvote config)"
             return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
         if ballot.map_id != self._store.map_id:
