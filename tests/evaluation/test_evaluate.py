@@ -14,6 +14,7 @@ from msgspec.structs import asdict
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
+from mapvote.formats import read_map
 from mapvote_lab.evaluation import tables
 from mapvote_lab.evaluation.cases import choose_cases
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, running_server
@@ -66,13 +67,10 @@ def test_a_second_run_comes_from_the_cache_and_says_the_same(corner: Evaluation,
     assert not {"simulating", "mapping"} & set(stages)
 
 
-def test_one_stage_costs_more_bytes_than_two(corner: Evaluation) -> None:
+def test_one_stage_costs_more_bytes_than_two_and_surfaces_find_what_changed(corner: Evaluation) -> None:
     cases = corner.result.cases
     assert min(cases["3"].state_bytes_per_vehicle or [0]) > 5 * max(cases["1"].state_bytes_per_vehicle or [0]) > 0
-
-
-def test_surfaces_find_what_changed(corner: Evaluation) -> None:
-    surfaces = corner.result.cases["surfaces"]
+    surfaces = cases["surfaces"]
     assert all(surfaces.objects.found)
     assert surfaces.map is not None
     assert surfaces.map.stale_deleted > 0.5
@@ -145,14 +143,7 @@ def test_a_recorded_street_is_mapped_and_voted_on_by_the_same_drive(tmp_path: Pa
     assert 2 * found > of > 6, "most of what was cast into the scans is found"
     html = (tmp_path / "out" / "report.html").read_text()
     assert html.count("data:image/png;base64,") == 3
-    assert mapvote_map_points(tmp_path / "out" / "map") > 10_000
-
-
-def mapvote_map_points(folder: Path) -> int:
-    from mapvote.core.point_map import all_points
-    from mapvote.formats import read_map
-
-    return len(all_points(read_map(folder)))
+    assert read_map(tmp_path / "out" / "map").n_points > 10_000
 
 
 @pytest.mark.slow

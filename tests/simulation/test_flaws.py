@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64
-from mapvote_lab.simulation import shapes, simulate
+from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.drives import _stage
 from mapvote_lab.simulation.flaws import PULSE_M, Hits, Kinds, chance_of, mixed, spoil
 from mapvote_lab.simulation.lidar import Caster, Sweep, measure, sweep
@@ -18,7 +16,6 @@ from mapvote_lab.simulation.scenario import Flaws, load_scenario
 SENSOR = SENSORS["hdl32e"]
 NONE = Flaws(reflection_share=0, mixed_share=0, wet_share=0, glass_share=0, dark_share=0)
 WALL_X = 20.0
-FAST = {"speed_kmh": 100.0}
 
 
 def yard() -> tuple[Caster, Sweep, Hits]:
@@ -121,26 +118,3 @@ def test_wet_places_are_the_same_in_every_scan_and_others_with_another_seed() ->
     np.testing.assert_array_equal(first, again)
     assert abs(np.corrcoef(first, other)[0, 1]) < 0.05
     np.testing.assert_allclose(np.histogram(first, 10, (0, 1))[0] / len(first), 0.1, atol=0.02)
-
-
-@pytest.fixture(scope="module")
-def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("flawed") / "corner"
-    simulate(
-        "corner", out, seed=4, overrides={"surveys": ["east inner"], "vehicles": 1, "changes": [], "speed_kmh": 100.0}
-    )
-    return out
-
-
-def test_a_simulated_drive_has_reflections_below_the_road_by_default(corner: Path) -> None:
-    """As KITTI's drives: .07 % of the points."""
-    stage = _stage(load_scenario("corner", FAST), 4)
-    below, points = 0, 0
-    for i in range(0, 13, 3):
-        scan = np.fromfile(corner / f"survey_1/velodyne/{i:06d}.bin", "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
-        time_s = i / 10 - np.arctan2(scan[:, 1], scan[:, 0]) / (2 * np.pi) / 10
-        T = stage.routes[0].poses(time_s)
-        here = np.einsum("nij,nj->ni", T[:, :3, :3], scan) + T[:, :3, 3]
-        below += int((here[:, 2] < stage.world.terrain.height(here[:, 0], here[:, 1]) - 0.3).sum())
-        points += len(scan)
-    assert 0.0002 < below / points < 0.002

@@ -61,17 +61,6 @@ def test_a_placed_solid_is_turned_counter_clockwise_about_its_foot_and_then_move
     np.testing.assert_allclose(placed[1:], [[x, y, 0.5], [x, y, 2.5]])
 
 
-def test_leaves_fill_the_crown_and_leave_gaps() -> None:
-    rng = np.random.default_rng(1)
-    half = np.array([2.0, 1.5, 1.0])
-    leaves = shapes.foliage(rng, (2.0, 1.5, 1.0), 4.0, 500, 0.1)
-    centres = (leaves.mean(axis=1) - [0.0, 0.0, 4.0]) / half
-    assert len(leaves) == 500
-    assert np.linalg.norm(centres, axis=1).max() < 1.15
-    assert np.linalg.norm(centres, axis=1).min() > 0.3
-    assert area(leaves) < 0.5 * 4 * np.pi * 1.5**2, "rays pass between them"
-
-
 def test_samples_lie_on_the_surface_one_to_each_patch() -> None:
     solid = shapes.box(0, 4, 0, 3, 0, 2)
     points = shapes.sample(solid, 0.1, np.random.default_rng(3))
