@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.codec.arrays import zstd
+from mapvote.codec.planes import zstd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

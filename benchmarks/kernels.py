@@ -210,7 +210,7 @@ def _deskewed(points: Any, time_s: Any, v: Any, w: Any, out: Any) -> None:
 
 NUMPY: dict[str, Callable[..., object]] = {
     "codec.ballot._placed": _points_out,
-    "codec.sparse_columns._ascending": _words_out,
+    "codec.planes._ascending": _words_out,
     "core.columns._enter_cells": _flat_cells,
     "core.columns.mark_obstacles": _obstacles,
     "core.geometry._transform": _transformed,
@@ -222,10 +222,10 @@ NUMPY: dict[str, Callable[..., object]] = {
     "core.voxels._add": _summed,
     "core.voxels._enter_keys": _keys,
     "core.voxels._thin_keys": lambda points, every, size, keys: _keys(points[::every], 0.0, 0.0, size, keys),
-    "codec.sparse_columns.mark": _marked,
-    "codec.sparse_columns.mark_spoken": _marked_spoken,
-    "codec.sparse_columns.mark_among": _marked_among,
-    "codec.sparse_columns.agreeing": _agreeing,
+    "codec.planes.mark": _marked,
+    "codec.planes.mark_spoken": _marked_spoken,
+    "codec.planes.mark_among": _marked_among,
+    "codec.planes.agreeing": _agreeing,
     "localisation.prepare._deskew": _deskewed,
 }
 

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
-from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import Ballot, BallotTile, check_path, pack_odds, pack_points, tile_key, unpack_planes
-from mapvote.codec.sparse_columns import Words, mark, nothing_reached, pack_words
+from mapvote.codec.planes import Words, mark, nothing_reached, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mapvote.codec.arrays import zstd
+from mapvote.codec.planes import zstd
 
 ABSURD: tuple[Any, ...] = (
     None,

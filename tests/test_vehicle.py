@@ -21,7 +21,7 @@ from mapvote.codec.ballot import (
     unpack_sureness,
     unpack_tally,
 )
-from mapvote.codec.sparse_columns import unpack_sparse
+from mapvote.codec.planes import unpack_sparse
 from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import (
     Ballot,
     BallotTile,
@@ -19,7 +18,7 @@ from mapvote.codec.ballot import (
     pack_points,
     tile_key,
 )
-from mapvote.codec.sparse_columns import pack_words
+from mapvote.codec.planes import pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, Say, at_least, make_ballot, states_plane, two_walls, unpack_all, wall, words_plane
-from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane, zstd
 from mapvote.codec.ballot import (
     MOST_STEPS,
     STEPS_PER_NAT,
@@ -32,7 +31,16 @@ from mapvote.codec.ballot import (
     unpack_sureness,
 )
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.sparse_columns import Words, pack_words, unpack_sparse
+from mapvote.codec.planes import (
+    Words,
+    compress,
+    pack_plane,
+    pack_words,
+    unpack_bytes,
+    unpack_plane,
+    unpack_sparse,
+    zstd,
+)
 from mapvote.codec.tile_planes import pack_memory, unpack_memory_plane
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.tile import PLANES, Memory

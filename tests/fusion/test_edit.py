@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, Cell, make_map, make_tile, states_plane, wall, words_plane
-from mapvote.codec.sparse_columns import Words
+from mapvote.codec.planes import Words
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.reference import reference_window

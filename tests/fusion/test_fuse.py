@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from hand_made import SHAPE, Say, make_ballot, make_tile, states_plane, two_walls, wall, words_plane
 from mapvote.cli import app
 from mapvote.codec.ballot import Ballot, encode
-from mapvote.codec.sparse_columns import Words
+from mapvote.codec.planes import Words
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap

@@ -11,7 +11,7 @@ import pytest
 
 from hand_made import make_tile, states_plane, wall, words_plane
 from histories import held_by, say
-from mapvote.codec.sparse_columns import Words
+from mapvote.codec.planes import Words
 from mapvote.config import FuseSettings
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent

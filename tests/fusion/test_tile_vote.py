@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hand_made import Say, at_least, make_ballot, states_plane, two_walls, unpack_all, wall, words_plane
-from mapvote.codec.sparse_columns import Words, nothing_reached
+from mapvote.codec.planes import Words, nothing_reached
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState

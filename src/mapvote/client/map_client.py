@@ -20,9 +20,9 @@ from typing import Literal
 import msgspec
 
 from mapvote.client.connection import Connection, Refused, Unreachable
-from mapvote.codec.arrays import FRAME_HEAD, compress
 from mapvote.codec.ballot import Ballot, decode, encode, tile_index
 from mapvote.codec.manifest import Manifest, TileHashes
+from mapvote.codec.planes import FRAME_HEAD, compress
 from mapvote.codec.tile_planes import check_plane, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, made_in_turn

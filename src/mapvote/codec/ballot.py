@@ -15,8 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane
-from mapvote.codec.sparse_columns import Words, unpack_sparse
+from mapvote.codec.planes import Words, compress, pack_plane, unpack_bytes, unpack_plane, unpack_sparse
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, Bool, CellState, MapvoteError

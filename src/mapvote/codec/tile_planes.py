@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.tile import PLANES, Memory, Tile
 from mapvote.core.types import F32, U64, Bool, MapvoteError

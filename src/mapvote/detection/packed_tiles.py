@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.codec.planes import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.process_memory import give_back_free_pages

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.sparse_columns import Words, counted, nothing_reached, words_of
+from mapvote.codec.planes import Words, counted, nothing_reached, words_of
 from mapvote.core.columns import EVERY_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel

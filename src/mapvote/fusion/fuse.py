@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.ballot import Ballot, Odds, encode, tile_key, unpack_planes
-from mapvote.codec.sparse_columns import nothing_reached
+from mapvote.codec.planes import nothing_reached
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.codec.arrays import unpack_plane
 from mapvote.codec.ballot import UNSAID, Odds, changed_cells_of, in_nats, pack_odds
+from mapvote.codec.planes import unpack_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState

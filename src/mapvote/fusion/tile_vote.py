@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.ballot import Odds, Planes
-from mapvote.codec.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
+from mapvote.codec.planes import Words, agreeing, mark, mark_among, mark_spoken, union
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
@@ -80,7 +80,7 @@ class TileVote(Planes):
         return np.asarray(counts.any(axis=-1))
 
     def mark_passed(self, reached: U64) -> None:
-        """One more voter in ``reached`` (see :func:`mapvote.codec.sparse_columns.mark`): of the voxels that rays
+        """One more voter in ``reached`` (see :func:`mapvote.codec.planes.mark`): of the voxels that rays
         passed through, in cells with a vote."""
         assert self.free is not None
         if self.states is not None:

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.codec.ballot import Ballot, unpack_states, unpack_tally
+from mapvote.codec.planes import pack_plane, unpack_bytes
 from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingSettings
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, save_pcd, states_plane, wall
-from mapvote.codec.arrays import pack_plane
+from mapvote.codec.planes import pack_plane
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import LazyTiles, PointMap, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError

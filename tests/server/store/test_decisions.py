@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 
 from hand_made import Say, make_ballot, two_walls
 from histories import START_S, WALL, History, seen_along
-from mapvote.codec.arrays import unpack_bytes
+from mapvote.codec.planes import unpack_bytes
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import N_STATES, CellState

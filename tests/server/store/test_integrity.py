@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.arrays import unpack_bytes
+from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile

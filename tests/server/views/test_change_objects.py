@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mapvote.codec.arrays import pack_plane
+from mapvote.codec.planes import pack_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.tile import Tile

@@ -13,9 +13,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mapvote.codec.arrays import FRAME_HEAD, pack_plane, unpack_bytes
 from mapvote.codec.ballot import tile_index, tile_key
 from mapvote.codec.manifest import Manifest, TileHashes, digests_of, shown
+from mapvote.codec.planes import FRAME_HEAD, pack_plane, unpack_bytes
 from mapvote.codec.tile_planes import check_plane, pack_tile, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.point_map import LazyTiles, PointMap, in_memory_if_small

@@ -14,8 +14,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from mapvote.codec.arrays import compress
 from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import compress
 from mapvote.server.errors import NotFound
 from mapvote.server.http.schemas import (
     AS_CSV,

@@ -15,7 +15,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
-from mapvote.codec.arrays import unpack_bytes
+from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.server.http.schemas import (
     AS_CSV,

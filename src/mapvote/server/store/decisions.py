@@ -15,8 +15,8 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, raw_plane, unpack_bytes, unpack_plane
 from mapvote.codec.ballot import Odds
+from mapvote.codec.planes import compress, raw_plane, unpack_bytes, unpack_plane
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
 from mapvote.core.voting import VOTE_UNIT

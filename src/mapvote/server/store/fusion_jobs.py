@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import pack_plane
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile

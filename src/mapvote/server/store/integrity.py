@@ -13,8 +13,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.planes import compress, unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError

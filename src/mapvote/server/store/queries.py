@@ -8,9 +8,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mapvote.codec.arrays import FRAME_HEAD
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import FRAME_HEAD
 from mapvote.codec.tile_planes import (
     points_in_plane,
     unpack_memory_plane,
