@@ -21,6 +21,7 @@ from mapvote.core.types import F32, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.point_fields import point_times_s
 from mapvote.formats.geo.frame import MapFrame
+from mapvote.live.messages import blank_message, header_of, to_cdr
 
 N = 5
 STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * i for i in range(N)]
@@ -111,6 +112,17 @@ def test_broken_bags_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(MapvoteError, match=r"mapvote\[ros\]"):
         open_drive(tmp_path / "cut")
+
+
+def test_an_orientation_that_nobody_set_is_no_pose(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "bag")
+    bag.cloud("/points", "lidar", START, HALL)
+    message = blank_message("geometry_msgs/msg/PoseStamped", header=header_of(START, "map"))
+    bag.write_raw("/odom", "geometry_msgs/msg/PoseStamped", START, to_cdr("geometry_msgs/msg/PoseStamped", message))
+    bag.bag.close()
+    with pytest.raises(MapvoteError, match=r"/odom holds a quaternion of zeros, .*--prior TOPIC or --prior none"):
+        open_drive(tmp_path / "bag", sensor="hdl32e", prior="/odom")
+    assert len(open_drive(tmp_path / "bag", sensor="hdl32e")) == 1
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6, 1e-9])

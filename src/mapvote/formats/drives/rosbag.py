@@ -208,7 +208,7 @@ def _trajectory(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     for _, message in bag.messages(topic):
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         times.append(stamp_of(message))
-        poses.append(_matrix(pose.position, pose.orientation))
+        poses.append(_matrix(bag, topic, pose.position, pose.orientation))
     stacked = np.stack(poses) if poses else np.zeros((0, 4, 4))
     return sorted_trajectory(np.array(times, dtype=np.int64), stacked, of_vehicle=True, frame=MapFrame())
 
@@ -250,7 +250,7 @@ def static_frames(bag: Bag) -> Edges:
             continue
         for _, message in bag.messages(topic):
             for t in message.transforms:
-                T = _matrix(t.transform.translation, t.transform.rotation)
+                T = _matrix(bag, topic, t.transform.translation, t.transform.rotation)
                 parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
                 edges.setdefault(parent, []).append((child, T))
                 edges.setdefault(child, []).append((parent, geometry.inverse(T)))
@@ -277,6 +277,11 @@ def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:
     return ""
 
 
-def _matrix(p: Any, q: Any) -> F64:
+def _matrix(bag: Bag, topic: str, p: Any, q: Any) -> F64:
+    if not np.any([q.x, q.y, q.z, q.w]):
+        raise MapvoteError(
+            f"{bag.path}: {topic} holds a quaternion of zeros, which is no rotation: mend who writes it, or choose "
+            f"another topic (poses: --prior TOPIC or --prior none; LiDARs: --topic)"
+        )
     rotation = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w])
     return geometry.poses_at([[p.x, p.y, p.z]], rotation.as_matrix())[0]
