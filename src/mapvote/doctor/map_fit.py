@@ -202,7 +202,7 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
             found = [refine(ndt_map, clouds, start).T_map_lidar for start in starts]
             fits.append(max(fitness(ndt_map, clouds, T, len(clouds) - 1) for T in found))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
-        peaks.append(_SCALES[best] + _FINER * _peak(fits[best - 1], fits[best], fits[best + 1]))
+        peaks.append(_SCALES[best] + _FINER * peak_of(fits[best - 1], fits[best], fits[best + 1]))
     scale = float(np.median(peaks))
     off = np.abs(np.array(peaks) - scale)
     if (off > 0.5 * _FINER).mean() > 0.5:
@@ -315,7 +315,7 @@ def _known(ndt_map: NdtMap, points: F64, T: F64) -> float:
     return float(columns[cells[inside, 0], cells[inside, 1]].sum() / len(cells))
 
 
-def _peak(before: float, at: float, after: float) -> float:
+def peak_of(before: float, at: float, after: float) -> float:
     """Where the parabola through three values one step apart is highest, in steps, at most one."""
     bend = before - 2.0 * at + after
     return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend < 0 else float(np.sign(after - before))
