@@ -58,12 +58,14 @@ def runs_of(T: F64) -> list[Run]:
     return [run_of(T, start, start + 31) for start in range(0, len(T) - 31, 31)]
 
 
-def evidence(T: F64, sigma_m: float, runs: list[Run] | None = None, chain: Run | None = None) -> DriveEvidence:
+def evidence(
+    T: F64, sigma_m: float, runs: list[Run] | None = None, chain: Run | None = None, sigma_deg: float = 1.0
+) -> DriveEvidence:
     """Of a drive whose scans show the motion of poses T (n, 4, 4), a tenth of a second apart."""
     stamps_ns = np.arange(len(T)) * 100_000_000
     nothing = Scan(0, np.zeros((0, 3), np.float32))
     e = DriveEvidence(
-        Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps_ns, lambda i: nothing, prior_sigma_m=sigma_m)
+        Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps_ns, lambda i: nothing, None, sigma_m, sigma_deg)
     )
     known = {"runs": runs or runs_of(T), "chain": chain or run_of(T, 0, len(T)), "road_below": ROAD}
     vars(e).update(known, looks={"turns": np.zeros(1)})
@@ -117,6 +119,8 @@ def test_a_prior_that_is_late_is_named_with_its_seconds_where_speed_and_heading_
     time = measure_time(prior, runs_of(np.stack(T)), np.arange(len(T)) * 100_000_000)
     (found,) = check_small(evidence(np.stack(T), 0.05), prior, time)
     assert (found.severity, found.what[:26]) == (severity, f"the prior is 0.{rows}0 s late (")
+    alone = f"the prior is 0.{rows}0 s late (+-0.00): so 0.00 m remain"
+    assert compared(prior, np.stack(T), sigma_m=0.05)[0].what.startswith(alone)
 
 
 def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:
@@ -173,6 +177,15 @@ def test_where_a_prior_stands_still_for_the_rest_of_the_drive_is_named(share: fl
     T = along(150.0, curved=True)
     held = np.minimum(np.arange(len(T)), int(share * len(T)))
     assert [f.what for f in compared(T[held], T) if f.severity == "error"] == [name]
+
+
+def test_a_prior_that_scatters_by_more_than_it_states_is_told_so() -> None:
+    T = along(150.0, curved=True)
+    scattered = T.copy()
+    scattered[:, :3, 3] += np.random.default_rng(1).normal(0.0, 0.2, (len(T), 3))
+    for sigma_m, told in ((0.02, True), (0.5, False)):
+        found = compare(evidence(T, sigma_m, sigma_deg=0.1), scattered)[0]
+        assert any(f"prior_sigma_m says {sigma_m}" in f.what for f in found) == told, found
 
 
 def test_of_two_faults_at_once_both_are_named_and_mended() -> None:
