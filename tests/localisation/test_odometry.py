@@ -13,6 +13,7 @@ from mapvote.core.types import F64, PosePrior, Registration, Scan
 from mapvote.localisation.ndt import refine
 from mapvote.localisation.ndt_map import MapWindow, NdtMap
 from mapvote.localisation.odometry import Tracker, _differ
+from mapvote.localisation.prepare import Sample
 from streets import path, street, sweep, twist_of
 
 SETTINGS = NdtSettings()
@@ -116,6 +117,8 @@ def elsewhere() -> Tracker:
 def test_a_vehicle_of_which_nothing_is_known_is_looked_for_at_the_origin_or_where_it_is_told_to_be() -> None:
     assert first_look(elsewhere(), TENTH) == [0.0, 0.0, 0.0]
     assert first_look(elsewhere(), TENTH, at(7.0)) == [7.0, 0.0, 1.8]
+    reaches = [elsewhere()._seed(TENTH, told)[1] for told in (None, at(7.0, 0.5), at(7.0, 3.0))]
+    assert reaches == [10.0, 1.0, 6.0], "as far as the search goes, or two sigmas of the prior"
 
 
 STANDS = np.zeros(6)
@@ -253,6 +256,12 @@ def test_on_a_first_scan_the_speed_is_found_by_how_the_scan_is_bent(tracker: Tra
     assert fix.trusted
     assert tracker.twist.tolist() == [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], "of the speeds tried, every 2.5 m/s"
     assert off(fix.registration.T_map_lidar, 0) < 0.04
+
+
+def test_where_a_vehicle_was_is_where_each_speed_is_tried_from(tracker: Tracker) -> None:
+    tracker.move_to(POSES[3], 4 * TENTH)
+    around = tracker.map_around(POSES[3][:3, 3])
+    assert tracker.guess_motion(around, 5 * TENTH, Sample(scan(4)), np.eye(4))[0] == 10.0
 
 
 def test_a_scan_without_times_is_taken_as_it_is(tracker: Tracker) -> None:
