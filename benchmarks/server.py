@@ -73,7 +73,7 @@ def pillars(tiles: list[TileIndex], cells: list[Cell]) -> PointMap:
 
 
 def typical_ballot(point_map: PointMap) -> Ballot:
-    """About 20 kB: eight tiles of states with noisy borders and a few new points, as after a 500 m drive."""
+    """About 24 kB: eight tiles of states with noisy borders and a few new points, as after a 500 m drive."""
     rng, says = np.random.default_rng(1), {}
     for tile in list(point_map.tiles)[:8]:
         states = states_plane(fill=CellState.UNCHANGED_EMPTY)
