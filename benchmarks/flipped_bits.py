@@ -123,7 +123,7 @@ def try_once(url: str, rng: random.Random, every_table: bool, expected: dict[Til
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
     parser.add_argument("--flips", type=int, default=100)
     parser.add_argument("--every-table", action="store_true")
