@@ -101,7 +101,9 @@ function refuse(error) {
 // ---- versions and the range between two of them
 
 function showVersions() {
-  const newest = state.manifest.version;
+  const newest = state.manifest.version, shown = `${newest} ${state.versions.length}`;
+  if ($("versions").dataset.shown === shown) return; // made anew, it would lose the focus and a question under way
+  $("versions").dataset.shown = shown;
   const item = (v) =>
     element("li", {}, [
       element("div", { className: "head" }, [
