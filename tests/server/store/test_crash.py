@@ -1,5 +1,4 @@
-"""kill -9 during ingest and publish loses nothing that was acknowledged, and a flipped bit hides nothing else: what
-benchmarks/crash.py and flipped_bits.py do at length."""
+"""kill -9 during ingest and publish loses nothing that was acknowledged: what benchmarks/crash.py does at length."""
 
 from __future__ import annotations
 
@@ -17,19 +16,13 @@ from postgres_cluster import programs
 ROOT = Path(__file__).parents[3]
 
 
-def bench(name: str, *more: str) -> str:
-    """What it prints; it ended with 0."""
-    command = [sys.executable, f"benchmarks/{name}.py", *more]
+def crash(kills: int, database: str) -> None:
+    command = [sys.executable, "benchmarks/crash.py", "--kills", str(kills), "--database", database]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def crash(kills: int, database: str) -> None:
-    told = bench("crash", "--kills", str(kills), "--database", database)
-    found = re.search(r"(\d+) acknowledged ballots, all there; (\d+) versions, all whole", told)
-    assert found, told
+    found = re.search(r"(\d+) acknowledged ballots, all there; (\d+) versions, all whole", done.stdout)
+    assert found, done.stdout
     assert int(found[1]) >= kills, "the server did nothing worth killing"
     assert int(found[2]) > 1
 
@@ -44,18 +37,6 @@ def test_twenty_kills(database: str) -> None:
     if database == "postgresql" and programs() is None:
         pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
     crash(20, database)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-def test_a_bit_flipped_anywhere_is_named_and_all_else_is_published(database: str) -> None:
-    if database == "postgresql" and programs() is None:
-        pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
-    assert "30 named, all else published after 30" in bench("flipped_bits", "--flips", "30", "--database", database)
-
-
-def test_a_bit_flipped_in_any_table_is_named() -> None:
-    bench("flipped_bits", "--flips", "6", "--every-table")
 
 
 def test_the_postgresql_of_the_tests_is_durable(postgres_url: str) -> None:
