@@ -161,3 +161,11 @@ def test_with_a_minimum_age_a_round_ends_when_the_next_vote_is_old_enough(
     clock.now += 60 * 10**9
     assert publish(store).deleted == 18
     assert store.versions()[-1].created_ns == clock.now
+
+
+def test_what_the_newest_version_edited_is_fused_again_for_votes_were_spent_there(make: Callable[..., Store]) -> None:
+    store = make()
+    for vehicle in "ab":
+        vote(store, [(0, 0), (0, 1)], vehicle)
+    assert publish(store).tiles == [(0, 0), (0, 1)]
+    assert [fused.index for fused in preview(store).fused] == [(0, 0), (0, 1)]
