@@ -148,6 +148,10 @@ def cell_with(bit: int, passes: tuple[int, int, int]) -> np.ndarray:
 
 
 @given(st.integers(1, TOP_BIT - 1), st.tuples(*[st.integers(0, FULL)] * 3))
+@example(1, (0, 2, 2))
+@example(2, (1, 2, 2))
+@example(TOP_BIT - 2, (2, 2, 1))
+@example(TOP_BIT - 1, (2, 2, 0))
 def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_three(
     bit: int, passes: tuple[int, int, int]
 ) -> None:

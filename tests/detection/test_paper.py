@@ -21,6 +21,7 @@ from mapvote.core.types import NO_VOTE, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.detection.paper import (
     BEGINS_ABOVE,
+    WITHOUT_MOVERS,
     WORDS,
     PaperVoter,
     cell_words,
@@ -38,14 +39,15 @@ SENSOR = SENSORS["hdl32e"]
 
 
 def one_cell(
-    n: int, sight: Sight, map_bits: int = 0, passed: int = 0, hit: int = 0, bottom_z: float = 0.5, far: int = 30
-) -> tuple[ScanView, Reference]:
-    """A window of one row in which only the last cell, ``far`` cells away, holds anything."""
-    grid = Grid(Lattice(), 0, 0, 1, far + 1)
+    n: int, sight: Sight, map_bits: int = 0, passed: int = 0, hit: int = 0, bottom_z: float = 0.5, far: int = 30,
+    row: int = 0,
+) -> tuple[ScanView, Reference]:  # fmt: skip
+    """A window in which only the last cell, ``far`` cells away in the last row, holds anything."""
+    grid = Grid(Lattice(), 0, 0, row + 1, far + 1)
 
     def plane(value: float, dtype: type, fill: float = 0) -> np.ndarray:
         out: np.ndarray = np.full(grid.shape, fill, dtype)
-        out[0, far] = value
+        out[row, far] = value
         return out
 
     view = ScanView(
@@ -76,7 +78,7 @@ def vote(
     states, weights = classify_paper(
         words, reference.counts > 0, voting, PaperSettings.model_validate({"occluded": "votes"} | read)
     )
-    return int(states[0, -1]), int(weights[0, -1])
+    return int(states[-1, -1]), int(weights[-1, -1])
 
 
 @pytest.mark.parametrize(
@@ -130,12 +132,12 @@ def test_case_5_skips_cells_whose_map_begins_above_the_view_at_that_range() -> N
 def test_a_map_begins_above_the_view_where_plain_trigonometry_says(
     origin: tuple[float, float, float], lean: tuple[float, float], bottom_z: float
 ) -> None:
-    view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=bottom_z, far=12)
+    view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=bottom_z, far=12, row=8)
     up = from_xyz_rpy(0, 0, 0, *lean, 0)[:3, 2]
-    away = np.array([12.5 * CELL_SIZE, 0.5 * CELL_SIZE, np.float32(bottom_z)]) - origin
+    away = np.array([12.5 * CELL_SIZE, 8.5 * CELL_SIZE, np.float32(bottom_z)]) - origin
     elevation = np.arcsin(np.clip(away @ up / np.linalg.norm(away), -1.0, 1.0))
     assume(abs(elevation - np.radians(SENSOR.fov_top_deg)) > 1e-4)
-    word = cell_words(view, reference, np.array(origin), SENSOR, up_map=up)[0, -1]
+    word = cell_words(view, reference, np.array(origin), SENSOR, up_map=up)[-1, -1]
     assert (word & BEGINS_ABOVE != 0) == (elevation > np.radians(SENSOR.fov_top_deg))
 
 
@@ -192,6 +194,14 @@ def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_cha
     assert not np.isin(states[1], (CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY)).any()
     assert weights[n < n_min].max() == VOTE_UNIT
     assert weights[n >= n_min].min() == 2 * VOTE_UNIT
+
+
+@pytest.mark.parametrize("sight", ["points", "cells", "farthest", "column"])
+def test_with_movers_removed_what_the_scan_without_them_saw_decides_as_the_scan_else_does(sight: Any) -> None:
+    removed, _ = reading_table(VotingSettings(), PaperSettings(movers="removed", line_of_sight=sight))
+    occlude, _ = reading_table(VotingSettings(), PaperSettings(movers="occlude", line_of_sight=sight))
+    words, seen = np.arange(WORDS), sum(1 << k for k in range(4, 9))
+    assert np.array_equal(removed, occlude[:, words & ~seen | (words >> WITHOUT_MOVERS & seen)])
 
 
 def observed() -> tuple[PointMap, Observation]:
