@@ -13,11 +13,11 @@ from hypothesis.extra.numpy import arrays
 
 from hand_made import Cell, make_map, make_tile, one_scan, states_plane, wall
 from mapvote.config import VotingSettings
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState
 from mapvote.detection.evidence import GONE_RAYS, HIT_REACH_M, SUPPORT
-from mapvote.detection.surfaces import LOOKS, MOST_CELLS, MOST_HEIGHT_M, SurfaceVoter, depths_m, log_odds, looks
+from mapvote.detection.surfaces import LOOKS, MOST_CELLS, MOST_HEIGHT_M, SurfaceVoter, blocks, depths_m, log_odds, looks
 from mapvote.detection.voter import TileVotes
 
 ROW, COLUMNS = 100, range(100, 112)
@@ -260,3 +260,10 @@ def test_a_deeper_surface_and_a_larger_thing_make_it_surer(looked: np.ndarray, d
     shallow = log_odds(states, low, np.array([0.0]))[0]
     assert shallow <= log_odds(states, low, np.array([deep]))[0]
     assert shallow <= log_odds(states, high, np.array([0.0]))[0]
+
+
+@given(st.sets(st.tuples(st.integers(-4, 4), st.integers(-4, 4)), max_size=20))
+def test_every_tile_is_judged_once_in_a_window_that_holds_it(tiles: set[tuple[int, int]]) -> None:
+    found = list(blocks(Lattice(), tiles))
+    assert sorted(tile for inner, _ in found for tile in inner) == sorted(tiles)
+    assert all(set(inner) <= set(window.tiles()) for inner, window in found)
