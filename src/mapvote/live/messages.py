@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.drives.rosbag import pose_of_message
 from mapvote.formats.extras import first_line, require
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -146,10 +147,8 @@ def pose_of(T: F64) -> Any:
 
 def matrix_of(position: Any, orientation: Any) -> F64:
     """T (4, 4) of a message's position and quaternion. MapvoteError if they are no pose."""
-    T, q = np.eye(4), orientation
+    q = orientation
     length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
     if not np.isfinite([length, position.x, position.y, position.z]).all() or length < 0.5:
         raise MapvoteError("numbers that are not finite, or a quaternion of zeros")
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = position.x, position.y, position.z
-    return T
+    return pose_of_message(position, orientation)

@@ -283,5 +283,11 @@ def _matrix(bag: Bag, topic: str, p: Any, q: Any) -> F64:
             f"{bag.path}: {topic} holds a quaternion of zeros, which is no rotation: mend who writes it, or choose "
             f"another topic (poses: --prior TOPIC or --prior none; LiDARs: --topic)"
         )
+    return pose_of_message(p, q)
+
+
+def pose_of_message(position: Any, orientation: Any) -> F64:
+    """T (4, 4) of a message's position, metres, and quaternion, which must not be zero."""
+    p, q = position, orientation
     rotation = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w])
     return geometry.poses_at([[p.x, p.y, p.z]], rotation.as_matrix())[0]
