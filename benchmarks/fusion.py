@@ -121,7 +121,7 @@ def numpy_tile(connection: sqlite3.Connection, tile: TileIndex) -> U8:
 
 
 def unpacked_words(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """(flat cells, words) of a mask or of free space, see codec/words.py."""
+    """(flat cells, words) of a mask or of free space, see codec/planes.py."""
     raw = np.frombuffer(zstd.decompress(data), np.uint8)
     n = len(raw) // 10
     ways = raw[:n].astype(np.int64) + 256 * raw[n : 2 * n].astype(np.int64)

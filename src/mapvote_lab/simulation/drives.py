@@ -52,9 +52,9 @@ def simulate(
 ) -> None:
     """Write the drive folders ``out``/survey_1.., ``out``/v1.. and ``out``/truth; ``out`` appears whole.
 
-    ``scenario`` is a name (:func:`mapvote_lab.simulation.scenario.names`) or a TOML file, ``overrides`` replace its
-    fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per core
-    for long drives). MapvoteError if ``out`` exists or the scenario is not valid.
+    ``scenario`` is a name (:func:`mapvote_lab.simulation.scenario.scenario_names`) or a TOML file, ``overrides``
+    replace its fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per
+    core for long drives). MapvoteError if ``out`` exists or the scenario is not valid.
     """
     out = Path(out)
     if out.exists():

@@ -151,7 +151,7 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
 
 
 def change_objects(changed: Sequence[ChangedCells], min_cells: int = 1, reach_m: float = REACH_M) -> list[ChangeObject]:
-    """Things over all tiles, see :func:`mapvote.server.views.geojson.group`; in order of their lowest, leftmost cell.
+    """Things over all tiles, see :func:`mapvote.server.views.outlines.group`; in order of their lowest, leftmost cell.
 
     The tiles may come in any order. Objects of fewer than ``min_cells`` cells are left out.
     """
