@@ -10,15 +10,17 @@ from threading import Barrier, Thread
 
 import numpy as np
 
-from hand_made import Say, make_ballot, two_walls, wall, words_plane
+from hand_made import Say, make_ballot, make_map, make_tile, wall, words_plane
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
+from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import Intake, Receipt, examine
-from mapvote.server.store.policy import Policy
+from mapvote.server.store.policy import KeepPolicy, Policy
 from mapvote.server.store.publish import publish
+from mapvote.server.store.retention import clear
 from mapvote.server.store.reviews import decide, undo
 from mapvote.server.store.rollback import replay, rollback
 from mapvote.server.store.store import Store
@@ -26,13 +28,19 @@ from mapvote.server.store.votes import withdraw
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 from stores import Clock
 
-WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
+WALL: list[Cell] = [(10, 10), (10, 11), (10, 12), (11, 10), (11, 11)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
+HEIGHTS = (0.05, 0.45, 0.75, 1.05)
 VEHICLES = ("a", "b", "c", "d", "e")
 OPEN = {"max_deleted_share": 1.0, "max_freed_share": 1.0}
 START_S = 1_700_000_000
 WAYS = ("north", "south")
 """That somebody drove who determined much besides, where nothing ever comes or goes."""
+
+
+def street() -> PointMap:
+    """The first map: one tile with the wall."""
+    return make_map({(0, 0): make_tile(wall(WALL, list(HEIGHTS)))})
 
 
 class History:
@@ -44,7 +52,7 @@ class History:
         self.store = make_store(self.clock)
         first = FuseSettings.model_validate(OPEN)
         self.policy(first)
-        walls = {cell: CellMap((0.05, 0.45, 0.75, 1.05)) for cell in WALL}
+        walls = {cell: CellMap(HEIGHTS) for cell in WALL}
         self.rules = Server(walls | {cell: CellMap() for cell in LAWN}, first)
         self.hashes = {1: self.store.tiles(1)[0, 0].points}
         self.drives = 0
@@ -67,7 +75,7 @@ class History:
         """So many steps; AssertionError, naming the step, at the first difference."""
         acts = [self.vote] * 8 + [self.round] * 8 + [self.publish] * 2 + [self.world] * 5
         acts += [self.again, self.back, self.take_out, self.other_policy, self.without, self.race]
-        acts += [self.review, self.let_go]
+        acts += [self.review, self.let_go, self.clear_away] + [self.part] * 3
         for step in range(steps):
             act = self.rng.choice(acts)
             self.clock.now += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S]) * 10**9
@@ -90,6 +98,20 @@ class History:
             self._cast(vehicle, f"d{self.drives}")
         self.publish()
 
+    def part(self) -> None:
+        """A cell of the wall goes in part, and what it leaves stands beside what is left of its neighbour."""
+        here, beside = self.rng.choice([((10, 10), (10, 11)), ((10, 11), (11, 10)), ((11, 11), (10, 12))])
+        mapped = self.rules.versions[self.rules.newest].cells
+        for vehicle in self.rng.sample(VEHICLES, 3):
+            self.drives += 1
+            gone = [self.rng.choice([0b1110, 0b0110, 0b1010, 0b1100, 0b0100, 0b1000]) for _ in range(2)]
+            says = {
+                here: Spoken(CE if mapped[here].stands() else UE, gone[0]),
+                beside: Spoken(UO if mapped[beside].stands() else UE, gone[1]),
+            }
+            self._send_and_tell(vehicle, f"d{self.drives}", self.rules.newest, says)
+        self.publish()
+
     def again(self) -> None:
         """A drive is sent once more, with other votes."""
         standing = [cast for cast in self.rules.casts if cast.gone_at is None]
@@ -106,17 +128,23 @@ class History:
         says = {c: say(rng, self.there[c], mapped[c], masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
         if not says:
             return
-        way = rng.choice(["", *self.ways])
+        self._send_and_tell(vehicle, drive, version, says, masks, has_free)
+
+    def _send_and_tell(
+        self, vehicle: str, drive: str, version: int, says: dict[Cell, Spoken], masks: bool = True, free: bool = False
+    ) -> None:
+        """A ballot to the store and to the rules, which must agree on whether it counts."""
+        rng, way = self.rng, self.rng.choice(["", *self.ways])
         states = seen_along(way, rng.choice([0, 0, 1]))
         for cell, spoken in says.items():
             states[cell] = spoken.state
         end_s = self._end_s(self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives)
         counts = bool(way) or self.rules.counts_anywhere(version, says)
-        if self._send(vehicle, drive, end_s, version, states, says, masks, has_free) != counts:
+        if self._send(vehicle, drive, end_s, version, states, says, masks, free) != counts:
             raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
         if counts:
             plane = states.tobytes()
-            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.now_s, 0, None, way, plane))
+            self.rules.vote(Cast(vehicle, drive, end_s, version, says, free, self.now_s, 0, None, way, plane))
 
     def _end_s(self, about: int) -> int:
         """A moment at which no drive has ended yet: of two that end at once the hashes decide."""
@@ -137,7 +165,7 @@ class History:
             free=words_plane({cell: s.free for cell, s in says.items()}) if has_free else None,
         )
         base = {(0, 0): self.hashes[version]}
-        ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=version)
+        ballot = make_ballot(street(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=version)
         (receipt,) = Intake(self.store).write([examine(encode(ballot))])
         assert isinstance(receipt, Receipt | Conflict), receipt
         return isinstance(receipt, Receipt)
@@ -174,8 +202,21 @@ class History:
     def back(self) -> None:
         if self.rules.newest > 1:
             to = self.rng.randint(1, self.rules.newest - 1)
+            if to < self.rules.oldest:
+                with suppress(NotFound):
+                    rollback(self.store, to)
+                    raise AssertionError(f"rolled back to version {to}, which was cleared away")
+                return
             rollback(self.store, to)
             self.rules.rollback(to, self.now_s)
+
+    def clear_away(self) -> None:
+        """Garbage is collected: all but the last versions, and ballots that can decide nothing more."""
+        keep = self.rng.choice([1, 2, 4])
+        self.store.set_policy(Policy(fuse=self.rules.settings, keep=KeepPolicy(versions=keep)))
+        clear(self.store, dry_run=False)
+        self.policy(self.rules.settings)
+        self.rules.clear_away(keep)
 
     def take_out(self) -> None:
         vehicle = self.rng.choice(VEHICLES)
@@ -242,7 +283,8 @@ def say(rng: random.Random, there: bool, mapped: CellMap, masks: bool, has_free:
     """Mostly the truth about a cell, as seen against what the map holds of it."""
     truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[mapped.stands(), there]
     state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
-    gone = rng.choice([0b1110, 0b0110, 0b0010, 0]) if masks and state in (CE, UO) and rng.random() < 0.7 else 0
+    marks = masks and state in (CE, UO) and rng.random() < 0.7
+    gone = rng.choice([0b1110, 0b0110, 0b0010, 0b1010, 0b1100, 0b0100, 0]) if marks else 0
     heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,)]) if state == CO else ()
     return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 

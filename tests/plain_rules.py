@@ -102,6 +102,8 @@ class Server:
     casts: list[Cast] = field(default_factory=list)
     reviews: list[Review] = field(default_factory=list)
     versions: dict[int, Version] = field(default_factory=dict)
+    oldest: int = 1
+    """The first version that was not cleared away."""
 
     def __post_init__(self) -> None:
         self.versions[1] = Version("import", dict(self.cells), False, 0, 0.0, self.settings)
@@ -163,12 +165,17 @@ class Server:
         cells = turned_back(before, target, number)
         self.versions[number] = Version("rollback", cells, target.knows_free, mark, now_s, target.settings, to)
 
+    def clear_away(self, keep: int) -> None:
+        """All but the last versions go; what they decided stays decided."""
+        self.event()
+        self.oldest = max(self.oldest, self.newest - keep + 1)
+
     def replay(self, vehicle: str, now_s: float) -> None:
-        """The map as if the vehicle had never voted."""
+        """The map as if the vehicle had never voted since the oldest version that is kept."""
         number = self.newest + 1
         out = {v.unvoted: n for n, v in self.versions.items() if v.kind == "replay"} | {vehicle: number}
-        again = {1: self.versions[1]}
-        for n in range(2, number):
+        again = {n: self.versions[n] for n in range(1, self.oldest + 1)}
+        for n in range(self.oldest + 1, number):
             again[n] = self._again(n, again, out)
         mark = self.event()
         ours, theirs = again[number - 1], self.versions[number - 1]
@@ -295,9 +302,8 @@ def fuse(
     stay = [
         (cell, layer)
         for cell, (state, says, *_) in decided.items()
-        if state != CE
         for layer in layers(before.cells[cell])
-        if layer and (state != UO or not (is_left(layer, says, quorum) or is_nearly_gone(layer, says, quorum)))
+        if layer and not (state in (CE, UO) and may_go(layer, state, says, quorum))
     ]
     for cell, held in before.cells.items():
         beside = {n for (r, c), n in stay if abs(r - cell[0]) <= 1 and abs(c - cell[1]) <= 1}
@@ -413,6 +419,11 @@ def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int, touched: 
         marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
         return sum(m >> layer & 1 for m in marks) >= quorum
     return is_nearly_gone(layer, says, quorum) or (layer not in touched and is_left(layer, says, quorum))
+
+
+def may_go(layer: int, state: int, says: dict[str, Spoken], quorum: int) -> bool:
+    """Whether a voxel goes if it touches nothing that stays."""
+    return goes(layer, state, says, quorum, set())
 
 
 def is_nearly_gone(layer: int, says: dict[str, Spoken], quorum: int) -> bool:

@@ -141,20 +141,45 @@ def test_what_touches_what_stays_goes_if_more_than_two_thirds_mark_it(marking: i
     assert of_standing([0b100] * marking + [0] * (of - marking), [0.45, 0.75]) == (0b100 if goes else 0)
 
 
-def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
-    twig, votes = wall([CELL], APART), says([0b1010] * 2 + [0], [UO] * 3)
-    for beside, other, stays in (
-        ((10, 11), UO, True),
-        ((11, 9), UO, True),
-        ((10, 12), UO, False),
-        ((10, 11), UN, True),
-        ((10, 11), CE, False),
-    ):
-        tile = make_tile(np.concatenate([twig, wall([beside], [0.75])]))
-        decided = states_plane({CELL: UO, beside: other})
-        words = words_gone(votes, decided, 2, tile)
-        assert words is not None
-        assert words[CELL] == (0 if stays else 0b1010)
+@pytest.mark.parametrize(
+    ("beside", "other", "gone_there", "stays"),
+    [
+        ((10, 11), UO, 0, True),
+        ((11, 9), UO, 0, True),
+        ((10, 12), UO, 0, False),
+        ((10, 11), UN, 0, True),
+        ((10, 11), CE, 0b100, False),
+        ((10, 11), CE, 0b1000, True),
+    ],
+)
+def test_a_voxel_that_stays_protects_what_touches_it_in_the_next_cell(
+    beside: Cell, other: int, gone_there: int, stays: bool
+) -> None:
+    """Two of three vehicles mark voxels of a cell that stands. Of a cell that is emptied only what the vehicles mark
+    goes; the rest stays, and protects its neighbours too."""
+    tile = make_tile(np.concatenate([wall([CELL], APART), wall([beside], [0.75])]))
+    masks, states = {CELL: 0b1010, beside: gone_there}, {CELL: UO, beside: other}
+    votes = [
+        TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(masks if i else {})))
+        for i in range(3)
+    ]
+    words = words_gone(votes, states_plane(states), 2, tile)
+    assert words is not None
+    assert words[CELL] == (0 if stays else 0b1010)
+
+
+def test_without_ground_any_mark_empties_the_column_so_that_nothing_of_it_protects() -> None:
+    beside, tile = (10, 11), make_tile(np.concatenate([wall([CELL], APART), wall([(10, 11)], [0.75])]))
+    bare = replace(tile, ground_z=np.full(SHAPE, np.nan, dtype=np.float32))
+    states = {CELL: UO, beside: CE}
+    marks = {CELL: 0b1010, beside: 0b1000}
+    votes = [
+        TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(marks if i else {})))
+        for i in range(3)
+    ]
+    words = words_gone(votes, states_plane(states), 2, bare)
+    assert words is not None
+    assert words[CELL] & bare.obstacle_words[CELL]
 
 
 @pytest.mark.parametrize("cell", [(0, 10), (TILE_CELLS - 1, 10), (10, 0), (10, TILE_CELLS - 1)])

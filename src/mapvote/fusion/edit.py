@@ -28,8 +28,7 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     Ground points are never deleted. In a tile without known ground, words have no agreed beginning, so any mark
     deletes the whole column.
     """
-    if not tile.has_ground:
-        gone = np.where(gone == 0, gone, EVERY_BIT)
+    gone = _deleted(gone, tile)
     ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
     flat, dropped = gone.reshape(-1), np.zeros(len(tile.points), dtype=np.bool_)
     asked = np.flatnonzero((flat != 0)[tile.cells])
@@ -136,6 +135,7 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
     In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied
     see :func:`_remnants`.
     """
+    # The voxels that leave the cells decided changed-empty.
     gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
     if len(emptied.cells):
         reached = nothing_reached(quorum, len(emptied.cells))
@@ -143,39 +143,49 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
             vote.mark_deleted(emptied, reached)
         gone = np.zeros(states.shape, dtype=np.uint64)
         gone.reshape(-1)[emptied.cells] = reached[-1]
-    stands = states == int(CellState.UNCHANGED_OCCUPIED)
-    left, standing = [vote.remnants(states) for vote in votes], Words.whole(stands)
+    # The voxels that leave cells that stand.
+    standing = Words.whole(states == int(CellState.UNCHANGED_OCCUPIED))
+    left = [vote.remnants(states) for vote in votes]
     # A mask in one stage only names what would be deleted.
     emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
     if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
         return gone
-    remnants = _remnants(left, emptied_by, votes, states != int(CellState.CHANGED_EMPTY), quorum, tile)
     gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
+    stays = tile.obstacle_words & ~_deleted(gone, tile)
+    remnants = _remnants(left, emptied_by, votes, stays, quorum, tile.base)
     gone.reshape(-1)[remnants.cells] |= remnants.words
     return gone
+
+
+def _deleted(gone: U64, tile: Tile) -> U64:
+    """(256, 256) the voxels that a delete mask takes: in a tile without known ground any mark takes the column."""
+    return gone if tile.has_ground else np.where(gone == 0, gone, EVERY_BIT)
 
 
 def _remnants(
     left: Sequence[Words],
     emptied_by: Sequence[Words],
     votes: Sequence[TileVote],
-    stays_in: Bool,
+    stays: U64,
     quorum: int,
-    tile: Tile,
+    base: I32,
 ) -> Words:
-    """What of cells that stand goes: the voxels that ``quorum`` vehicles or more, and more than half of those that
-    determined the cell, say are ``left`` of something, if they touch (26) nothing of the map that stays; and those that
-    more than two thirds, two at least, say are left or gone with the whole cell. What lies beyond the tile's edge stays
-    for all that is known here."""
+    """The voxels that leave cells that stand.
+
+    A voxel that ``quorum`` vehicles, and more than half of those that determined the cell, call ``left`` of something
+    goes if it touches (26) nothing that ``stays``. A voxel that more than two thirds, two at least, call left or gone
+    with the whole cell goes in any case. ``stays`` (256, 256): the map without what leaves other cells; a voxel that
+    half of the vehicles call left does not stay. Everything beyond the tile's edge stays.
+    """
     cells = np.unique(np.concatenate([found.cells for found in (*left, *emptied_by)]))
     halves = counted(cells, left)
     marks = halves + counted(cells, emptied_by)
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
     most = words_of((halves >= quorum) & (2 * halves > determined))
     nearly_all = words_of((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))
-    stays = np.where(stays_in, tile.obstacle_words, np.uint64(0))
+    stays = stays.copy()
     stays.reshape(-1)[cells] &= ~(most | nearly_all)
-    return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
+    return Words(cells, nearly_all | (most & ~_touched(cells, stays, base)))
 
 
 def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from numpy.typing import DTypeLike
 
 from hand_made import Say, make_ballot, two_walls
-from histories import START_S, WALL, History, seen_along
+from histories import START_S, WALL, History, seen_along, street
 from mapvote.codec.planes import unpack_bytes
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS
@@ -142,7 +142,7 @@ def heard_again(store: Store, connection: sa.Connection, version: Version) -> di
 
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow), 3])
 def test_the_records_of_a_random_history_say_what_fusing_it_again_finds(seed: int, tmp_path: Path) -> None:
-    history = History(seed, lambda clock: Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls(), clock=clock))
+    history = History(seed, lambda clock: Store.create(f"sqlite:///{tmp_path / 'store.db'}", street(), clock=clock))
     history.live(25)
     compared = 0
     with history.store.database.reading() as connection:

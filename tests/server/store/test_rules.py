@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from hand_made import two_walls
-from histories import START_S, live
+from histories import START_S, live, street
 from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
 from mapvote.fusion.distrust import Copy
@@ -32,7 +31,7 @@ MakeStore = Callable[[Clock], Store]
 def sqlite_stores(tmp_path: Path) -> MakeStore:
     """New stores, each a copy of one that was made once."""
     first, names = tmp_path / "first.db", itertools.count()
-    Store.create(f"sqlite:///{first}", two_walls(), clock=Clock(START_S * 10**9)).close()
+    Store.create(f"sqlite:///{first}", street(), clock=Clock(START_S * 10**9)).close()
     return lambda clock: Store.open(f"sqlite:///{shutil.copy(first, tmp_path / f'{next(names)}.db')}", clock=clock)
 
 
@@ -71,7 +70,7 @@ def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(500, 530))
 def test_store_and_rules_agree_on_postgresql(postgres_url: str, seed: int) -> None:
-    assert live(seed, lambda clock: Store.create(postgres_url, two_walls(), clock=clock), 25) is None
+    assert live(seed, lambda clock: Store.create(postgres_url, street(), clock=clock), 25) is None
 
 
 def test_the_rules_object_to_a_store_that_hears_copies(
