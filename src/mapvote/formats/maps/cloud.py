@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 
 log = logging.getLogger("mapvote.formats")
@@ -48,6 +48,11 @@ class Cloud:
     """The file's statement of its coordinates: they may be in feet or degrees still."""
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
+
+    def where(self, chosen: Bool) -> Cloud:
+        """Those of its points that are ``chosen`` (n,), with their fields."""
+        fields = {name: column[chosen] for name, column in self.fields.items()}
+        return replace(self, points=self.points[chosen], fields=fields)
 
 
 def full_scale(values: NDArray[Any]) -> float:

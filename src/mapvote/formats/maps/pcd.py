@@ -1,4 +1,4 @@
-"""PCD files (ascii, binary, binary_compressed) through pypcd4."""
+"""PCD files: ascii, binary and binary_compressed (LZF)."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ import os
 import re
 import struct
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO
 
+import lzf
 import numpy as np
 from numpy.typing import NDArray
-from pypcd4 import Encoding, MetaData, PointCloud
 
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of, warn_of_float32
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, log, table_of, warn_of_float32
+from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
 
 _BLOCK = 500_000
 """Points read at a time."""
 _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
+_MOST_EXPANDED = 300
+"""LZF writes at most 264 bytes for each 3."""
 _TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}\.pcd")
 
 
@@ -44,92 +47,180 @@ def read_pcd_table(path: Path) -> NDArray[np.void]:
 
     MapvoteError if the file is not a PCD, cut off, or says more points than it holds.
     """
-    with reading(path, "PCD file"):
-        table = np.atleast_1d(PointCloud.from_path(path).pc_data)
-        with path.open("rb") as file:
-            about = _header(file)
-            _check_count(path, len(table), about, _rest(file, about, skip=True))
-    return table
+    with reading(path, "PCD file"), path.open("rb") as file:
+        header = read_header(str(path), file)
+        tables = list(_tables(path, file, header))
+    return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
 def read_viewpoint(path: Path) -> F64:
     """tx ty tz qw qx qy qz (7,) of the header alone; no point is read."""
     with reading(path, "PCD file"), path.open("rb") as file:
-        return np.array(_header(file).viewpoint, dtype=np.float64)
-
-
-def _check_count(path: Path, found: int, about: MetaData, beyond: int = 0) -> None:
-    """``beyond``: bytes that follow the points that the header promises."""
-    if beyond >= about.build_dtype().itemsize:
-        more = beyond // about.build_dtype().itemsize
-        raise MapvoteError(
-            f"{path}: its header says {about.points} points, but data for {more} more follow; correct WIDTH, "
-            "HEIGHT and POINTS, or export it again"
-        )
-    if found != about.points:
-        raise MapvoteError(f"{path}: cut off: {found} points, but its header says {about.points}; copy it again")
+        return np.array(read_header(str(path), file).viewpoint, dtype=np.float64)
 
 
 def stream_pcd(path: Path) -> Iterator[Cloud]:
     """The points of a PCD file, piece by piece (binary_compressed, one block by its nature, in one); its VIEWPOINT is
-    not applied: map points are in map metres already. MapvoteError as :func:`read_pcd_table`."""
+    not applied: map points are in map metres already. MapvoteError as :func:`read_pcd_table`.
+
+    In an organised cloud a ray without return is NaN or (0, 0, 0); such rays are left out, with their number."""
     with reading(path, "PCD file"), path.open("rb") as file:
-        about = _header(file)
-        compressed = about.points and about.data == Encoding.BINARY_COMPRESSED
-        tables = iter([read_pcd_table(path)]) if compressed else _blocks(file, about)
-        found = 0
-        for table in tables:
-            found += len(table)
-            yield cloud_of_table(str(path), table)
-        _check_count(path, found, about, 0 if compressed else _rest(file, about))
+        header = read_header(str(path), file)
+        empty_rays = 0
+        for table in _tables(path, file, header):
+            cloud = cloud_of_table(str(path), table)
+            if header.is_organised:
+                measured = _measured(cloud.points)
+                empty_rays += int((~measured).sum())
+                cloud = cloud.where(measured)
+            yield cloud
+    if empty_rays:
+        what = "%s: an image of %d by %d rays; %d of them without return are left out"
+        log.warning(what, path, header.width, header.height, empty_rays)
 
 
-def _header(file: BinaryIO) -> MetaData:
-    """What the lines up to DATA say; the file is left where points begin."""
-    lines: list[str] = []
-    for raw in file:
-        line = raw.decode().strip()
-        if line and not line.startswith("#"):
-            lines.append(line)
-        if line.startswith("DATA") or len(lines) >= 10:
-            break
-    return MetaData.parse_header(lines)
+def _measured(points: NDArray[np.floating]) -> Bool:
+    """Which of the points (n, 3) are no rays without return."""
+    return np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
 
 
-def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
-    """The points that follow the header, ascii or binary; fewer than it says if the file is cut off."""
-    dtype, left = about.build_dtype(), about.points
-    if left <= 0:
-        yield np.empty(0, dtype=dtype)
+def _tables(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+    """The points that follow the header, block by block, their number checked; one empty block if there are none."""
+    if header.points == 0:
+        yield np.empty(0, header.layouts()[0])
+    elif header.encoding == "ascii":
+        yield from _ascii(path, file, header)
+    elif header.encoding == "binary":
+        yield from _binary(path, file, header)
+    else:
+        yield _compressed(path, file, header)
+        _check_end(path, header, _bytes_left(file))
+
+
+def _binary(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+    there = path.stat().st_size - file.tell()
+    sizes = {layout.itemsize * header.points: layout for layout in header.layouts()}
+    dtype = sizes.get(there, header.layouts()[0])
+    left = header.points
     while left > 0:
-        if about.data == Encoding.ASCII:
-            lines = list(islice(file, min(left, _BLOCK)))
-            table = np.atleast_1d(np.loadtxt(lines, dtype, delimiter=" ")) if lines else np.empty(0, dtype=dtype)
-        else:
-            raw = file.read(min(left, _BLOCK) * dtype.itemsize)
-            table = np.frombuffer(raw[: len(raw) // dtype.itemsize * dtype.itemsize], dtype=dtype)
-        if not len(table):
-            return
+        raw = file.read(min(left, _BLOCK) * dtype.itemsize)
+        table = np.frombuffer(raw[: len(raw) // dtype.itemsize * dtype.itemsize], dtype=dtype)
         left -= len(table)
+        if not len(table):
+            raise _cut_off(path, header.points - left, header)
         yield table
+    _check_end(path, header, _bytes_left(file) // dtype.itemsize)
 
 
-def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
-    """Bytes left of a file (of text, as many as its lines would be), a page of zeros at most not counted; ``skip``:
-    beyond the points that follow."""
-    if about.data == Encoding.ASCII:
-        lines = (line for line in file if line.strip())
-        return about.build_dtype().itemsize * sum(1 for _ in islice(lines, about.points if skip else 0, None))
-    if skip and about.data == Encoding.BINARY:
-        file.seek(about.points * about.build_dtype().itemsize, os.SEEK_CUR)
-    elif skip:
-        file.seek(struct.unpack("<I", file.read(8)[:4].ljust(4, b"\0"))[0], os.SEEK_CUR)
+def _ascii(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+    lines = _DataLines(file, header.lines)
+    rows = iter(lines)
+    first = next(rows, b"")
+    layouts = {_elements(layout): layout for layout in reversed(header.layouts())}
+    dtype = layouts.get(len(first.split()), header.layouts()[0])
+    left = header.points
+    rows = chain([first] if first else [], rows)
+    while left > 0:
+        block = list(islice(rows, min(left, _BLOCK)))
+        if not block:
+            raise _cut_off(path, header.points - left, header)
+        left -= len(block)
+        yield _parsed(f"{path}:{lines.number - len(block) + 1}", block, dtype)
+    _check_end(path, header, sum(1 for _ in rows))
+
+
+class _DataLines:
+    """The lines of an ascii file that hold something; ``number`` of the last one read."""
+
+    def __init__(self, file: BinaryIO, number: int) -> None:
+        self._file = file
+        self.number = number
+
+    def __iter__(self) -> Iterator[bytes]:
+        for line in self._file:
+            self.number += 1
+            if line.strip():
+                yield line.replace(b",", b" ")
+
+
+def _elements(dtype: np.dtype[np.void]) -> int:
+    """Numbers of one point."""
+    return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
+
+
+def _parsed(where: str, lines: list[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Lines of numbers as a table. Where a whole number is written "1.0" or "nan" it is read as PCL does: 1, 0.
+    MapvoteError names the first line that has too few or too many numbers, or something else."""
+    try:
+        return np.atleast_1d(np.loadtxt(lines, dtype, comments=None))
+    except (ValueError, OverflowError):
+        pass
+    width, rows = _elements(dtype), np.empty((len(lines), _elements(dtype)))
+    path, _, start = where.rpartition(":")
+    for number, line in enumerate(lines):
+        words = line.split()
+        try:
+            rows[number] = [float(word) for word in words] if len(words) == width else ()
+        except ValueError:
+            cause = f"{len(words)} values, but FIELDS and COUNT make {width}"
+            if len(words) == width:
+                cause = f"{line[:60].decode('utf-8', 'replace').strip()!r} is no row of numbers"
+            raise MapvoteError(f"{path}:{int(start) + number}: {cause}; correct the line, or export again") from None
+    table = np.empty(len(lines), dtype)
+    column = 0
+    for name in dtype.names or ():
+        shape = dtype[name].shape
+        values = rows[:, column : column + int(np.prod(shape))].reshape(len(lines), *shape)
+        column += int(np.prod(shape))
+        table[name] = values if dtype[name].base.kind == "f" else np.nan_to_num(values)
+    return table
+
+
+def _compressed(path: Path, file: BinaryIO, header: PcdHeader) -> NDArray[np.void]:
+    """The points of a binary_compressed file: LZF, field after field."""
+    packed_bytes, whole_bytes = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    layouts = {layout.itemsize * header.points: layout for layout in reversed(header.layouts())}
+    if whole_bytes not in layouts:
+        raise MapvoteError(
+            f"{path}: its data unpack to {whole_bytes} bytes, but its header says {header.points} points of "
+            f"{header.layouts()[0].itemsize} bytes; FIELDS, SIZE, COUNT or POINTS is wrong: export it again"
+        )
+    packed = file.read(packed_bytes)
+    if len(packed) < packed_bytes or whole_bytes > _MOST_EXPANDED * max(packed_bytes, 1):
+        raise MapvoteError(f"{path}: cut off: {len(packed)} of {packed_bytes} packed bytes; copy it again")
+    raw = lzf.decompress(packed, whole_bytes)
+    if raw is None or len(raw) != whole_bytes:
+        raise MapvoteError(f"{path}: its packed data are damaged; copy it again")
+    dtype = layouts[whole_bytes]
+    table = np.empty(header.points, dtype)
+    start = 0
+    for name in dtype.names or ():
+        table[name] = np.frombuffer(raw, dtype[name], header.points, start)
+        start += dtype[name].itemsize * header.points
+    return table
+
+
+def _bytes_left(file: BinaryIO) -> int:
+    """Bytes that follow, zeros that fill a page at most not counted."""
     start = file.tell()
     left = max(0, file.seek(0, os.SEEK_END) - start)
     if left > _PAGE:
         return left
     file.seek(start)
     return len(file.read().rstrip(b"\0"))
+
+
+def _cut_off(path: Path, there: int, header: PcdHeader) -> MapvoteError:
+    return MapvoteError(f"{path}: cut off: {there} points, but its header says {header.points}; copy it again")
+
+
+def _check_end(path: Path, header: PcdHeader, more: int) -> None:
+    """MapvoteError if the file holds ``more`` than its header says."""
+    if more > 0:
+        raise MapvoteError(
+            f"{path}: its header says {header.points} points, but data for {more} more follow; correct WIDTH, "
+            "HEIGHT and POINTS, or export it again"
+        )
 
 
 def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, double: bool = False) -> None:
@@ -150,9 +241,8 @@ def save_pcd(path: Path, cloud: Cloud | CloudPieces, xyz_type: type[np.floating]
     kinds = dict.fromkeys("xyz", np.dtype(xyz_type)) | dict(clouds.kinds)
     if "intensity" in kinds:
         kinds["intensity"] = np.dtype(np.float32)
-    columns = [np.empty(1, dtype=kind) for kind in kinds.values()]
-    one = PointCloud.from_points(columns, tuple(kinds), tuple(kind.type for kind in kinds.values())).metadata
+    dtype = np.dtype(list(kinds.items()))
     with path.open("wb") as stream:
-        stream.write(one.derive(points=clouds.n, width=clouds.n).compose_header(Encoding.BINARY).encode())
+        stream.write(compose_header(dtype, clouds.n))
         for piece in clouds:
             stream.write(table_of(piece, list(kinds.items())).tobytes())
