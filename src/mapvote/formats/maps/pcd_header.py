@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, Literal, cast
+from typing import BinaryIO, Literal
 
 import numpy as np
 
@@ -124,6 +124,8 @@ class _Lines:
             if not words or words[0].startswith("#"):
                 continue
             keyword = words[0].upper()
+            if keyword not in _KEYWORDS and "FIELDS" in self.entries and not (keyword.isascii() and keyword.isalpha()):
+                return  # points already: the line DATA is missing
             if keyword not in _KEYWORDS:
                 raise MapvoteError(
                     f"{self.where}:{self.number}: {words[0][:40]!r} is no line of a PCD header "
@@ -146,7 +148,7 @@ class _Lines:
             self._fields(),
             width,
             height,
-            cast("Encoding", encoding),
+            encoding,
             tuple(self._floats("VIEWPOINT", 7)) if "VIEWPOINT" in self.entries else _IDENTITY,
             number,
         )
