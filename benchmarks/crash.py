@@ -34,9 +34,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.store import schema
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from postgres_cluster import PostgresCluster, cluster_for
 
 POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)

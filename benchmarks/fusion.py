@@ -44,11 +44,11 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.store import database
-from mapvote.server.store.admission import Intake, Receipt, examine
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import preview, publish
-from mapvote.server.store.store import Store
+from mapvote_server.store import database
+from mapvote_server.store.admission import Intake, Receipt, examine
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import preview, publish
+from mapvote_server.store.store import Store
 from stores import send
 
 SHAPE = (256, 256)

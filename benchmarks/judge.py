@@ -36,8 +36,8 @@ from mapvote.core.geometry import inverse
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
-from mapvote.localisation.prepare import deskew, motion_at
-from mapvote.slam.build import build_map
+from mapvote.matching.prepare import deskew, motion_at
+from mapvote.survey.build import build_map
 from mapvote.vehicle import Vehicle
 
 WARM_UP = 25

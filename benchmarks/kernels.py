@@ -226,7 +226,7 @@ NUMPY: dict[str, Callable[..., object]] = {
     "codec.planes.mark_spoken": _marked_spoken,
     "codec.planes.mark_among": _marked_among,
     "codec.planes.agreeing": _agreeing,
-    "localisation.prepare._deskew": _deskewed,
+    "matching.prepare._deskew": _deskewed,
 }
 
 
@@ -238,8 +238,8 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
     from mapvote.fusion.change_time import lately_changed
     from mapvote.fusion.fuse import count
     from mapvote.fusion.tile_vote import TileVote
-    from mapvote.localisation.global_search import GlobalSearch
-    from mapvote.server.views.point_lod import make_levels
+    from mapvote.matching.global_search import GlobalSearch
+    from mapvote.shapes.packed_cloud import make_levels
 
     point_map, drive = (
         warmup.map_from_points(warmup._street(demolished=False)),

@@ -26,19 +26,19 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 DECIDING = [
     "core/voting", "core/ground", "fusion/fuse", "fusion/tile_vote", "fusion/edit", "fusion/distrust",
-    "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "detection/paper", "detection/evidence",
-    "detection/packed_tiles", "detection/surfaces", "perception/fans", "perception/raycast", "slam/clean_map",
-    "server/store/votes", "server/store/publish", "localisation/odometry", "localisation/pose_check",
+    "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "rules/paper", "rules/evidence",
+    "rules/packed_tiles", "rules/surfaces", "perception/fans", "perception/raycast", "survey/clean_map",
+    "mapvote_server/store/votes", "mapvote_server/store/publish", "matching/odometry", "matching/pose_check",
     "doctor/map_fit", "doctor/prior_fit", "formats/drives/trajectory", "formats/geo/units",
 ]  # fmt: skip
 TESTS = {
     **{m: "fusion/test_fuse.py fusion/test_rules_of_fusion.py" for m in DECIDING if m.startswith("fusion/")},
-    **{m: "detection" for m in DECIDING if m.startswith("detection/")},
+    **{m: "rules" for m in DECIDING if m.startswith("rules/")},
     "core/voting": "fusion/test_fuse.py",
     "fusion/fuse": "fusion/test_distrust.py fusion/test_rules_of_fusion.py",
     "perception/fans": "perception/test_raycast.py",
-    "server/store/votes": "server/store/test_rules.py server/store/test_store.py",
-    "server/store/publish": "server/store/test_publish_limits.py server/store/test_store.py server/views",
+    "mapvote_server/store/votes": "server/store/test_rules.py server/store/test_store.py",
+    "mapvote_server/store/publish": "server/store/test_publish_limits.py server/store/test_store.py server/questions",
     "doctor/map_fit": "doctor/test_drives.py",
     "doctor/prior_fit": "doctor/test_small.py",
     "formats/drives/trajectory": "formats/drives",
@@ -111,7 +111,8 @@ def run(house: Path, tests: str, cache: Path, limit_s: float) -> str:
 
 def try_module(house: Path, module: str, tests: str, share: int, seed: int, equal: set[tuple[str, str]]) -> float:
     """The share of a module's mutants that is killed; equal mutants do not count."""
-    file, common, cache = house / f"src/mapvote/{module}.py", house / "cache", house / "cache-of-mutant"
+    file = house / f"src/{module}.py" if module.startswith("mapvote_") else house / f"src/mapvote/{module}.py"
+    common, cache = house / "cache", house / "cache-of-mutant"
     source, began = file.read_text(), time.monotonic()
     assert run(house, tests, common, 900.0) == "survived", f"{module}: its tests fail without any change"
     limit_s = 60.0 + 4.0 * (time.monotonic() - began)
@@ -141,7 +142,7 @@ def main() -> None:
         house = Path(folder)
         for part in ("src", "tests", "pyproject.toml"):
             (shutil.copytree if (ROOT / part).is_dir() else shutil.copy2)(ROOT / part, house / part)
-        own = {m: "/test_".join(m.rsplit("/", 1)) + ".py" for m in asked.only}
+        own = {m: "/test_".join(m.removeprefix("mapvote_").rsplit("/", 1)) + ".py" for m in asked.only}
         tests = {m: f"{own[m] * (house / 'tests' / own[m]).exists()} {TESTS.get(m, '')}" for m in asked.only}
         killed = {m: try_module(house, m, tests[m], asked.mutants, asked.seed, equal) for m in asked.only}
     mean = sum(killed.values()) / len(killed)

@@ -26,9 +26,9 @@ from PIL import Image
 from chromium import Chromium
 from hand_made import make_map
 from live_server import serving
-from mapvote.server.store import keys
-from mapvote.server.store.store import Store
-from mapvote.server.views.history import changes_between, page_between
+from mapvote_server.questions.history import changes_between, page_between
+from mapvote_server.store import keys
+from mapvote_server.store.store import Store
 
 SHOWN = "performance.getEntriesByName('first-points').length > 0"
 LISTED = "document.querySelectorAll('#changes button').length > 0"

@@ -48,10 +48,10 @@ from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
-from mapvote.server.store import schema
-from mapvote.server.store.keys import ROLES, issue
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema
+from mapvote_server.store.keys import ROLES, issue
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from postgres_cluster import cluster_for
 from stores import send
 

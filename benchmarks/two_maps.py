@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from mapvote.comparison.cloud_changes import CloudChange, compare_cells, differences
-from mapvote.comparison.merge import merge_maps
-from mapvote.comparison.register import brought_into
+from mapvote.compare.cloud_changes import CloudChange, compare_cells, differences
+from mapvote.compare.merge import merge_maps
+from mapvote.compare.register import brought_into
 from mapvote.config import Settings, choose_case
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.fusion.fuse import states_over, update_map
-from mapvote.slam.build import build_map
+from mapvote.survey.build import build_map
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.scores import score_cells
 from mapvote_lab.evaluation.truths import Truth, lay_on, read_truth

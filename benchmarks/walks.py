@@ -37,11 +37,11 @@ from mapvote.core.types import CellState
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.fusion.fuse import fuse_tile
-from mapvote.server.http.app import URL, in_process
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.store import Store
-from mapvote.slam.build import build_map
+from mapvote.survey.build import build_map
 from mapvote.vehicle import Vehicle
+from mapvote_server.api.app import URL, in_process
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.store import Store
 from streets import drive_along, path, street
 
 SRC = str(Path(mapvote.__file__).parent) + "/"

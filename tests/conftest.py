@@ -10,7 +10,7 @@ import pytest
 
 if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
-    from mapvote.server.store.store import Store
+    from mapvote_server.store.store import Store
     from stores import NewStore
 
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def new_store(tmp_path: Path) -> Iterator[NewStore]:
     """Makes stores as ``Store.create`` does, in SQLite files named so, of two walls if nothing else is said."""
     from hand_made import two_walls
-    from mapvote.server.store.store import Store
+    from mapvote_server.store.store import Store
 
     made: list[Store] = []
 

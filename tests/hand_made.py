@@ -20,7 +20,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, PosePrior, Scan
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.localisation.odometry import Fix
+from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 

@@ -16,15 +16,15 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
-from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.admission import Intake, Receipt, examine
-from mapvote.server.store.policy import KeepPolicy, Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.retention import clear
-from mapvote.server.store.reviews import decide, undo
-from mapvote.server.store.rollback import replay, rollback
-from mapvote.server.store.store import Store
-from mapvote.server.store.votes import withdraw
+from mapvote_server.errors import Conflict, NotFound
+from mapvote_server.store.admission import Intake, Receipt, examine
+from mapvote_server.store.policy import KeepPolicy, Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.retention import clear
+from mapvote_server.store.reviews import decide, undo
+from mapvote_server.store.rollback import replay, rollback
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import withdraw
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 from stores import Clock
 

@@ -18,8 +18,9 @@ from unittest import mock
 import structlog
 
 from mapvote.config import load_with_sources
-from mapvote.server.http import serve
-from mapvote.server.store.store import Store
+from mapvote_server.api import serve
+from mapvote_server.gate import gate_by
+from mapvote_server.store.store import Store
 
 
 def mapvote(*arguments: object) -> list[str]:
@@ -69,7 +70,7 @@ def serving_here(store: Path, *, log: Path, settings: str = "") -> Iterator[str]
             servers.put(self)
 
     def run() -> None:
-        serve.serve(opened, read, port=0, opened=True, ready=addresses.put)
+        serve.serve(opened, read, port=0, opened=True, gate=gate_by(read.ndt), ready=addresses.put)
 
     thread = threading.Thread(target=run)
     with log.open("a") as written, mock.patch.object(serve, "_Server", Kept):

@@ -7,8 +7,8 @@ import pytest
 
 from hand_made import make_map, make_tile, wall
 from mapvote.core.point_map import PointMap
-from mapvote.detection import surfaces
-from mapvote.detection.voter import TileVotes, Voter
+from mapvote.rules import surfaces
+from mapvote.rules.voter import TileVotes, Voter
 
 
 def long_street() -> PointMap:

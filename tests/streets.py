@@ -11,7 +11,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.localisation.prepare import motion_at
+from mapvote.matching.prepare import motion_at
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 LENGTH_M = 45.0

@@ -10,8 +10,8 @@ from mapvote.core.point_map import map_from_points
 from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import Diagnosis
 from mapvote.plots import draw_diagnosis, draw_survey
-from mapvote.slam.build import BuildReport
-from mapvote.slam.pose_graph import DriveTrack
+from mapvote.survey.build import BuildReport
+from mapvote.survey.pose_graph import DriveTrack
 from streets import drive_along, path
 
 POSES = path(10)

@@ -29,7 +29,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, NO_VOTE, CellState, Drive, MapvoteError, PosePrior, Registration, Scan
 from mapvote.fusion.fuse import update_map
-from mapvote.localisation.odometry import Fix
+from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import DriveReport
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle
 from streets import vote_in_stretches

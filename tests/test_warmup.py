@@ -14,7 +14,7 @@ import mapvote
 from mapvote.core.ground import _grow
 from mapvote.core.voting import count_states
 from mapvote.fusion.distrust import contradicts, find_alike
-from mapvote.localisation.ndt import align
+from mapvote.matching.ndt import align
 from mapvote.perception.moving_objects import look
 from mapvote.warmup import warm_up
 from mapvote_lab.simulation import simulate

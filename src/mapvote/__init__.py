@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mapvote.formats import write_map as write_map
     from mapvote.formats.drives.point_fields import scan_from_point_cloud2 as scan_from_point_cloud2
     from mapvote.fusion.fuse import update_map as update_map
-    from mapvote.slam.build import build_map as build_map
+    from mapvote.survey.build import build_map as build_map
     from mapvote.vehicle import Vehicle as Vehicle
     from mapvote.vehicle import vote_drive as vote_drive
 
@@ -40,7 +40,7 @@ _HOME = {
     "Sensor": "core.sensors",
     "Settings": "config",
     "Vehicle": "vehicle",
-    "build_map": "slam.build",
+    "build_map": "survey.build",
     "load_settings": "config",
     "map_from_points": "core.point_map",
     "open_drive": "formats",

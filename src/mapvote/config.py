@@ -31,7 +31,7 @@ class Section(BaseModel):
 
 
 class NdtSettings(Section):
-    """When a scan's registration is sound (localisation/odometry.py)."""
+    """When a scan's registration is sound (matching/odometry.py)."""
 
     min_inlier_share: float = Field(
         default=0.5, description="abstain if fewer of the returns are inliers; scans at a wrong pose have about 0.4"
@@ -48,7 +48,7 @@ class MovingSettings(Section):
 
 
 class MappingSettings(Section):
-    """slam/build.py: NDT SLAM."""
+    """survey/build.py: NDT SLAM."""
 
     reach_m: float = Field(
         default=80.0, description="range limit of returns for the map and for the moving-object filter"
@@ -185,7 +185,7 @@ class FuseSettings(Section):
 
 
 class GateSettings(Section):
-    """server/views/localisation_gate.py: when a new version may be published, judged by a reference drive."""
+    """mapvote_server/gate.py: when a new version may be published, judged by a reference drive."""
 
     tolerance_found: float = Field(default=0.02, ge=0, description="allowed loss of the share of scans localised")
     tolerance_inlier_share: float = Field(default=0.01, ge=0, description="allowed loss of inlier share")

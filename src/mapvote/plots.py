@@ -22,7 +22,7 @@ from mapvote.formats.atomic import whole_file
 
 if TYPE_CHECKING:
     from mapvote.doctor.diagnosis import Diagnosis
-    from mapvote.slam.build import BuildReport
+    from mapvote.survey.build import BuildReport
 
 Format = Literal["png", "svg", "pdf"]
 FORMATS: tuple[Format, ...] = "png", "svg", "pdf"

@@ -27,11 +27,11 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
-from mapvote.detection.paper import PaperVoter
-from mapvote.detection.voter import NewPoints, TileVotes, Voter, points_in
-from mapvote.localisation.localiser import Localise, Localiser
+from mapvote.matching.localiser import Localise, Localiser
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
+from mapvote.rules.paper import PaperVoter
+from mapvote.rules.voter import NewPoints, TileVotes, Voter, points_in
 
 NOTHING = np.uint64(0)
 
@@ -187,7 +187,7 @@ class RoadDriven:
 def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
     """The voter that ``voting.method`` names."""
     if settings.voting.method == "surfaces":
-        from mapvote.detection.surfaces import SurfaceVoter  # brings half of scipy, which the paper's rule does without
+        from mapvote.rules.surfaces import SurfaceVoter  # brings half of scipy, which the paper's rule does without
 
         return SurfaceVoter(settings.voting, point_map)
     return PaperVoter(settings.voting, settings.paper, sensor, point_map)
@@ -242,7 +242,7 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
     kept, bright = offered(point_map, tile, np.where(came, votes.new, NOTHING), points)
     odds = None
     if two_stage and votes.looked is not None:
-        from mapvote.detection.surfaces import depths_m, log_odds  # brings scipy, as surfaces do
+        from mapvote.rules.surfaces import depths_m, log_odds  # brings scipy, as surfaces do
 
         changes = votes.states.reshape(-1)[changed_cells_of(votes.states)]
         depth_m = depths_m(votes.states, point_map.tiles.get(tile), kept)

@@ -24,14 +24,14 @@ from mapvote.core.process_memory import seldom_collecting
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan, read_only
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.doctor.maps import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
 from mapvote.formats.drives.point_fields import BadPoints, scan_from_fields, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
-from mapvote.localisation.localiser import GivenPoses
-from mapvote.slam.build import build_map
+from mapvote.matching.localiser import GivenPoses
+from mapvote.rules.packed_tiles import PackedTiles
+from mapvote.survey.build import build_map
 from mapvote.vehicle import vote_drive
 
 _SCANS = 14

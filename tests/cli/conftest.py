@@ -18,8 +18,8 @@ from mapvote.core.types import F64, CellState
 from mapvote.formats import read_map, write_pcd
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from stores import send
 
 TINY = """

@@ -17,8 +17,8 @@ from typer.main import get_command
 from live.loopback_dds import LOOPBACK, own_domain
 from live_server import mapvote
 from mapvote.cli import app
-from mapvote.server.store.store import Store
-from mapvote.server.views.history import last_events
+from mapvote_server.questions.history import last_events
+from mapvote_server.store.store import Store
 
 Desk = Callable[..., Path]
 
@@ -69,13 +69,13 @@ def slowed(verb_words: list[str], patch: str) -> list[str]:
 VERBS = {
     "info my_map": "import mapvote.formats.describe as m; m.describe = wait",
     "doctor MY_DRIVE": "import mapvote.doctor.diagnosis as m; m.diagnose = wait",
-    "build MY_DRIVE --out new": "import mapvote.slam.build as m; m.build_map = wait",
+    "build MY_DRIVE --out new": "import mapvote.survey.build as m; m.build_map = wait",
     "vote MY_DRIVE --map my_map --out new": "import mapvote.vehicle as m; m.vote_drive = wait",
     "update my_map car_1.ballot --out new": "import mapvote.fusion.fuse as m; m.update_map = wait",
     "import city.pcd new": "import mapvote.formats as m; m.map_of = wait",
     "export my_map new.pcd": "import mapvote.formats as m; m.export_map = wait",
-    "publish STORE": "import mapvote.server.store.publish as m; m.publish = wait",
-    "log STORE --out new": "import mapvote.server.views.history as m; m.changes_between = wait",
+    "publish STORE": "import mapvote_server.store.publish as m; m.publish = wait",
+    "log STORE --out new": "import mapvote_server.questions.history as m; m.changes_between = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
     "diff my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
     "merge my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
@@ -121,7 +121,7 @@ def test_ctrl_c_while_a_version_is_being_written_leaves_no_version(line: str, de
     """Its row is there by then, in a transaction that never ends."""
     here = desk("STORE")
     before = what_is_in(here / "STORE")
-    patch = "import mapvote.server.store.publish as m; m.set_tiles = wait"
+    patch = "import mapvote_server.store.publish as m; m.set_tiles = wait"
     done = interrupt(slowed(line.split(), patch), here, (here / "ready").exists)
     assert stopped_by_a_line(done)
     assert what_is_in(here / "STORE") == before

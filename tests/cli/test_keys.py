@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mapvote.cli.operate import keys, policy
-from mapvote.server.store.keys import ballots_standing, issue
-from mapvote.server.views.history import events_after, newest_event
+from mapvote_server.questions.history import events_after, newest_event
+from mapvote_server.store.keys import ballots_standing, issue
+from mapvote_server.verbs import keys, policy
 from stores import NewStore, vote_gone
 
 

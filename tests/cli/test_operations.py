@@ -20,7 +20,7 @@ from fresh_wheel import packed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.core.types import CellState
 from mapvote.formats import write_map
-from mapvote.server.store.store import Store
+from mapvote_server.store.store import Store
 from postgres_cluster import PostgresCluster, programs
 from stores import send
 

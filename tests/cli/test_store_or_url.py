@@ -17,9 +17,9 @@ from live_server import serving_here
 from mapvote.cli import app
 from mapvote.config import FuseSettings
 from mapvote.core.types import MapvoteError
-from mapvote.server.store import schema
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.store import Store
 from stores import WALL, NewStore, vote_gone
 
 

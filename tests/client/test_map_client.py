@@ -18,10 +18,10 @@ from mapvote.client import MapClient, Refused
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.http.app import create_app
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.api.app import create_app
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from stores import WALL, NewStore, vote_gone
 
 BALLOT = make_ballot(two_walls(), {(0, 0): Say(states_plane({(10, 10): CellState.UNCHANGED_OCCUPIED}))}, "a", "d1")

@@ -15,11 +15,12 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.core import geometry
 from mapvote.core.types import F64, CellState
-from mapvote.doctor.diagnosis import check_bag, check_ballot, check_store
+from mapvote.doctor.diagnosis import check_bag, check_ballot
 from mapvote.formats.drives.options import drive_options, mount_of
-from mapvote.server.store import schema
-from mapvote.server.store.keys import issue
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema
+from mapvote_server.store.keys import issue
+from mapvote_server.store.store import Store
+from mapvote_server.stores import check_store
 
 T_BASE_LIDAR = geometry.from_xyz_rpy(1.2, 0.0, 1.8, 0.01, 0.02, np.pi / 2)
 SAME, GONE = int(CellState.UNCHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)

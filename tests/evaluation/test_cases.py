@@ -13,7 +13,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.cases import as_paper, choose_cases
 from mapvote_lab.evaluation.scene import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapvote.config import Settings
-from mapvote.detection.paper import read, readings_of
+from mapvote.rules.paper import read, readings_of
 from mapvote_lab.evaluation.cases import choose_cases, decided, paper_cases, read_kept
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.scene import Scene, pass_folder

@@ -19,8 +19,8 @@ from mapvote.codec.ballot import encode, pack_path
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.next_pass import Witness, one_vote_short, stretches
-from mapvote.server.http.app import URL, in_process
-from mapvote.server.store.store import Store
+from mapvote_server.api.app import URL, in_process
+from mapvote_server.store.store import Store
 
 CO, CE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY
 SAID = st.sampled_from([*map(int, CellState), NO_VOTE])

@@ -16,8 +16,8 @@ from live_server import serving
 from mapvote.client import Manifest, MapClient, Unreachable
 from mapvote.config import FuseSettings
 from mapvote.live.road_map import RoadMap
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.store import Store
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.store import Store
 from stores import WALL, NewStore
 
 TILE_M = 76.8

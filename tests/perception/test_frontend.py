@@ -12,8 +12,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Bool, MapvoteError, PosePrior, Registration, Scan
-from mapvote.localisation.localiser import GivenPoses, Localise
-from mapvote.localisation.odometry import Fix
+from mapvote.matching.localiser import GivenPoses, Localise
+from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 

@@ -20,7 +20,7 @@ from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F32, F64, Bool, Reference
 from mapvote.formats import open_drive
 from mapvote.formats.drives.trajectory import read_poses
-from mapvote.localisation.prepare import deskew, motion_at
+from mapvote.matching.prepare import deskew, motion_at
 from mapvote.perception.fans import FANS, Rays, follow_rays
 from mapvote.perception.raycast import CLEARANCE_M, SECTORS, SKY_M, Sight, Sky, cast_rays, find_obstacles
 from mapvote_lab.simulation import simulate

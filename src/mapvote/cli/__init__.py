@@ -18,8 +18,8 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
     os.environ.setdefault(_threads, "1")
 
-from mapvote.cli import drives, files, live, operate, setup  # noqa: E402
-from mapvote.cli.options import DRIVE, MAP, SERVER, SETUP  # noqa: E402
+from mapvote.cli import drives, files, live, setup  # noqa: E402
+from mapvote.cli.options import DRIVE, MAP, SETUP  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
 
@@ -38,10 +38,6 @@ VERBS = {
         files.doctor,
     ),
     MAP: (files.import_map, files.export, files.info, files.update),
-    SERVER: (
-        operate.serve, operate.publish, operate.policy, operate.log, operate.explain, operate.coverage,
-        operate.rollback, operate.unvote, operate.check, operate.gc, operate.keys,
-    ),
     SETUP: (setup.config, setup.warmup),
 }  # fmt: skip
 """The verbs as ``mapvote --help`` lists them."""
@@ -49,7 +45,7 @@ for panel, verbs in VERBS.items():
     for verb in verbs:
         app.command(verb.__name__.removesuffix("_map"), rich_help_panel=panel)(verb)
 for other_package in entry_points(group="mapvote.verbs"):
-    # The laboratory (demo, simulate, evaluate) adds its verbs here; this package does not know of it.
+    # The server and the laboratory (demo, simulate, evaluate) add their verbs here; this package knows neither.
     other_package.load()(app)
 
 

@@ -10,11 +10,12 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, cast
 
-from mapvote.cli.terminal import complain, progress
+from mapvote.cli.terminal import progress
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from mapvote.doctor import Finding
     from mapvote.doctor.scans import Looking
     from mapvote.formats.maps.tiling import Look
-    from mapvote.server.store.store import Store
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -73,38 +73,31 @@ def api_at(
         with closing(Connection(name, key=key_in(key_file), timeout_s=600.0)) as server:
             yield server
         return
-    from mapvote.server.http.app import URL, in_process
-    from mapvote.server.views.localisation_gate import gate_by
-
-    gate = None if settings is None else gate_by(settings.ndt)
-    with (
-        opened_store(name) as store,
-        _errors_only(),
-        in_process(store, settings, owner=who(), gate=gate, executor=executor) as transport,
-    ):
-        try:
-            yield Connection(URL, name=name, attempts=1, timeout_s=None, transport=transport)
-        except KeyboardInterrupt:
-            complain("interrupted; what was not finished was not written")
-            os._exit(130)
+    with stores().api_of(name, settings, executor) as connection:
+        yield connection
 
 
-@contextmanager
-def _errors_only() -> Iterator[None]:
-    """The API logs every request, to stdout; a verb's stdout is its answer."""
-    import logging
+def stores() -> Stores:
+    """The package that opens stores; the entry point group ``mapvote.stores`` names it. MapvoteError if none is
+    installed."""
+    for entry in entry_points(group="mapvote.stores"):
+        return cast("Stores", entry.load())
+    raise MapvoteError("no installed package opens a STORE: pip install 'mapvote[server]', or name a server's URL")
 
-    import structlog
 
-    before = structlog.get_config()
-    structlog.configure(
-        wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-    )
-    try:
-        yield
-    finally:
-        structlog.configure(**before)
+class Stores(Protocol):
+    """The functions of :mod:`mapvote_server.stores` that verbs use; this package does not know of it."""
+
+    def api_of(
+        self, name: str, settings: Settings | None, executor: Executor | None
+    ) -> AbstractContextManager[Connection]:
+        """The HTTP API of a STORE within this process."""
+
+    def map_of_store(self, name: str, version: int | None) -> AbstractContextManager[PointMap]:
+        """The newest map of a STORE, or one version of it; its tiles are read while this is open."""
+
+    def findings_of(self, name: str) -> list[Finding]:
+        """Everything that is wrong with a STORE."""
 
 
 def client_of(url: str, key: str | None) -> MapClient:
@@ -145,8 +138,8 @@ def map_at(
     if region is not None:
         raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")
     if is_store(name):
-        with opened_store(name) as store:
-            yield store.point_map(version)
+        with stores().map_of_store(name, version) as newest:
+            yield newest
         return
     if version is not None:
         raise MapvoteError(f"{name}: only a store or a server has versions")
@@ -162,45 +155,6 @@ def region_in(text: str) -> Region:
     if not (x0 < x1 and y0 < y1):
         raise MapvoteError(f"--region {text}: is empty; give the lower left corner first, then the upper right")
     return x0, y0, x1, y1
-
-
-def store_url(name: str) -> str:
-    """The database URL of STORE on the command line. MapvoteError if it shows a password."""
-    from sqlalchemy.engine import make_url
-    from sqlalchemy.exc import ArgumentError
-
-    from mapvote.server.store.store import url_of
-
-    given = os.environ.get("MAPVOTE_STORE", "") if name == "-" else name
-    if not given:
-        raise MapvoteError("STORE is -, but MAPVOTE_STORE is not set")
-    if is_url(given):
-        raise MapvoteError(f"{given}: this is a server. Name the STORE (a file or a database) on the server's machine")
-    try:
-        password = make_url(url_of(given)).password
-    except ArgumentError:
-        raise MapvoteError("STORE is no database URL: postgresql+psycopg://USER@HOST/NAME") from None
-    if password is not None and name != "-":
-        mend = "set MAPVOTE_STORE to the URL and give - as STORE, or keep the password in ~/.pgpass"
-        raise MapvoteError(f"everybody on this machine can read a password on the command line: {mend}")
-    return url_of(given)
-
-
-def opened_store(name: str) -> closing[Store]:
-    """An existing store, closed at the end."""
-    from mapvote.server.store.store import Store
-
-    return closing(Store.open(store_url(name)))
-
-
-def who() -> str:
-    """The login name of the user of this machine, for a store's log."""
-    import getpass
-
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # no name for this number
-        return "operator"
 
 
 def when(stamp_ns: int) -> str:

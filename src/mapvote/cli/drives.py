@@ -17,12 +17,12 @@ from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot
-    from mapvote.comparison.cloud_changes import CloudChange
+    from mapvote.compare.cloud_changes import CloudChange
     from mapvote.config import Settings
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
     from mapvote.perception.frontend import DriveReport
-    from mapvote.slam.build import BuildReport
+    from mapvote.survey.build import BuildReport
 
 
 @with_drive_options
@@ -46,7 +46,7 @@ def build(
     """
     from mapvote.config import load_settings
     from mapvote.formats import open_drive, write_map
-    from mapvote.slam.build import build_map
+    from mapvote.survey.build import build_map
 
     if out.exists():
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
@@ -193,7 +193,7 @@ def vote(
 def _drive_once(
     drive: Drive, point_map: PointMap, settings: Settings, trust_prior: bool
 ) -> tuple[Ballot, DriveReport | None]:
-    from mapvote.localisation.localiser import GivenPoses
+    from mapvote.matching.localiser import GivenPoses
     from mapvote.vehicle import vote_drive
 
     localise = None
@@ -231,7 +231,7 @@ def _ballot_of_cloud(
 ) -> Ballot:
     """The ballot of a session's cloud; prints its registration and where it does not vote. It ended when the file
     was last changed."""
-    from mapvote.comparison.session_votes import vote_of_session
+    from mapvote.compare.session_votes import vote_of_session
     from mapvote.formats import read_map
     from mapvote.formats.drives.trajectory import read_poses
 
@@ -278,17 +278,17 @@ def diff(
     """
     import json
 
-    from mapvote.comparison.cloud_changes import (
+    from mapvote.compare.cloud_changes import (
         compare_cells,
         difference_geojson,
         difference_page,
         difference_rows,
         differences,
     )
-    from mapvote.comparison.register import brought_into
+    from mapvote.compare.register import brought_into
     from mapvote.formats import read_map
     from mapvote.formats.atomic import write_whole
-    from mapvote.server.views.geojson import as_csv
+    from mapvote.shapes.geojson import as_csv
 
     with waiting(f"reading {path_a} and {path_b}"):
         map_a, map_b = read_map(path_a), read_map(path_b)
@@ -336,7 +336,7 @@ def merge(
 
     mapvote merge north.laz south.laz --out town
     """
-    from mapvote.comparison.merge import merge_maps
+    from mapvote.compare.merge import merge_maps
     from mapvote.formats import read_map, write_map
 
     if out.exists():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, is_store, is_url, key_in, look_at_points, map_at, opened_store, sound_map, when
+from mapvote.cli.door import api_at, is_store, is_url, key_in, look_at_points, map_at, sound_map, stores, when
 from mapvote.cli.options import Config, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
 from mapvote.core.types import MapvoteError
@@ -101,7 +101,7 @@ def doctor(
     """
     from rich.console import Console
 
-    from mapvote.doctor.diagnosis import Diagnosis, check_store, diagnose
+    from mapvote.doctor.diagnosis import Diagnosis, diagnose
     from mapvote.formats import read_map
 
     if is_url(path):
@@ -111,8 +111,8 @@ def doctor(
         with waiting(f"reading {map_path}"):
             point_map = read_map(map_path)
     if is_store(path):
-        with opened_store(path) as store, waiting("reading every byte"):
-            diagnosis = Diagnosis(check_store(store))
+        with waiting("reading every byte"):
+            diagnosis = Diagnosis(stores().findings_of(path))
     else:
         with stages_that_vanish() as tell:
             diagnosis = diagnose(Path(path), drive_options, point_map, tell)
@@ -171,7 +171,7 @@ def import_map(
         wanted = frame_wanted(crs, projector)
         point_map, told = import_cloud(source, wanted, from_crs, folder_beside(out), look_at_points(str(source)))
     if clean:
-        from mapvote.slam.clean_map import without_lone_points
+        from mapvote.survey.clean_map import without_lone_points
 
         point_map, lone = without_lone_points(point_map)
         told = [*told, f"{lone} points above the ground dropped: they touch no other"]

@@ -6,11 +6,10 @@ where it was? A store: is every byte what it was, can anybody use it, is its new
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import scipy
@@ -29,9 +28,6 @@ from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_opti
 from mapvote.formats.drives.rosbag import CLOUD, GNSS, POSES, Bag, T_from, frame_id, is_rosbag, static_frames
 from mapvote.formats.registry import DRIVES
 
-if TYPE_CHECKING:
-    from mapvote.server.store.store import Store
-
 _LATE_S = 0.5
 """Between the stamp in a header and the receipt: more is another clock."""
 
@@ -41,10 +37,6 @@ _CHANGED = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
 _DETERMINED = (CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY, *_CHANGED)
 _MOST_CHANGED = 0.2
 _SIGMA_M = 0.15
-_MEND = "mapvote check STORE --mend --from BACKUP"
-_LISTED = 5
-"""Damaged records of one kind that are listed one by one."""
-_SIZES = "tiles", "ballots", "vehicles", "plane_bytes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,36 +235,3 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     if misfit_m is not None and sigma_m is not None and misfit_m > max(3.0 * sigma_m, 0.5):
         what = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
         yield Finding("warning", what, "measure the offset: mapvote doctor DRIVE --map MAP")
-
-
-def check_store(store: Store) -> list[Finding]:
-    """Everything that the doctor finds in an open store, errors first. Every byte is read."""
-    from mapvote.server.store.integrity import check
-    from mapvote.server.store.keys import listed
-    from mapvote.server.views.history import overview
-
-    damaged = check(store)
-    found = []
-    for kind, count in Counter(damage.kind for damage in damaged).items():
-        some = [damage for damage in damaged if damage.kind == kind][:_LISTED]
-        found += [Finding("error", f"damaged: {damage}", _MEND) for damage in some]
-        if count > _LISTED:
-            found.append(Finding("error", f"damaged: {count - _LISTED} more of the kind {kind}", _MEND))
-    glance = overview(store)
-    sizes = ", ".join(f"{glance[key]:,} {key.replace('_', ' ')}" for key in _SIZES)
-    found.append(Finding("note", f"version {glance['version']}: {sizes}"))
-    if glance["quarantined"]:
-        what = f"{glance['quarantined']} damaged things were set aside: their votes and tiles do not count"
-        found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
-    valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
-    if valid["operator"]:
-        roles = ", ".join(f"{count} {role}" for role, count in sorted(valid.items()))
-        found.append(Finding("note", f"keys: {roles}"))
-    else:
-        what = "no operator has a valid key: the server cannot be operated remotely"
-        found.append(Finding("warning", what, "mapvote keys STORE issue NAME --role operator"))
-    try:
-        newest = store.point_map()
-        return in_order([*found, *check_cloud(tile_by_tile(newest)), *check_map(newest)])
-    except MapvoteError as error:
-        return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])

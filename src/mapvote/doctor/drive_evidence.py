@@ -18,9 +18,9 @@ from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress
 from mapvote.doctor.scans import Looking, Looks
-from mapvote.localisation.ndt import fitness, likeliest, refine
-from mapvote.localisation.ndt_map import NdtMap
-from mapvote.localisation.prepare import thin_for_levels
+from mapvote.matching.ndt import fitness, likeliest, refine
+from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.prepare import thin_for_levels
 
 _UPS = {sign + axis: s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mapvote.comparison.register import register_maps
+from mapvote.compare.register import register_maps
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
@@ -24,11 +24,11 @@ from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Progress, Severity
 from mapvote.doctor.drive_evidence import find_road
 from mapvote.doctor.prior import Similarity, fit_similarity
-from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.ndt import fitness, likeliest, refine
-from mapvote.localisation.ndt_map import LEVELS, MapWindow, NdtMap
-from mapvote.localisation.pose_check import MIN_FIT, Judge
-from mapvote.localisation.prepare import deskew, motion_at, solid_sample, thin_for_levels
+from mapvote.matching.global_search import GlobalSearch
+from mapvote.matching.ndt import fitness, likeliest, refine
+from mapvote.matching.ndt_map import LEVELS, MapWindow, NdtMap
+from mapvote.matching.pose_check import MIN_FIT, Judge
+from mapvote.matching.prepare import deskew, motion_at, solid_sample, thin_for_levels
 
 Step = TypeVar("Step")
 _PLACES = 6
@@ -75,7 +75,7 @@ class Place:
     index: int
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map has too few points."""
+    """As :class:`mapvote.matching.pose_check.Verdict` has it; 0 where the map has too few points."""
     known: float
     """Share of the scan's points near which the map has anything, at the guess."""
 

@@ -27,7 +27,7 @@ from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.tiling import in_map_metres, map_of
-from mapvote.slam.clean_map import lone_points
+from mapvote.survey.clean_map import lone_points
 
 Pieces = Callable[[], Iterator[NDArray[np.floating]]]
 """The points (n, 3) of a map from the start, piece by piece: as often as it is called."""

@@ -38,7 +38,7 @@ from mapvote.doctor.prior import (
     scaled,
     turned,
 )
-from mapvote.slam.driven_road import wrong_attitude
+from mapvote.survey.driven_road import wrong_attitude
 
 _POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
 """Errors of a prior's pose against a chain: they weigh positions against rotations."""

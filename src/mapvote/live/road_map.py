@@ -21,7 +21,7 @@ from mapvote.core.grid import Lattice, TileIndex, window_around
 from mapvote.core.point_map import LazyTiles, PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
-from mapvote.localisation.ndt_map import tiles_within
+from mapvote.matching.ndt_map import tiles_within
 
 log = logging.getLogger("mapvote.live")
 KEPT_M = 300.0

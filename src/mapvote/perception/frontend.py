@@ -23,8 +23,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, PosePrior, Reference, Scan
-from mapvote.localisation.localiser import Localise
-from mapvote.localisation.odometry import Fix
+from mapvote.matching.localiser import Localise
+from mapvote.matching.odometry import Fix
 from mapvote.perception.raycast import ScanView, Sky, cast_rays, find_obstacles
 
 

@@ -26,7 +26,7 @@ from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, B
 from mapvote.core.voting import one_hot, plurality
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats.atomic import whole_folder
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.cases import Progress, paper_cases, untold
 from mapvote_lab.evaluation.scene import (

@@ -4,7 +4,7 @@ All of them are settings of the one rule. A vehicle casts a ballot by each; the 
 decided cells are scored.
 
 The other readings of the paper's open sentences (paper III-IV) need no drive again: the scans of a drive say one word a
-cell (detection/paper.py), which is kept over each scan's window. Every reading is then a look-up, with the product's
+cell (rules/paper.py), which is kept over each scan's window. Every reading is then a look-up, with the product's
 own tables, votes and verdicts (core/voting.py).
 """
 
@@ -27,9 +27,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteError
 from mapvote.core.voting import one_hot, plurality, to_wire
-from mapvote.detection.paper import read, reading_table, readings_of, sightings
 from mapvote.fusion.fuse import states_over, update_map
 from mapvote.perception.frontend import Observation
+from mapvote.rules.paper import read, reading_table, readings_of, sightings
 from mapvote_lab.evaluation.scores import Scores, score_cells
 from mapvote_lab.evaluation.truths import CaseOutcome, lay_on
 

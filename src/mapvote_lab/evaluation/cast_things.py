@@ -13,7 +13,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
-from mapvote.localisation.prepare import deskew, motion_at
+from mapvote.matching.prepare import deskew, motion_at
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.shapes import box, cylinder, hedge, join, place, sign
 

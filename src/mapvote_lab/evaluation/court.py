@@ -21,8 +21,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from mapvote.codec.ballot import Ballot
-from mapvote.comparison.cloud_changes import REACH_CELLS, CloudChange, Kind, planes_of
-from mapvote.comparison.session_votes import vote_of_session
+from mapvote.compare.cloud_changes import REACH_CELLS, CloudChange, Kind, planes_of
+from mapvote.compare.session_votes import vote_of_session
 from mapvote.config import Settings, choose_case
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points

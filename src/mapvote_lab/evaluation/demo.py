@@ -26,12 +26,10 @@ from mapvote.formats import open_drive, write_map
 from mapvote.formats.atomic import whole_file, write_whole
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.plots import NEW, UNSURE, save
-from mapvote.server.store.store import Store, url_of
-from mapvote.server.views.cutout import Cutout, fragment
-from mapvote.server.views.history import changes_between, cutouts_between
-from mapvote.slam.build import build_map
+from mapvote.shapes.cutout import Cutout, fragment
+from mapvote.survey.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation import figures, real_bench
 from mapvote_lab.evaluation.cases import Progress, choose_cases, untold
@@ -43,6 +41,8 @@ from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.simulation.processes import processes
+from mapvote_server.questions.history import changes_between, cutouts_between
+from mapvote_server.store.store import Store, url_of
 
 CASE = "surfaces"
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""

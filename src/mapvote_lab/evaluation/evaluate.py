@@ -28,9 +28,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, Drive, MapvoteError, PosePrior
 from mapvote.formats import read_map, write_map
 from mapvote.formats.atomic import whole_folder
-from mapvote.localisation.ndt_map import MapWindow
-from mapvote.localisation.odometry import Tracker
-from mapvote.slam.build import build_map
+from mapvote.matching.ndt_map import MapWindow
+from mapvote.matching.odometry import Tracker
+from mapvote.survey.build import build_map
 from mapvote_lab.evaluation.baselines import yardsticks
 from mapvote_lab.evaluation.cases import Case, Progress, fuse_case, read_kept, swept, untold
 from mapvote_lab.evaluation.scene import Pass, Scene, pass_folder, passes

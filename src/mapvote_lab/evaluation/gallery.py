@@ -15,7 +15,7 @@ from mapvote.core.geometry import transform
 from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, Bool, CellState
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation import figures
 from mapvote_lab.evaluation.baselines import heights_above_ground

@@ -18,7 +18,7 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
 from mapvote_lab.evaluation.cases import Case, Progress
 from mapvote_lab.evaluation.cast_things import Site, Thing, with_things

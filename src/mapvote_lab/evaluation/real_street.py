@@ -25,11 +25,11 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.formats.drives.options import parse_scans
-from mapvote.localisation.localiser import GivenPoses
+from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
-from mapvote.slam.build import BuildReport, build_map
+from mapvote.survey.build import BuildReport, build_map
 from mapvote_lab.evaluation.cases import Case, fuse_case
 from mapvote_lab.evaluation.scene import SharedPass
 from mapvote_lab.evaluation.scores import NEIGHBOURS, cells_with, determined, pieces, ratio

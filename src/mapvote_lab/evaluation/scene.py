@@ -35,13 +35,13 @@ from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import F64, Drive, PosePrior, Scan
 from mapvote.core.voxels import voxel_downsample
-from mapvote.detection.voter import NewPoints, Voter
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.formats.atomic import whole_file, whole_folder
-from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
+from mapvote.matching.localiser import GivenPoses, Localise, Localiser
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.slam.build import build_map
+from mapvote.rules.voter import NewPoints, Voter
+from mapvote.survey.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
 from mapvote_lab.evaluation.cases import Case, KeptDrive, Progress, Rule, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
@@ -51,7 +51,7 @@ from mapvote_lab.simulation.scenario import load_scenario
 
 _DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/scan_folder.py")
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
-_MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
+_MAP_FROM = ("core", "codec", "formats", "matching", "perception", "rules", "survey")
 BALLOTS_FROM = (
     *_MAP_FROM, "vehicle.py", "evaluation/scene.py",
     "evaluation/cases.py",

@@ -21,7 +21,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
 from mapvote.formats.describe import describe
 from mapvote.formats.maps.mapvote_folder import read_manifest
-from mapvote.server.store.store import Store
+from mapvote_server.store.store import Store
 
 
 def small_map(seed: int = 0, offset: tuple[float, float] = (0.0, 0.0)) -> PointMap:

@@ -18,9 +18,9 @@ from mapvote.codec.ballot import Ballot, Planes, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import TooMany
-from mapvote.server.http.schemas import refuse
-from mapvote.server.store.admission import (
+from mapvote_server.api.schemas import refuse
+from mapvote_server.errors import TooMany
+from mapvote_server.store.admission import (
     Incoming,
     Intake,
     Quota,
@@ -29,8 +29,8 @@ from mapvote.server.store.admission import (
     examine,
     refuse_out_of_reach,
 )
-from mapvote.server.store.database import Remembered
-from mapvote.server.store.store import Store
+from mapvote_server.store.database import Remembered
+from mapvote_server.store.store import Store
 from stores import Clock
 
 

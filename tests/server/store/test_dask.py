@@ -22,10 +22,10 @@ from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_w
 from live_server import mapvote
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.store import fusion_jobs, schema
-from mapvote.server.store.database import address_of
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.store import fusion_jobs, schema
+from mapvote_server.store.database import address_of
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from stores import send
 
 TILES = [(row, col) for row in range(2) for col in range(3)]

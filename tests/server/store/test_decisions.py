@@ -18,23 +18,15 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import N_STATES, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.decision_record import REASONS, Record, Standing, pack_tally, packed_cells, unpack_tally_plane
 from mapvote.fusion.fuse import decide_tile, rule_of
-from mapvote.server.store import schema
-from mapvote.server.store.decisions import (
-    REASONS,
-    Record,
-    Standing,
-    pack_tally,
-    packed_cells,
-    records_of,
-    unpack_tally_plane,
-)
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.queries import Version, oldest_kept, tile_as_of
-from mapvote.server.store.reviews import decide
-from mapvote.server.store.store import Store
-from mapvote.server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
+from mapvote_server.store import schema
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.queries import Version, oldest_kept, records_of, tile_as_of
+from mapvote_server.store.reviews import decide
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
 from stores import Clock, send
 
 HERE = (0, 0)

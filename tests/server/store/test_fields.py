@@ -27,15 +27,15 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import export_map, read_map
 from mapvote.fusion.fuse import update_map
-from mapvote.server.http.app import create_app
-from mapvote.server.store import schema
-from mapvote.server.store.integrity import check, restore_plane, set_aside
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.retention import clear
-from mapvote.server.store.rollback import replay, rollback
-from mapvote.server.store.store import Store
-from mapvote.server.views.history import overview
+from mapvote_server.api.app import create_app
+from mapvote_server.questions.history import overview
+from mapvote_server.store import schema
+from mapvote_server.store.integrity import check, restore_plane, set_aside
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.retention import clear
+from mapvote_server.store.rollback import replay, rollback
+from mapvote_server.store.store import Store
 from stores import send
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))

@@ -23,11 +23,11 @@ from mapvote.codec.tile_planes import unpack_points_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState
-from mapvote.server.store import schema
-from mapvote.server.store.integrity import check
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema
+from mapvote_server.store.integrity import check
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from postgres_cluster import PostgresCluster
 from stores import send
 

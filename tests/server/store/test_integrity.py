@@ -15,16 +15,16 @@ from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.errors import NotFound
-from mapvote.server.store import schema
-from mapvote.server.store.integrity import ballot_name, check, restore_plane, set_aside
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
-from mapvote.server.views.explain import evidence
-from mapvote.server.views.history import changes_between, last_events
-from mapvote.server.views.point_lod import Clouds
-from mapvote.server.views.vehicles import vehicle_standings
+from mapvote_server.errors import NotFound
+from mapvote_server.questions.clouds import Clouds
+from mapvote_server.questions.explain import evidence
+from mapvote_server.questions.history import changes_between, last_events
+from mapvote_server.questions.vehicles import vehicle_standings
+from mapvote_server.store import schema
+from mapvote_server.store.integrity import ballot_name, check, restore_plane, set_aside
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from stores import send
 
 CELL = (10, 10)

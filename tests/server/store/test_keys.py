@@ -10,12 +10,12 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import NotFound, Unauthorised
-from mapvote.server.store import keys
-from mapvote.server.store.admission import Intake, examine
-from mapvote.server.store.publish import publish
-from mapvote.server.store.rollback import replay
-from mapvote.server.store.store import Store
+from mapvote_server.errors import NotFound, Unauthorised
+from mapvote_server.store import keys
+from mapvote_server.store.admission import Intake, examine
+from mapvote_server.store.publish import publish
+from mapvote_server.store.rollback import replay
+from mapvote_server.store.store import Store
 from stores import Clock, send
 
 NOON = 1_700_000_000 * 10**9

@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 from hand_made import two_walls
 from mapvote.cli import app
 from mapvote.core.types import MapvoteError
-from mapvote.server.store import migrate, schema
-from mapvote.server.store.database import Database
-from mapvote.server.store.store import Store
+from mapvote_server.store import migrate, schema
+from mapvote_server.store.database import Database
+from mapvote_server.store.store import Store
 
 NEXT = """
 import sqlalchemy as sa

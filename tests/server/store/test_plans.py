@@ -12,11 +12,11 @@ import sqlalchemy as sa
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import Intake
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.store import Store
-from mapvote.server.views.history import changes_between
+from mapvote_server.questions.history import changes_between
+from mapvote_server.store.admission import Intake
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
 from stores import send
 
 LARGE = ("ballots", "ballot_tiles", "version_tiles", "blobs", "decisions", "events")

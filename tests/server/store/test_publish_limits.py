@@ -14,8 +14,8 @@ from scipy import ndimage
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import I64
-from mapvote.server.store.fusion_jobs import Fused
-from mapvote.server.store.publish import areas_m2, hold_reasons, lattice_cells
+from mapvote_server.store.fusion_jobs import Fused
+from mapvote_server.store.publish import areas_m2, hold_reasons, lattice_cells
 
 SETTINGS = FuseSettings(max_deleted_share=0.5, max_freed_share=0.25, max_change_m2=0.9)  # 0.9 m2 are ten cells
 NOTHING = Fused.nothing((0, 0), ())

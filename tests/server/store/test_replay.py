@@ -19,10 +19,10 @@ from mapvote.cli import app
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.publish import publish, write_version
-from mapvote.server.store.rollback import replay, rollback
-from mapvote.server.store.store import Store
+from mapvote_server.errors import Conflict, NotFound
+from mapvote_server.store.publish import publish, write_version
+from mapvote_server.store.rollback import replay, rollback
+from mapvote_server.store.store import Store
 from stores import send
 
 EMPTY, BUILT, KEEPS = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_OCCUPIED
@@ -130,7 +130,7 @@ def test_publishing_meanwhile_is_a_conflict(store: Store, monkeypatch: pytest.Mo
         rollback(store, 1)
         return write_version(*arguments, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("mapvote.server.store.rollback.write_version", late)
+    monkeypatch.setattr("mapvote_server.store.rollback.write_version", late)
     with pytest.raises(Conflict, match="somebody else"):
         replay(store, "liar", dry_run=False)
     assert store.versions()[-1].kind == "rollback"

@@ -13,15 +13,15 @@ from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import NotFound
-from mapvote.server.store import schema
-from mapvote.server.store.integrity import check
-from mapvote.server.store.policy import KeepPolicy, Policy
-from mapvote.server.store.publish import publish
-from mapvote.server.store.retention import clear
-from mapvote.server.store.rollback import replay, rollback
-from mapvote.server.store.store import Store
-from mapvote.server.views.explain import explain_cell
+from mapvote_server.errors import NotFound
+from mapvote_server.questions.explain import explain_cell
+from mapvote_server.store import schema
+from mapvote_server.store.integrity import check
+from mapvote_server.store.policy import KeepPolicy, Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.retention import clear
+from mapvote_server.store.rollback import replay, rollback
+from mapvote_server.store.store import Store
 from stores import Clock, send
 
 CELL = (20, 20)

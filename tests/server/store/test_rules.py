@@ -19,9 +19,9 @@ from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
 from mapvote.fusion.distrust import Copy
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.server.store import schema, votes
-from mapvote.server.store.database import remembered
-from mapvote.server.store.store import Store
+from mapvote_server.store import schema, votes
+from mapvote_server.store.database import remembered
+from mapvote_server.store.store import Store
 from stores import Clock
 
 MakeStore = Callable[[Clock], Store]

@@ -17,16 +17,16 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
-from mapvote.server.store.policy import (
+from mapvote_server.errors import Conflict, Held, NotFound, Unavailable
+from mapvote_server.store.policy import (
     GatePolicy,
     Policy,
     RoundPolicy,
     changed,
 )
-from mapvote.server.store.publish import preview, publish
-from mapvote.server.store.rollback import rollback
-from mapvote.server.store.store import Store
+from mapvote_server.store.publish import preview, publish
+from mapvote_server.store.rollback import rollback
+from mapvote_server.store.store import Store
 from stores import send
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED

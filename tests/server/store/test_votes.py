@@ -17,11 +17,11 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Memory
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
-from mapvote.server.store import reviews
-from mapvote.server.store.integrity import ballot_name
-from mapvote.server.store.policy import Policy, RoundPolicy
-from mapvote.server.store.store import Store
-from mapvote.server.store.votes import (
+from mapvote_server.store import reviews
+from mapvote_server.store.integrity import ballot_name
+from mapvote_server.store.policy import Policy, RoundPolicy
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import (
     Electorate,
     judged_on,
     judged_votes,

@@ -1,0 +1,188 @@
+"""Overlapping maps become one: registered to each other, adjusted together, one point a voxel.
+
+The paper's first map is made so ([9]: mapping, then merging of several maps). Every pair that overlaps gives one link
+of a pose graph over the maps. The first map stays where it is, unless all of them state one frame. Maps that contradict
+each other after that are refused. Built maps carry how many scans hit each voxel: noise is judged by the scans of all
+surveys together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.compare.register import Patches, Registered, register_maps, with_free_space_of
+from mapvote.core.geometry import inverse, poses_at, transform
+from mapvote.core.grid import Lattice
+from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
+from mapvote.core.types import F64, MapvoteError
+from mapvote.core.voxels import VoxelCloud, voxel_keys
+from mapvote.survey.clean_map import specks, strays
+from mapvote.survey.driven_road import road_under
+from mapvote.survey.pose_graph import Anchors, Links, optimise
+
+MOST_APART_M = 0.1
+"""By the median over the patches of a pair, after the adjustment."""
+_HELD = 1e-4
+_SAME_FRAME_M, _SAME_FRAME_RAD = 0.5, np.radians(0.5)
+_MOST_MAPS = 64
+"""Bits of a point's sources."""
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """One map of several."""
+
+    point_map: PointMap
+    T_first_each: F64
+    """(k, 4, 4) where each map lies in the frame of the first."""
+    apart_m: dict[tuple[int, int], float]
+    """Median distance of the patches of each pair that overlaps, after the adjustment."""
+
+
+def merge_maps(maps: Sequence[PointMap]) -> Merged:
+    """One map on the lattice and in the frame of the first, or in the mean of their frames if all state one.
+
+    The ground is computed anew, from the driven paths where the maps carry them; the paths stay. A voxel is free if its
+    middle lies in one that a map knows to be free, and no map has a point in it. Each point's field SOURCES has bit k
+    set where map k has a point in its voxel.
+
+    MapvoteError, with figures, if a map overlaps no other one, is bent, or contradicts another by more than 0.1 m.
+    """
+    if not 2 <= len(maps) <= _MOST_MAPS:
+        raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
+    clouds = [all_points(one) for one in maps]
+    pairs, why = {}, {}
+    for i, j in combinations(range(len(maps)), 2):
+        try:
+            pairs[i, j] = register_maps(maps[i], maps[j])
+        except MapvoteError as error:
+            why[i, j] = str(error)
+    T = _adjusted(maps, pairs, why, np.median(clouds[0], axis=0))
+    apart_m = {(i, j): _apart_m(found.patches, inverse(T[i]) @ T[j]) for (i, j), found in pairs.items()}
+    _refuse_contradictions(pairs, apart_m)
+    return Merged(_laid(maps, clouds, T), T, apart_m)
+
+
+def _adjusted(
+    maps: Sequence[PointMap], pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str], middle: F64
+) -> F64:
+    """(n, 4, 4) where the maps lie in the first one's frame: along the pairs, then all links together.
+
+    Surveys of one lattice that lie within _SAME_FRAME_M of where they say, at ``middle`` (3,), state one frame, each
+    with the error of its own prior: then no map is right alone, and the adjusted frame is the mean of theirs."""
+    n = len(maps)
+    T = np.tile(np.eye(4), (n, 1, 1))
+    placed = {0}
+    while len(placed) < n:
+        step = next(((i, j) for i, j in pairs if (i in placed) != (j in placed)), None)
+        if step is None:
+            lost = min(set(range(n)) - placed)
+            reasons = "; ".join(f"with map {min(p) + 1}: {text}" for p, text in why.items() if lost in p)
+            raise MapvoteError(f"map {lost + 1} cannot be registered to any of the others ({reasons})")
+        i, j = step
+        if i in placed:
+            T[j] = T[i] @ pairs[step].T_a_b
+        else:
+            T[i] = T[j] @ inverse(pairs[step].T_a_b)
+        placed |= {i, j}
+    links = [
+        Links(np.array([i]), np.array([j]), one.T_a_b[None], one.fit.sigma_m, float(np.radians(one.fit.sigma_deg)))
+        for (i, j), one in pairs.items()
+    ]
+    if any(one.lattice != maps[0].lattice or one.georeference != maps[0].georeference for one in maps) or any(
+        np.linalg.norm(T_first[:3, :3] @ middle + T_first[:3, 3] - middle) > _SAME_FRAME_M for T_first in T
+    ):
+        return optimise(T, links, [Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)], iterations=10)
+    where_they_say = Anchors(np.arange(len(T)), np.tile(np.eye(4), (len(T), 1, 1)), _SAME_FRAME_M, _SAME_FRAME_RAD)
+    return optimise(T, links, [where_they_say], iterations=10)
+
+
+def _apart_m(patches: Patches, T_a_b: F64) -> float:
+    return float(np.median(np.linalg.norm(patches.residuals(T_a_b)[patches.compared, :3], axis=1)))
+
+
+def _refuse_contradictions(pairs: dict[tuple[int, int], Registered], apart_m: dict[tuple[int, int], float]) -> None:
+    complaints = [f"maps {i + 1} and {j + 1}: {part.told()}" for (i, j), one in pairs.items() for part in one.bent]
+    complaints += [
+        f"maps {i + 1} and {j + 1} are {far:.2f} m apart (median of {int(pairs[i, j].patches.compared.sum())} patches)"
+        for (i, j), far in apart_m.items()
+        if far > MOST_APART_M
+    ]
+    if complaints:
+        raise MapvoteError(
+            f"the maps contradict each other by more than {MOST_APART_M:g} m after adjustment: {'; '.join(complaints)}"
+        )
+
+
+def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
+    first = maps[0]
+    cloud = VoxelCloud(first.lattice)
+    moved = [transform(T_first, points) for T_first, points in zip(T, clouds, strict=True)]
+    for points in moved:
+        cloud.enter(points)
+    driven = [transform(T_first, path) for one, T_first in zip(maps, T, strict=True) for path in one.driven]
+    points = cloud.points()[0]
+    roads = [road_under(poses_at(path), np.ones(len(path), dtype=np.bool_), points) for path in driven]
+    merged = map_from_points(
+        points,
+        lattice=first.lattice,
+        georeference=first.georeference,
+        road=np.concatenate(roads) if roads else None,
+        fields=_joint_fields(points, maps, moved, first.lattice),
+    )
+    merged = _without_strays(merged, maps, T)
+    ends = [one.surveyed_ns for one in maps]
+    surveyed_ns = max(end for end in ends if end is not None) if all(end is not None for end in ends) else None
+    merged = with_free_space_of(merged, maps, T)
+    return replace(merged, driven=tuple(driven), surveyed_ns=surveyed_ns)
+
+
+def _joint_fields(
+    points: F64, maps: Sequence[PointMap], moved: Sequence[F64], lattice: Lattice
+) -> dict[str, NDArray[Any]]:
+    """SOURCES and SCANS (n,) of the merged points, one a voxel. SOURCES has bit k set where map k has a point in the
+    voxel. SCANS is the sum over all maps; 0 if one of the points is not counted."""
+    keys = voxel_keys(points, lattice.x0, lattice.y0)
+    order = np.argsort(keys)
+    sources, scans = np.zeros(len(points), dtype=np.uint64), np.zeros(len(points), dtype=np.int64)
+    uncounted = np.zeros(len(points), dtype=np.bool_)
+    for k, (one, cloud) in enumerate(zip(maps, moved, strict=True)):
+        wanted = voxel_keys(cloud, lattice.x0, lattice.y0)
+        at = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+        there = keys[at] == wanted  # but where a mean was rounded into the next voxel
+        counts = all_fields(one).get(SCANS, np.zeros(len(cloud), dtype=np.uint8))
+        sources[at[there]] |= np.uint64(1) << np.uint64(k)
+        np.add.at(scans, at[there], counts[there])
+        uncounted[at[there & (counts == 0)]] = True
+    scans[uncounted] = 0
+    return {SOURCES: sources, SCANS: np.minimum(scans, 255).astype(np.uint8)}
+
+
+def _without_strays(merged: PointMap, maps: Sequence[PointMap], T: F64) -> PointMap:
+    """The map without the points that all counted surveys together show to be noise, as `build` drops them: one survey
+    hit them once, and the others passed as near and did not."""
+    driven = [
+        transform(T_first, path)
+        for one, T_first in zip(maps, T, strict=True)
+        if SCANS in one.field_names
+        for path in one.driven
+    ]
+    if not driven:
+        return merged
+    points, scans = all_points(merged), all_fields(merged)[SCANS].astype(np.int32)
+    indices = sorted(merged.tiles)
+    standing = np.concatenate([merged.tiles[index].columns[1] for index in indices])
+    asked = np.flatnonzero(standing & (scans > 0))
+    dropped = np.zeros(len(points), dtype=np.bool_)
+    dropped[asked] = strays(points[asked], scans[asked], np.concatenate(driven), merged.lattice)
+    left = np.flatnonzero(standing & ~dropped)
+    dropped[left] = specks(points[left], np.where(scans > 0, scans, 255)[left], merged.lattice)
+    ends = np.cumsum([len(merged.tiles[index].points) for index in indices])
+    parts = zip(indices, np.split(dropped, ends[:-1]), strict=True)
+    return replace(merged, tiles={index: merged.tiles[index].without(part) for index, part in parts})

@@ -1,0 +1,484 @@
+"""One cloud or map registered to another, without a prior: the pose, its error, the parts that do not fit a rigid
+motion, and the map in the frame and on the lattice of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from mapvote.core.columns import TOP_BIT
+from mapvote.core.geometry import exp, exps, hat, inverse, logs, rotation_angle, transform
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
+from mapvote.core.types import F64, Bool, MapvoteError
+from mapvote.core.voxels import voxel_downsample
+from mapvote.matching.coarse_search import LEAST_LEAD, place_without_prior
+from mapvote.matching.ndt import fitness, refine
+from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.prepare import thin_for_levels
+
+STEP_M, SIDE_M = 15.0, 30.0
+"""Patches begin every STEP_M and are SIDE_M wide: neighbours share three quarters of their points."""
+_LEAST_POINTS = 150
+"""Voxels of .7 m that a patch must fill."""
+_AROUND_M = 10.0
+"""Margin of the other cloud around the patch."""
+_MIN_INLIERS = 0.5
+_SURE_M = 0.15
+"""A patch whose standard deviation is larger is not used: ground alone leaves the shift along it open."""
+_FLOOR_M, _FLOOR_RAD = 0.05, np.radians(0.5)
+"""What patches disagree by for other reasons than a bend: noise, voxels, what changed, and turned scans. At 80 m
+from the path of a survey half a degree is 0.7 m."""
+BENT_M = 0.25
+"""A patch that is off by more, by more than four standard deviations, and by more than a scan's turn explains at its
+distance from the survey's path, may be bent."""
+_GAIN = 0.1
+"""It is bent if its own place fits better than the motion of the whole by such a share: along a wall without ends every
+place fits alike."""
+_STANDS_M = 0.5
+_LEAST_BENT = 3
+"""Patches side by side that are off: fewer are the sparse fringe of a survey, where NDT finds what it likes."""
+_ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Patches:
+    """Pieces of a cloud b, each registered to a by itself: (k, ..) arrays."""
+
+    centre_b: F64
+    """(k, 3) in b's frame."""
+    T_a_patch: F64
+    """(k, 4, 4) pose in a of the patch's centre, with b's axes."""
+    covariance: F64
+    """(k, 6, 6) of (rho, phi) about the centre, in a's axes."""
+    inliers: F64
+    """(k,) share of the points that agree."""
+    compared: Bool
+    """(k,) whether the registration is certain enough."""
+    lever_m: F64
+    """(k,) from the nearest place of the path from which a, or b, was measured, whichever is farther; 0 if no path is
+    known."""
+    points: tuple[tuple[F64, F64], ...]
+    """Of each patch a's points around it, and its own from its centre."""
+
+    def residuals(self, T_a_b: F64) -> F64:
+        """(k, 6) of each patch against one motion: shift (metres) and turn (radians), in a's axes."""
+        shift = self.T_a_patch[:, :3, 3] - (self.centre_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
+        turned = np.tile(np.eye(4), (len(shift), 1, 1))
+        turned[:, :3, :3] = self.T_a_patch[:, :3, :3] @ T_a_b[:3, :3].T
+        return np.column_stack([shift, logs(turned)[:, 3:]])
+
+    def gain(self, k: int, T_a_b: F64) -> float:
+        """By which share of its likelihood what stands in patch k fits better at its own place than under one motion:
+        its ground fits everywhere."""
+        near, mine = self.points[k]
+        ndt_map, clouds = _ndt(near, self.T_a_patch[k, :3, 3]), thin_for_levels(mine[_stands(mine)])
+        other = T_a_b.copy()
+        other[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
+        finest = len(ndt_map.levels) - 1
+        own = fitness(ndt_map, clouds, self.T_a_patch[k], finest)
+        return 1.0 - fitness(ndt_map, clouds, other, finest) / max(own, 1e-9)
+
+    @property
+    def bound_m(self) -> F64:
+        """(k,) how far a patch may be off one motion without being bent."""
+        return np.maximum.reduce([np.full(len(self.lever_m), BENT_M), 4.0 * self.sigma_m, _FLOOR_RAD * self.lever_m])
+
+    @property
+    def sigma_m(self) -> F64:
+        """(k,) largest standard deviation of the position."""
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :3, :3])[:, -1]))
+
+
+def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F64]) -> Patches:
+    """Every patch of b that overlaps a, registered from T_a_b. MapvoteError if none overlaps.
+
+    ``paths``: (n, 3) each, from where a or b was measured, in a's frame by T_a_b."""
+    thin_a, thin_b = points_a[voxel_downsample(points_a, 0.3)], points_b[voxel_downsample(points_b, 0.3)]
+    tree_a, tree_b = KDTree(thin_a[:, :2]), KDTree(thin_b[:, :2])
+    path_trees = [KDTree(path) for path in paths]
+    centres, poses, covariances, inliers, compared, levers_m, kept = [], [], [], [], [], [], []
+    T = T_a_b
+    corners = np.unique(np.floor(thin_b[:, :2] / STEP_M).astype(np.int64), axis=0)
+    for corner in corners:
+        middle = STEP_M * (corner + 0.5)
+        mine = thin_b[tree_b.query_ball_point(middle, SIDE_M / 2, p=np.inf)]
+        if len(mine) < _LEAST_POINTS:
+            continue
+        centre = np.array([*middle, np.median(mine[:, 2])])
+        at = T[:3, :3] @ centre + T[:3, 3]
+        near = thin_a[tree_a.query_ball_point(at[:2], SIDE_M / 2 + _AROUND_M, p=np.inf)]
+        clouds = thin_for_levels(mine - centre)
+        if clouds[-1].shape[1] < _LEAST_POINTS or len(near) < _LEAST_POINTS:
+            continue
+        guess = np.eye(4)
+        guess[:3, :3], guess[:3, 3] = T[:3, :3], at
+        found = refine(_ndt(near, at), clouds, guess)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]))
+        centres.append(centre)
+        poses.append(found.T_map_lidar)
+        covariances.append(found.covariance)
+        inliers.append(found.inlier_share)
+        levers_m.append(max((tree.query(at)[0] for tree in path_trees), default=0.0))
+        kept.append((near, mine - centre))
+        compared.append(found.inlier_share > _MIN_INLIERS and sigma_m < _SURE_M)
+    if not centres:
+        raise MapvoteError("the clouds do not overlap: no piece of one lies where the other has points")
+    return Patches(
+        np.array(centres),
+        np.array(poses),
+        np.array(covariances),
+        np.array(inliers),
+        np.array(compared),
+        np.array(levers_m),
+        tuple(kept),
+    )
+
+
+def _stands(points: F64) -> Bool:
+    """(n,) points that lie higher than _STANDS_M above the lowest one of their square metre."""
+    _, cell = np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0, return_inverse=True)
+    lowest = np.full(len(points), np.inf)
+    np.minimum.at(lowest, cell.reshape(-1), points[:, 2])
+    return np.asarray(points[:, 2] > lowest[cell.reshape(-1)] + _STANDS_M)
+
+
+def _ndt(points: F64, centre: F64) -> NdtMap:
+    ndt_map = NdtMap(centre, half_window_m=SIDE_M)
+    ndt_map.enter(points)
+    return ndt_map
+
+
+@dataclass(frozen=True, slots=True)
+class RigidFit:
+    """One motion for all patches."""
+
+    T_a_b: F64
+    covariance: F64
+    """(6, 6) of (rho, phi) about the middle of the patches that agree, in a's axes."""
+    shift_m: F64
+    """(k,) length of each patch's residual shift."""
+    agree: Bool
+    """(k,) compared patches that fit this motion."""
+    bent: Bool
+    """(k,) compared patches that do not, three of them or more side by side. Fewer show no bend, but nothing is
+    compared there."""
+
+    @property
+    def sigma_m(self) -> float:
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def sigma_deg(self) -> float:
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
+
+
+def fit_rigid(patches: Patches, T_a_b: F64) -> RigidFit:
+    """The motion on which most patches agree, from T_a_b. MapvoteError if no patch could be compared."""
+    if not patches.compared.any():
+        raise MapvoteError("no piece of one cloud fits the other: are they of one place, z up, in metres?")
+    T = T_a_b.copy()
+    floor = np.tile(np.diag([_FLOOR_M**2] * 3 + [_FLOOR_RAD**2] * 3), (len(patches.lever_m), 1, 1))
+    floor[:, range(3), range(3)] += (_FLOOR_RAD * patches.lever_m[:, None]) ** 2
+    information = np.linalg.inv(patches.covariance + floor) * patches.compared[:, None, None]
+    weights = np.ones(len(information))
+    for round_ in range(_ROUNDS):
+        r = patches.residuals(T)
+        off = np.einsum("ki,kij,kj->k", r, information, r) / 6.0
+        scale = max(2.0, 64.0 / 2.0**round_)  # wide at first: no start is so bad that all are outliers
+        weights = (scale / (scale + off)) ** 2
+        middle = np.average(patches.T_a_patch[:, :3, 3], axis=0, weights=np.where(patches.compared, weights, 0.0))
+        J = np.tile(np.eye(6), (len(r), 1, 1))  # a turn about the middle moves each centre by phi x (centre - middle)
+        J[:, :3, 3:] = -np.array([hat(p - middle) for p in patches.T_a_patch[:, :3, 3] - r[:, :3]])
+        H = np.einsum("k,kji,kjl,klm->im", weights, J, information, J)
+        step = np.linalg.solve(H + 1e-6 * np.eye(6), np.einsum("k,kji,kjl,kl->i", weights, J, information, r))
+        about = np.eye(4)
+        about[:3, 3] = middle
+        T = about @ exp(step) @ inverse(about) @ T
+    r = patches.residuals(T)
+    agree = patches.compared & (np.linalg.norm(r[:, :3], axis=1) < BENT_M)
+    spread = max(1.0, float(np.einsum("ki,kij,kj->k", r, information, r)[agree].mean() / 6.0)) if agree.any() else 1.0
+    # Neighbouring patches share points: a quarter of them are independent.
+    covariance = np.linalg.inv(H + 1e-6 * np.eye(6)) * spread * (SIDE_M / STEP_M) ** 2
+    off = bent_under(patches, T)
+    bent = np.zeros_like(off)
+    for mine in _side_by_side(patches.T_a_patch[:, :2, 3], off):
+        bent |= mine & (mine.sum() >= _LEAST_BENT)
+    return RigidFit(T, covariance, np.linalg.norm(r[:, :3], axis=1), patches.compared & ~off, bent)
+
+
+def bent_under(patches: Patches, T_a_b: F64) -> Bool:
+    """(k,) compared patches that are off one motion by more than ``bound_m``, and that fit better where they are."""
+    shift = np.linalg.norm(patches.residuals(T_a_b)[:, :3], axis=1)
+    bent = patches.compared & (shift > patches.bound_m)
+    for k in np.flatnonzero(bent):
+        bent[k] = patches.gain(int(k), T_a_b) > _GAIN
+    return np.asarray(bent)
+
+
+def unbent(points_b: F64, patches: Patches, T_a_b: F64) -> F64:
+    """points_b (m, 3) in a's frame, each moved by the compared patches around it, the nearer the more: the twists of
+    their residuals are averaged with Gaussian weights of half a patch's side. What is off without being bent stays."""
+    residuals = patches.residuals(T_a_b)
+    tells = bent_under(patches, T_a_b) | (np.linalg.norm(residuals[:, :3], axis=1) < BENT_M)
+    r = np.where(tells[:, None], residuals, 0.0)[patches.compared]
+    centres = patches.centre_b[patches.compared]
+    coarse, cell = np.unique(np.floor(points_b[:, :2] / 2.0).astype(np.int64), axis=0, return_inverse=True)
+    nearest = min(8, len(centres))
+    far, index = KDTree(centres[:, :2]).query(2.0 * coarse + 1.0, k=[*range(1, nearest + 1)])
+    weight = np.exp(-0.5 * (far / (0.5 * SIDE_M)) ** 2) + 1e-12
+    weight /= weight.sum(axis=1, keepdims=True)
+    moves = np.tile(np.eye(4), (len(r), 1, 1))
+    moves[:, :3, :3] = exps(np.column_stack([np.zeros((len(r), 3)), r[:, 3:]]))[:, :3, :3]
+    at = centres @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    rigid = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    cell = cell.reshape(-1)
+    out = np.zeros_like(rigid)
+    for k in range(nearest):
+        one = index[cell, k]
+        moved = np.einsum("nij,nj->ni", moves[one][:, :3, :3], rigid - at[one]) + at[one] + r[one, :3]
+        out += weight[cell, k, None] * moved
+    return out
+
+
+def parts_of(centre: F64, off: Bool) -> list[tuple[str, Bool]]:
+    """(name, (k,) its patches) of each connected group of the patches ``off`` (k,), whose middles (k, 3) are in a's
+    frame: "south of y = -45 m" where a half-plane divides the group from the patches that are not off, else a box.
+
+    A half-plane divides them if it holds three of four of the group and three of four in it are of the group.
+    """
+    out = []
+    for mine in _side_by_side(centre[:, :2], off):
+        name = _half_plane(centre, mine, off)
+        if name is None:
+            low, high = centre[mine].min(axis=0) - SIDE_M / 2, centre[mine].max(axis=0) + SIDE_M / 2
+            name = f"in x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} m"
+        out.append((name, mine))
+    return out
+
+
+def _side_by_side(centre_xy: F64, off: Bool) -> list[Bool]:
+    """(k,) masks of the connected groups of the patches ``off``, the largest first."""
+    members = np.flatnonzero(off)
+    if not len(members):
+        return []
+    tree = KDTree(centre_xy[members])
+    _, label = connected_components(tree.sparse_distance_matrix(tree, 1.5 * STEP_M).tocsr(), directed=False)
+    return [
+        np.isin(np.arange(len(off)), members[label == number])
+        for number in np.argsort(-np.bincount(label), kind="stable")
+    ]
+
+
+def _half_plane(centre: F64, mine: Bool, off: Bool) -> str | None:
+    """The name of the half-plane that divides the patches ``mine`` from those that are not ``off``; None without."""
+    best: tuple[float, str | None] = 0.75, None
+    for axis, low, high in ((1, "south", "north"), (0, "west", "east")):
+        values = centre[:, axis]
+        for bound in np.unique(values[mine]):
+            for inside, side, way in ((values <= bound, low, 1.0), (values >= bound, high, -1.0)):
+                share = min((mine & inside).sum() / mine.sum(), (mine & inside).sum() / (inside & (mine | ~off)).sum())
+                if share >= best[0] and not inside.all():
+                    best = share, f"{side} of {'xy'[axis]} = {bound + way * STEP_M / 2:.0f} m"
+    return best[1]
+
+
+_LEAST_FITTING = 0.25
+"""Share of the compared patches that must agree on one motion: fewer are chance."""
+_MOST_LEFT = 0.1
+"""Share of the patches that may stay bent after they were moved."""
+
+_SAME_M, _SAME_DEG = 0.05, 0.1
+"""Maps of one lattice that are registered this near to where they are already lie where they are: their free space
+holds cell by cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class BentPart:
+    """A part of a cloud that one rigid motion does not lay on the other."""
+
+    name: str
+    """As "south of y = -45 m", in the frame of a."""
+    most_m: float
+    """How far its patches are off at most."""
+    patches: int
+
+    def told(self) -> str:
+        return f"{self.name} this session is off by up to {self.most_m:.1f} m ({self.patches} patches)"
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A cloud b in the frame of a."""
+
+    T_a_b: F64
+    points: F64
+    """(n, 3) b's points in a's frame."""
+    lead: float
+    """By which share of its score the place is ahead of the best place elsewhere."""
+    patches: Patches
+    fit: RigidFit
+    bent: tuple[BentPart, ...]
+    unbent: bool
+    """Whether the points were moved patch by patch."""
+    why_not: str
+    """Why they were not, although requested."""
+
+    def told(self) -> list[str]:
+        """The registration in sentences."""
+        T = self.T_a_b
+        yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
+        tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+        x, y, z = T[:3, 3]
+        agree = int(self.fit.agree.sum())
+        lines = [
+            f"B lies in A at x {x:.3f}, y {y:.3f}, z {z:.3f} m, turned by {yaw:.3f} deg, tilted by {tilt:.3f} deg "
+            f"(+-{self.fit.sigma_m:.3f} m, {self.fit.sigma_deg:.3f} deg)",
+            f"{agree} of {int(self.patches.compared.sum())} patches of {SIDE_M:.0f} m agree on it; the best place "
+            f"elsewhere scores {self.lead:.0%} less",
+        ]
+        lines += [f"bent: {part.told()}" for part in self.bent]
+        if self.unbent:
+            lines.append("the bent parts were moved patch by patch (--unbend)")
+        elif self.why_not:
+            lines.append(f"not unbent: {self.why_not}")
+        return lines
+
+    def compared(self, xy: F64) -> Bool:
+        """(n,) whether places (n, 2) in a's frame lie where a rigid part of b covers them: in a patch that agrees, or
+        outside all patches nearer to one that agrees than to a bent one."""
+        out = np.zeros(len(xy), dtype=np.bool_)
+        doubt = np.zeros(len(xy), dtype=np.bool_)
+        nearest = np.full((2, len(xy)), np.inf)
+        shown = self.patches.compared
+        agree = shown if self.unbent else self.fit.agree
+        for centre, off in zip(self.patches.T_a_patch[shown, :2, 3], ~agree[shown], strict=True):
+            far = np.abs(xy - centre).max(axis=1)
+            (doubt if off else out)[far < SIDE_M / 2] = True
+            nearest[int(off)] = np.minimum(nearest[int(off)], far)
+        return np.asarray(out | (~doubt & (nearest[0] <= nearest[1])))
+
+    def other_motions(self) -> list[tuple[F64, F64]]:
+        """((2,) middle of each bent patch in a's frame, (4, 4) T that moves b's points, as they lie in a by the rigid
+        motion, to where the patch itself fits): what looks changed under one motion may fit under another."""
+        out = []
+        for k in np.flatnonzero(self.patches.compared & ~self.fit.agree):
+            T_patch = self.patches.T_a_patch[k]
+            before = np.eye(4)
+            before[:3, :3] = self.T_a_b[:3, :3]
+            before[:3, 3] = self.T_a_b[:3, :3] @ self.patches.centre_b[k] + self.T_a_b[:3, 3]
+            out.append((T_patch[:2, 3], T_patch @ np.linalg.inv(before)))
+        return out
+
+
+def register_maps(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> Registered:
+    """Map or cloud b registered to a, metres, z up, without a prior.
+
+    ``unbend``: move bent parts patch by patch, if that makes them fit. MapvoteError, with figures, where the place is
+    ambiguous or nothing fits.
+    """
+    points_a, points_b = all_points(map_a), all_points(map_b)
+    placed = place_without_prior(points_a, points_b)
+    if placed.lead < LEAST_LEAD:
+        raise MapvoteError(
+            f"the clouds fit at several places: the best one scores {placed.score:.2f}, the next one only "
+            f"{placed.lead:.0%} less; are they of one place, and do they overlap by more than a street of equal houses?"
+        )
+    paths = [np.concatenate(map_a.driven)] if map_a.driven else []
+    paths += [transform(placed.T_a_b, np.concatenate(map_b.driven))] if map_b.driven else []
+    patches = register_patches(points_a, points_b, placed.T_a_b, paths)
+    fit = fit_rigid(patches, placed.T_a_b)
+    agree = int(fit.agree.sum())
+    if agree < _LEAST_FITTING * patches.compared.sum() or not patches.compared.any():
+        raise MapvoteError(
+            f"only {agree} of {int(patches.compared.sum())} pieces agree on one motion: not one place, or badly bent"
+        )
+    moved, why = None, ""
+    if unbend and fit.bent.any():
+        moved, why = _unbend(points_a, points_b, patches, fit, paths)
+    rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
+    points = rigid if moved is None else moved
+    return Registered(fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, why)
+
+
+def _bent_parts(patches: Patches, fit: RigidFit) -> tuple[BentPart, ...]:
+    """The parts, the largest first."""
+    shown = np.flatnonzero(patches.compared)
+    parts = parts_of(patches.T_a_patch[shown, :3, 3], fit.bent[shown])
+    return tuple(BentPart(name, float(fit.shift_m[shown][mine].max()), int(mine.sum())) for name, mine in parts)
+
+
+def _unbend(
+    points_a: F64, points_b: F64, patches: Patches, fit: RigidFit, paths: Sequence[F64]
+) -> tuple[F64 | None, str]:
+    """(points of b moved patch by patch, "") or (None, why that does not help)."""
+    moved = unbent(points_b, patches, fit.T_a_b)
+    again = register_patches(points_a, moved, np.eye(4), paths)
+    still = bent_under(again, np.eye(4))
+    if still.sum() > _MOST_LEFT * again.compared.sum():
+        worst = float(np.linalg.norm(again.residuals(np.eye(4))[still, :3], axis=1).max())
+        return None, (
+            f"{int(still.sum())} of {int(again.compared.sum())} patches stay off by up to {worst:.1f} m: within "
+            f"{SIDE_M:.0f} m the session is not rigid, things beside each other are shifted by different amounts"
+        )
+    return moved, ""
+
+
+def brought_into(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> tuple[PointMap, Registered]:
+    """(b as a map in a's frame on a's lattice, how it was registered).
+
+    Its ground is computed anew from its points; its free space comes along, unless b was unbent. A map that lies in a's
+    frame already is returned as it is. MapvoteError where they do not register.
+    """
+    registered = register_maps(map_a, map_b, unbend=unbend)
+    if map_a.lattice == map_b.lattice and not registered.unbent and _is_in_place(registered.T_a_b, all_points(map_b)):
+        return map_b, registered
+    fields = all_fields(map_b)
+    moved = map_from_points(registered.points, lattice=map_a.lattice, map_id=map_b.map_id, fields=fields)
+    return moved if registered.unbent else with_free_space_of(moved, [map_b], registered.T_a_b[None]), registered
+
+
+def _is_in_place(T: F64, points: F64) -> bool:
+    middle = np.median(points, axis=0)
+    return bool(
+        np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle) < _SAME_M and np.degrees(rotation_angle(T)) < _SAME_DEG
+    )
+
+
+def with_free_space_of(point_map: PointMap, maps: Sequence[PointMap], T: F64) -> PointMap:
+    """The map with the free space that ``maps`` know, which lie in its frame at T (k, 4, 4).
+
+    Each voxel asks the maps for its own middle: the other way round, the voxels of a turned map leave gaps. No voxel
+    that holds a point of the map becomes free."""
+    out = {}
+    from_map = [(one, inverse(T_map)) for one, T_map in zip(maps, T, strict=True)]
+    for index, tile in point_map.tiles.items():
+        rows, cols = np.nonzero(np.isfinite(tile.ground_z))
+        words = np.zeros(len(rows), dtype=np.uint64)
+        x, y = tile.window.centres()
+        middles = np.column_stack([x[cols], y[rows], np.zeros(len(rows))])
+        for one, T_one_map in from_map:
+            for bit in range(TOP_BIT):
+                middles[:, 2] = (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE
+                is_free = _is_free(one, transform(T_one_map, middles))
+                words |= is_free.astype(np.uint64) << np.uint64(bit)
+        free = np.zeros(tile.window.shape, dtype=np.uint64)
+        free[rows, cols] = words
+        free &= ~tile.obstacle_words
+        out[index] = replace(tile, free=free) if free.any() else tile
+    return replace(point_map, tiles=out)
+
+
+def _is_free(one: PointMap, places: F64) -> Bool:
+    """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
+    out = np.zeros(len(places), dtype=np.bool_)
+    for part, mine, cell in one.by_tile(places):
+        if part.free is not None:
+            bit = np.floor(places[mine, 2] / CELL_SIZE).astype(np.int64) - part.base[cell]
+            words = part.free[cell] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
+            out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
+    return out

@@ -1,0 +1,139 @@
+"""The decision record: what a version decided about a tile, which ballots counted, and why the others did not.
+
+A publish writes one record a tile that it decided. So "who says so" is read, not fused again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.codec.ballot import Odds
+from mapvote.codec.planes import compress, raw_plane, unpack_bytes, unpack_plane
+from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
+from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.loss_budget import unpack_agreed
+
+_BYTE_MAX = 255
+_MAX_STANDINGS_BYTES = 64 << 20
+
+Why = Literal["", "young", "window", "otherwise", "damaged", "copy", "opposes", "spent", "reviewed"]
+"""Why a ballot did not count on a tile, or on one of its cells; "" if it did. See :data:`REASONS`."""
+REASONS: Mapping[Why, str] = {
+    "young": "younger than the minimum age",
+    "window": "too old, or not of the vehicles that passed last",
+    "otherwise": "cast by another method or other settings than the policy asks for",
+    "damaged": "damaged, and set aside",
+    "copy": "a copy: its cells on this tile equal those of another vehicle's ballot, which counts for both",
+    "opposes": "opposes the others over most of this tile, or denies nearly all that changed on it",
+    "spent": "spent: a version had changed the cell since its vehicle drove",
+    "reviewed": "of a change that a reviewer held or rejected",
+}
+
+
+class Standing(msgspec.Struct, frozen=True, array_like=True):
+    """The standing of one ballot on one tile in one version: counted, or why not."""
+
+    ballot: int
+    """Its ``seq``."""
+    why: Why = ""
+    """Why it did not count on the tile at all; "" if it did."""
+    spent: bytes = b""
+    """Cells of which it spoke, and which had changed since its vehicle drove: flat, ascending, uint16 little-endian."""
+    reviewed: bytes = b""
+    """Likewise, cells of a change that a reviewer held or rejected."""
+    alike: int = 0
+    """For a copy: the ballot that counted for both."""
+
+    def why_not(self, cell: int) -> Why:
+        """Why it did not count on a flat ``cell``; "" if it did, provided that the ballot speaks of the cell."""
+        if self.why:
+            return self.why
+        if cell in cells_in(self.spent):
+            return "spent"
+        return "reviewed" if cell in cells_in(self.reviewed) else ""
+
+
+_STANDINGS = msgspec.msgpack.Decoder(list[Standing])  # made when the module is loaded: see codec/ballot.py
+
+
+def packed_cells(cells: I64) -> bytes:
+    """Flat cells (n,) of a tile as a :class:`Standing` holds them."""
+    return cells.astype("<u2").tobytes()
+
+
+def cells_in(data: bytes) -> NDArray[np.uint16]:
+    """The inverse of :func:`packed_cells`."""
+    return np.frombuffer(data, dtype="<u2")
+
+
+def pack_standings(standings: Iterable[Standing]) -> bytes:
+    """The standings of all ballots on a tile, as one blob."""
+    return compress(msgspec.msgpack.encode(list(standings)), 1)
+
+
+def unpack_standings(data: bytes) -> list[Standing]:
+    """The inverse of :func:`pack_standings`; MapvoteError if it is damaged."""
+    raw = unpack_bytes(data, _MAX_STANDINGS_BYTES, "decision: standings")
+    try:
+        return _STANDINGS.decode(raw)
+    except msgspec.DecodeError as error:
+        raise MapvoteError(f"decision: standings are damaged ({error})") from error
+
+
+@dataclass(frozen=True)
+class Record:
+    """The decision of one version about one tile. Planes are unpacked on demand; MapvoteError if one is damaged."""
+
+    version: int
+    """0: none yet."""
+    packed_states: bytes
+    packed_tally: bytes
+    packed_odds: bytes | None
+    packed_standings: bytes
+
+    @cached_property
+    def states(self) -> U8:
+        """(256, 256) CellState or NO_VOTE."""
+        return unpack_plane(self.packed_states, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
+
+    @cached_property
+    def tally(self) -> I32:
+        """(256, 256, 5) in VOTE_UNITs."""
+        return unpack_tally_plane(self.packed_tally)
+
+    @cached_property
+    def odds(self) -> Odds:
+        """Log-odds of the changed cells by the vehicles that voted for them."""
+        return unpack_agreed(self.packed_odds, self.states)
+
+    @cached_property
+    def standings(self) -> Sequence[Standing]:
+        """The standing of every ballot on the tile, in the order of the ballots."""
+        return unpack_standings(self.packed_standings)
+
+
+def pack_tally(tally: NDArray[Any]) -> bytes:
+    """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
+    by cell: int32, or of unsigned numbers, which are whole votes, these as uint8; as they are if that holds too little.
+    The length tells which."""
+    planes = np.moveaxis(tally, -1, 0)
+    if planes.dtype == np.int32:
+        return compress(raw_plane(planes, "<i4"), 1)
+    votes = planes // planes.dtype.type(VOTE_UNIT)
+    return compress(raw_plane(votes, "|u1") if votes.max() <= _BYTE_MAX else raw_plane(planes, "<u2"), 1)
+
+
+def unpack_tally_plane(data: bytes) -> I32:
+    """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
+    raw = unpack_bytes(data, 4 * N_STATES * CELLS, "decision: tally")
+    dtype, unit = {N_STATES * CELLS: ("|u1", VOTE_UNIT), 2 * N_STATES * CELLS: ("<u2", 1)}.get(len(raw), ("<i4", 1))
+    planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
+    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32) * unit

@@ -1,0 +1,336 @@
+"""Where in the whole map was this scan taken? A search without any prior, over every place that can be driven on.
+
+Exhaustive correlation (Olson, Real-time correlative scan matching, 2009) with a column word for every metre of map:
+what stands in the scan, by its height above the ground, is looked up at every drivable place and heading. Heights
+above the ground need no roll, pitch or altitude. The best peaks are refined by NDT and judged like any other pose.
+One km2 of streets has some 10^7 places and headings: seconds, so no branching and bounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+
+from mapvote.config import NdtSettings
+from mapvote.core.columns import flat_cells
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import allocating, kernel
+from mapvote.core.point_map import PointMap, all_points, has_open_ground
+from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
+from mapvote.matching.coarse_search import LEAST_LEAD, best_and_rival, distinct, place_without_prior
+from mapvote.matching.ndt import refine
+from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.odometry import Tracker
+from mapvote.matching.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
+from mapvote.matching.prepare import Sample, deskew, solid_sample, thin_for_levels
+
+CELL_M = 1.0
+LAYER_M = 1.0
+LOW_M, HIGH_M = 0.8, 30.0
+"""Heights above the ground that are used."""
+MARGIN = 32
+"""Of every second cell: more than the 45 m within which points are used."""
+_SPAN = 64
+"""Cells of a row that are looked up together."""
+_MAX_CELLS = 40_000_000
+"""Of one metre: a box of 6 km by 6 km."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseMap:
+    """The map in cells of a metre."""
+
+    x0: float
+    y0: float
+    ground_z: F32
+    """(rows, cols) map metres, NaN where unknown."""
+    words: U32
+    """(rows, cols) what stands, by layers of a metre above the ground."""
+    wide: U32
+    """(2, 2, rows / 2, cols / 2) the same, dilated, by even and odd rows and columns, with MARGIN cells and more on
+    each side: what places on every second cell look up for one point of a scan lies side by side."""
+    rows: I64
+    cols: I64
+    """Cells on a coarser raster in which a vehicle can stand, row by row."""
+    spans: I64
+    """(m, 3) row and first column in ``wide``, and the first of these cells, of each stretch of a row with any."""
+
+
+def laid_out(point_map: PointMap) -> CoarseMap:
+    """The whole map. MapvoteError if it is too large to search."""
+    windows = [tile.window for tile in point_map.tiles.values()]
+    x0, y0 = min(w.x0 for w in windows), min(w.y0 for w in windows)
+    cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / CELL_M))
+    rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / CELL_M))
+    if rows * cols > _MAX_CELLS:
+        raise MapvoteError(
+            f"map {point_map.map_id} is {cols} m by {rows} m: too large to search; give the drive a prior (--prior)"
+        )
+    words, ground_z = np.zeros((rows, cols), dtype=np.uint32), np.full((rows, cols), np.nan, dtype=np.float32)
+    for tile in point_map.tiles.values():
+        x, y = tile.window.centres()
+        known = np.nonzero(np.isfinite(tile.ground_z))
+        at = ((y[known[0]] - y0) / CELL_M).astype(np.int64), ((x[known[1]] - x0) / CELL_M).astype(np.int64)
+        ground_z[at] = tile.ground_z[known]
+        points = tile.points_map
+        height = points[:, 2] - tile.ground_z.reshape(-1)[flat_cells(tile.window, tile.points)]
+        tall = (height > LOW_M) & (height < HIGH_M)  # nowhere over unknown ground
+        bit = np.uint32(1) << np.floor(height[tall] / LAYER_M).astype(np.uint32)
+        at = ((points[tall, 1] - y0) / CELL_M).astype(np.int64), ((points[tall, 0] - x0) / CELL_M).astype(np.int64)
+        np.bitwise_or.at(words, at, bit)
+    low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)  # and the four cells beside each
+    r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
+    first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
+    spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
+    return CoarseMap(x0, y0, ground_z, words, _by_parity(_dilated(words)), 2 * r, 2 * c, spans)
+
+
+def _by_parity(words: U32) -> U32:
+    """As :class:`CoarseMap` has it."""
+    rows, cols = words.shape
+    wide = np.pad(words, ((0, rows % 2), (0, cols % 2)))
+    split = wide.reshape(len(wide) // 2, 2, -1, 2).transpose(1, 3, 0, 2)
+    return np.pad(split, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN + _SPAN)))
+
+
+def highest(scores: U8, most: int) -> I64:
+    """Indices of the ``most`` highest of (n,), in descending order; of equal ones the last first."""
+    counts = np.cumsum(np.bincount(scores, minlength=256)[::-1])
+    least = 255 - int(np.searchsorted(counts, most))
+    found = np.flatnonzero(scores >= max(least, 0))
+    return found[np.argsort(scores[found], kind="stable")[::-1][:most]]
+
+
+def _dilated(words: U32) -> U32:
+    """Every column with those of its eight neighbours, and one layer up and down."""
+    wide = words | (words << np.uint32(1)) | (words >> np.uint32(1))
+    out = wide.copy()
+    out[1:] |= wide[:-1]
+    out[:-1] |= wide[1:]
+    rows = out.copy()
+    out[:, 1:] |= rows[:, :-1]
+    out[:, :-1] |= rows[:, 1:]
+    return out
+
+
+@allocating
+def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
+    """(places, headings) how many of the points (n <= 255) match the map at their height there; 0 where hopeless.
+
+    ``cols`` (places,) in ``wide``. Span by span, point by point: what the cells of a span look up lies side by side, so
+    that all of them are sooner asked for than the places among them.
+    """
+    n, rows, width = len(xy), wide.shape[2], wide.shape[3]
+    flat = wide.reshape(-1)
+    out = np.zeros((len(cols), len(yaws)), dtype=np.uint8)
+    way = np.empty(n, dtype=np.int64)
+    hits, early = np.empty(_SPAN, dtype=np.uint32), np.empty(_SPAN, dtype=np.uint32)
+    for a in range(len(yaws)):
+        c, s = np.cos(yaws[a]), np.sin(yaws[a])
+        for i in range(n):
+            dr = np.int64(np.floor(s * xy[i, 0] + c * xy[i, 1] + 0.5))
+            dc = np.int64(np.floor(c * xy[i, 0] - s * xy[i, 1] + 0.5))
+            way[i] = ((2 * (dr & 1) + (dc & 1)) * rows + (dr >> 1)) * width + (dc >> 1)
+        for k in range(len(spans)):
+            row, col, place = spans[k, 0], spans[k, 1], spans[k, 2]
+            beyond = spans[k + 1, 2] if k + 1 < len(spans) else len(cols)
+            hits[:] = 0
+            _look_up(flat, row * width + col, way, bits, 0, first, hits)
+            hopeful = False
+            for p in range(place, beyond):
+                j = cols[p] - col
+                early[j] = hits[j]
+                hopeful |= hits[j] > hopeless
+            if hopeful:
+                _look_up(flat, row * width + col, way, bits, first, n, hits)
+                for p in range(place, beyond):
+                    j = cols[p] - col
+                    out[p, a] = hits[j] if early[j] > hopeless else 0
+    return out
+
+
+@kernel
+def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits: U32) -> None:
+    """Add to ``hits`` of each cell of the span that begins ``at`` how many points, shifted by ``way``, match."""
+    for i in range(begin, end):
+        start, bit = np.uint64(at + way[i]), bits[i]
+        for j in range(np.uint64(0), np.uint64(_SPAN)):
+            hits[j] += (flat[start + j] >> bit) & np.uint32(1)
+
+
+@allocating
+def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: float) -> I64:
+    """Indices of the first ``most`` that lie apart from all chosen before."""
+    chosen = np.empty(most, dtype=np.int64)
+    n = 0
+    for i in range(len(x)):
+        fresh = True
+        for k in range(n):
+            j = chosen[k]
+            turn = abs(np.arctan2(np.sin(yaw[i] - yaw[j]), np.cos(yaw[i] - yaw[j])))
+            if (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 < spread_m**2 and turn < spread_rad:
+                fresh = False
+                break
+        if fresh:
+            chosen[n] = i
+            n += 1
+            if n == most:
+                break
+    return chosen[:n]
+
+
+@kernel
+def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) -> tuple[float, float, float, float]:
+    """(share, x, y, yaw) of the best place and heading around one, on single cells; x and y in cells."""
+    best, at = -1.0, (x, y, yaw)
+    height, width = words.shape
+    for da in range(-3, 4):
+        a = yaw + np.radians(0.75) * da
+        c, s = np.cos(a), np.sin(a)
+        for dx in range(-4, 5):
+            for dy in range(-4, 5):
+                px, py, hits = x + 0.5 * dx, y + 0.5 * dy, np.int64(0)
+                for i in range(len(xy)):
+                    r = np.int64(np.floor(py + s * xy[i, 0] + c * xy[i, 1]))
+                    k = np.int64(np.floor(px + c * xy[i, 0] - s * xy[i, 1]))
+                    if 0 <= r < height and 0 <= k < width:
+                        column = words[r, k] | (words[r, k] << np.uint32(1)) | (words[r, k] >> np.uint32(1))
+                        hits += np.int64((column >> bits[i]) & np.uint32(1))
+                if hits > best:
+                    best, at = float(hits), (px, py, a)
+    return best / len(xy), at[0], at[1], at[2]
+
+
+_REACH_M = 45.0
+_POINTS = 200
+_FIRST = 48
+"""Points after which a hopeless place is given up."""
+_YAWS = 120
+_SPREAD_M, _SPREAD_RAD = 3.0, np.radians(15.0)
+"""Peaks nearer to each other than this are one."""
+_PEAKS, _REFINED, _JUDGED = 60, 12, 3
+_LEAST_SCORE = 0.4
+"""Mean likelihood of what stands in a scan, of a map without ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The best place in the map."""
+
+    T_map_lidar: F64
+    fit: float
+    """As :class:`mapvote.matching.pose_check.Verdict` has it."""
+    lead: float
+    """By how much it fits better than the best place elsewhere."""
+
+
+class GlobalSearch:
+    """The whole map as arrays for the search, made at the first call."""
+
+    def __init__(self, point_map: PointMap, ndt: NdtSettings, range_sigma_m: float) -> None:
+        self.point_map, self.ndt = point_map, ndt
+        self.map_around = MapWindow(point_map)
+        self.judge = Judge(range_sigma_m)
+
+    def in_map(self, point_map: PointMap) -> GlobalSearch:
+        """The same search in another version of the map."""
+        other = GlobalSearch(point_map, self.ndt, 0.0)
+        other.judge = self.judge
+        return other
+
+    @cached_property
+    def _has_ground(self) -> bool:
+        return has_open_ground(self.point_map)
+
+    @cached_property
+    def _points(self) -> F64:
+        return all_points(self.point_map)
+
+    @cached_property
+    def _layout(self) -> CoarseMap:
+        return laid_out(self.point_map)
+
+    def __call__(self, scan: Scan) -> F64 | None:
+        """The pose (4, 4) of the scan, or None if no place holds or another fits as well.
+
+        A map without ground has neither drivable squares nor heights above ground: there every shift and yaw of
+        the scan is tried (matching/coarse_search.py), which takes some seconds for each square kilometre.
+        """
+        if not self._has_ground:
+            placed = place_without_prior(self._points, scan.points.astype(np.float64))
+            return placed.T_a_b if placed.lead >= LEAST_LEAD and placed.score >= _LEAST_SCORE else None
+        found = self.find(scan)
+        if found is None or found.fit < MIN_FIT or found.lead < MIN_LEAD:
+            return None
+        return found.T_map_lidar
+
+    def find(self, scan: Scan) -> Found | None:
+        """The best place, however good it is; None if nothing stands in the scan or nothing in the map is like it."""
+        few = solid_sample(scan.points, 1.0)
+        height = height_above_lowest(few)
+        near = few[:, 0] ** 2 + few[:, 1] ** 2 < _REACH_M**2
+        sample = few[near & (height > LOW_M) & (height < HIGH_M)]
+        if len(sample) < _FIRST:
+            return None
+        bits = np.floor(height[near & (height > LOW_M) & (height < HIGH_M)] / LAYER_M).astype(np.uint32)
+        order = np.random.default_rng(0).permutation(len(sample))[:_POINTS]  # any will do, the same each time
+        xy, bits = sample[order, :2], bits[order]
+        below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
+        sensor_m = -float(np.quantile(below, 0.05)) if len(below) else 1.8
+        best = sorted(self._peaks(xy, bits), key=lambda peak: -peak[0])[:_REFINED]
+        return self._choose(scan, [self._pose(peak, sensor_m) for peak in best])
+
+    def _peaks(self, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
+        """(share, x, y, yaw) of the best places, sharpened on single cells."""
+        lay = self._layout
+        yaws = np.arange(_YAWS) * (2.0 * np.pi / _YAWS)
+        hopeless = int(0.5 * MIN_FIT * MIN_KNOWN * _FIRST)
+        scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, _FIRST)
+        likely = highest(scores.ravel(), 400 * _PEAKS)
+        place, heading = likely // _YAWS, likely % _YAWS
+        x, y = lay.cols[place] + 0.5, lay.rows[place] + 0.5
+        kept = apart(x * CELL_M, y * CELL_M, yaws[heading], _PEAKS, _SPREAD_M, _SPREAD_RAD)
+        return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
+
+    def _pose(self, peak: tuple[float, float, float, float], sensor_m: float) -> F64:
+        """(4, 4) on the map's ground at a peak, level with it."""
+        lay, (_, x, y, yaw) = self._layout, peak
+        row, col = int(y), int(x)
+        low_r, low_c = max(row - 5, 0), max(col - 5, 0)
+        patch = lay.ground_z[low_r : row + 6, low_c : col + 6]
+        r, c = np.nonzero(np.isfinite(patch))
+        A = np.column_stack([c + low_c + 0.5 - x, r + low_r + 0.5 - y, np.ones(len(r))])
+        (gx, gy, z), *_ = np.linalg.lstsq(A, patch[r, c], rcond=None)
+        up = np.array([-gx, -gy, 1.0]) / np.sqrt(gx * gx + gy * gy + 1.0)
+        ahead = np.array([np.cos(yaw), np.sin(yaw), gx * np.cos(yaw) + gy * np.sin(yaw)])
+        ahead /= np.linalg.norm(ahead)
+        T = np.eye(4)
+        T[:3, 0], T[:3, 1], T[:3, 2] = ahead, np.cross(up, ahead), up
+        T[:3, 3] = np.array([lay.x0 + x * CELL_M, lay.y0 + y * CELL_M, z]) + sensor_m * up
+        return T
+
+    def _choose(self, scan: Scan, guesses: list[F64]) -> Found | None:
+        """Refine all, judge the best few with the motion that suits them, and compare."""
+        guesses.sort(key=lambda T: (round(T[0, 3] / 40.0), round(T[1, 3] / 40.0)))  # neighbours share a window
+        clouds = thin_for_levels(scan.points)
+        clouds = [np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // 2000)]) for cloud in clouds]
+        refined = [refine(self.map_around(guess[:3, 3]), clouds, guess) for guess in guesses]
+        refined.sort(key=lambda result: -result.score)
+        places = distinct((one.T_map_lidar for one in refined), _SPREAD_RAD)[:_JUDGED]
+        if not places:
+            return None
+        fit, T, rival = best_and_rival([self._judged(scan, T) for T in places], _SPREAD_RAD)
+        return Found(T, fit, fit - rival)
+
+    def _judged(self, scan: Scan, T: F64) -> tuple[float, F64]:
+        ndt_map = self.map_around(T[:3, 3])
+        points = scan.points
+        if scan.time_s is not None:
+            tracker = Tracker(self.map_around, self.ndt)
+            points = deskew(scan, tracker.guess_motion(ndt_map, scan.stamp_ns, Sample(scan), T))
+        T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
+        few = solid_sample(points, LEVELS[-1].points_m)
+        return self.judge.fit(ndt_map, few, T), T

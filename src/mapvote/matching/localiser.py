@@ -1,0 +1,225 @@
+"""Poses that a vehicle may vote with: a track is followed, doubted, confirmed, moved or taken back.
+
+A scan waits until the place of its track has been confirmed by a look taken at it or after it. So nothing has to be
+recalled once a track proves wrong: its scans since the last good look have not voted yet. Where another place fits
+better the track moves there, and what waits moves along. Memory is bounded by the scans that may wait.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from mapvote.config import Settings
+from mapvote.core.geometry import inverse
+from mapvote.core.point_map import PointMap
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
+from mapvote.matching.global_search import GlobalSearch
+from mapvote.matching.ndt import refine
+from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.odometry import TWIST_AGE_S, Fix, Tracker
+from mapvote.matching.pose_check import Judge, Verdict
+from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
+
+LOOKS = 3
+"""In turn that must hold before the first vote."""
+WAIT_SCANS = 40
+"""Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
+_EVERY_M, _EVERY_S = 10.0, 0.35
+"""A track that holds is checked again after this distance, well within the 15 m of a check, or this time:
+four scans at 10 Hz, however their stamps jitter. A vote is up to so much later for it."""
+_JUMPS = 4
+"""How often a track may move on one scan before it counts as lost there."""
+_MEMORY = 0.1
+"""Weight of the newest difference between fix and prior in the one remembered."""
+_FIRST_SEARCH = 6
+"""Scans without a confirmed place before the whole map is searched; every further search waits twice as long."""
+
+
+class Localise(Protocol):
+    """Where were these scans taken? Scans go in, in order of time; fixes come out in the same order, some later."""
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        """One more scan; the fixes that are decided by now. Untrusted ones cast no vote."""
+        ...
+
+    def flush(self) -> list[Fix]:
+        """The drive is over: the fixes of all scans that still wait."""
+        ...
+
+
+@dataclass(slots=True)
+class _Waiting:
+    fix: Fix
+    misfit: F64 | None
+    """(3,) how far the fix lies off the prior as it came, map metres."""
+
+
+class Localiser:
+    """NDT in a finished map, trusted only where several scans agree that no other place fits as well.
+
+    Without a prior, and when no place holds for long, the whole map is searched.
+    """
+
+    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
+        self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
+        self.map_around = MapWindow(point_map)
+        self.tracker = Tracker(self.map_around, settings.ndt)
+        self.judge = Judge(sensor.range_sigma_m)
+        self.misfit = np.zeros(3)
+        """How far trusted fixes lately lay off their priors, map metres."""
+        self._waiting: deque[_Waiting] = deque()
+        self._held = 0
+        """Looks in turn that held."""
+        self._confirmed = False
+        self._looked_at: Fix | None = None
+        self._unconfirmed, self._next_search = 0, _FIRST_SEARCH
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        """See :class:`Localise`."""
+        if not self._has_place(scan, prior):
+            nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
+            self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None))
+            return self._decide(len(self._waiting), False)
+        fix = self.tracker.localise(scan, None if prior is None else self._corrected(prior))
+        self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
+        misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
+        self._waiting.append(_Waiting(fix, misfit))
+        if self._is_due(fix):
+            self._look()
+            if self._confirmed and self._held:
+                return self._decide(len(self._waiting), True)
+        return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+
+    def flush(self) -> list[Fix]:
+        """See :class:`Localise`."""
+        if self._waiting and self._confirmed:
+            self._look()
+        return self._decide(len(self._waiting), self._confirmed)
+
+    def go_on_in(self, point_map: PointMap) -> None:
+        """The map is another version from here on; the track goes on."""
+        self.search = self.search.in_map(point_map)
+        self.map_around.go_on_in(point_map)
+
+    def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
+        """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
+        homeless = prior is None and self.tracker.last_pose is None
+        self._unconfirmed = 0 if self._confirmed else self._unconfirmed + 1
+        if not (homeless or self._unconfirmed >= self._next_search):
+            return True
+        if self._unconfirmed < self._next_search and self._unconfirmed > 1:
+            return False
+        self._next_search = 2 * max(self._unconfirmed, _FIRST_SEARCH)
+        found = self.search(scan)
+        if found is not None:
+            self.tracker.move_to(found, scan.stamp_ns)
+        return found is not None or not homeless
+
+    def _corrected(self, prior: PosePrior) -> PosePrior:
+        """The prior without what it was off by lately, and no surer of itself than that."""
+        T_map_lidar = prior.T_map_lidar.copy()
+        T_map_lidar[:3, 3] += self.misfit
+        return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.linalg.norm(self.misfit))))
+
+    def _is_due(self, fix: Fix) -> bool:
+        last = self._looked_at
+        if last is None or not self._confirmed or not fix.trusted:
+            return True
+        way = np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - last.registration.T_map_lidar[:3, 3])
+        return bool(way >= _EVERY_M or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= _EVERY_S)
+
+    def _look(self) -> None:
+        """Judge the newest fix; move the track while another place fits better."""
+        verdict = self._verdict()
+        for _ in range(_JUMPS):
+            if verdict.lead >= 0.0 or verdict.T_map_lidar_other is None:
+                break
+            self._move(verdict.T_map_lidar_other)
+            verdict = self._verdict()
+        self._looked_at = self._waiting[-1].fix
+        if self._looked_at.trusted and self.judge.holds(verdict):
+            self._held += 1
+            self._confirmed = self._confirmed or self._held >= LOOKS
+        else:
+            self._held, self._confirmed = 0, False
+
+    def _verdict(self) -> Verdict:
+        fix = self._waiting[-1].fix
+        T_map_lidar = fix.registration.T_map_lidar
+        ndt_map = self.map_around(T_map_lidar[:3, 3])
+        few = solid_sample(fix.points, LEVELS[-1].points_m)
+        if self._confirmed:  # a track that held is held again at less cost; where it is doubted, nothing is saved
+            verdict = self.judge.judge(ndt_map, few, T_map_lidar, quick=True)
+            if self.judge.holds(verdict):
+                return verdict
+        return self.judge.judge(ndt_map, few, T_map_lidar)
+
+    def _move(self, T_map_lidar: F64) -> None:
+        """The newest scan was taken here: it and all that wait are registered anew, the track goes on from here."""
+        newest = self._waiting[-1]
+        shift = T_map_lidar @ inverse(newest.fix.registration.T_map_lidar)
+        twist = self.tracker.twist
+        if len(self._waiting) == 1 and newest.fix.scan.time_s is not None:
+            self.tracker.move_to(T_map_lidar, newest.fix.scan.stamp_ns)
+            around, sample = self.map_around(T_map_lidar[:3, 3]), Sample(newest.fix.scan)
+            twist = self.tracker.guess_motion(around, newest.fix.scan.stamp_ns, sample, T_map_lidar)
+        for waiting in self._waiting:
+            self._register_anew(waiting, shift @ waiting.fix.registration.T_map_lidar, twist)
+        self._held, self._confirmed = 0, False
+        self._go_on()
+
+    def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
+        before, ndt_map = waiting.fix.registration.T_map_lidar, self.map_around(guess[:3, 3])
+        points = deskew(waiting.fix.scan, twist)
+        result = refine(ndt_map, thin_for_levels(points), guess)
+        waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
+        if waiting.misfit is not None:
+            waiting.misfit = waiting.misfit + result.T_map_lidar[:3, 3] - before[:3, 3]
+
+    def _go_on(self) -> None:
+        """The track goes on from the newest scan that waits, with the motion of the last two."""
+        newest, twist = self._waiting[-1], None
+        if len(self._waiting) > 1:
+            last = self._waiting[-2]
+            seconds = 1e-9 * (newest.fix.scan.stamp_ns - last.fix.scan.stamp_ns)
+            poses = last.fix.registration.T_map_lidar, newest.fix.registration.T_map_lidar
+            twist = twist_between(*poses, seconds) if seconds <= TWIST_AGE_S else None
+        registration = newest.fix.registration
+        self.tracker.move_to(registration.T_map_lidar, newest.fix.scan.stamp_ns, twist, registration.score)
+
+    def _decide(self, count: int, confirmed: bool) -> list[Fix]:
+        """The fixes of the oldest ``count`` scans, which nothing changes any more; what they say of the prior is
+        remembered if they are trusted."""
+        decided = []
+        for _ in range(count):
+            waiting = self._waiting.popleft()
+            fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
+            if fix.trusted and waiting.misfit is not None:
+                self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
+            decided.append(fix)
+        return decided
+
+
+class GivenPoses:
+    """Poses that need no improvement: a prior to be trusted, the outcome of SLAM, or the truth."""
+
+    def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
+        """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
+        self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
+        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        """See :class:`Localise`: decided at once."""
+        i = self._poses[scan.stamp_ns]
+        twist = motion_at(self._stamps_ns, self._T_map_lidar, i)
+        registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
+        return [Fix(scan, registration, deskew(scan, twist), True)]
+
+    def flush(self) -> list[Fix]:
+        """See :class:`Localise`: nothing waits."""
+        return []

@@ -1,0 +1,217 @@
+"""Where the vehicle is, scan after scan: predict, register, judge, recover (paper II).
+
+A vehicle that does not trust its pose abstains: a lost vehicle must never demolish a street.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.config import NdtSettings
+from mapvote.core.geometry import exp, from_xyz_rpy
+from mapvote.core.types import F32, F64, PosePrior, Registration, Scan
+from mapvote.matching.ndt import best_of, fitnesses, refine
+from mapvote.matching.ndt_map import LEVELS, NdtMap
+from mapvote.matching.prepare import Sample, deskew, twist_between
+
+_REFINED = 3
+"""How many of the best guesses are refined when the vehicle is lost."""
+_RECONSIDERED = 8
+"""The same, when a scan fits worse than the ones before it."""
+_POOR = 0.9
+"""Share of the usual score below which other places are tried."""
+_STEP_M, _REACH_M = 1.0, 10.0
+"""Spacing of the guesses when the vehicle is lost, and the farthest."""
+ACCELERATION_MPS2 = 3.0
+"""How fast a prediction by constant velocity goes stale: a car brakes harder than this only in an emergency."""
+_YAWS_RAD = np.radians([0.0, -3.0, 3.0])
+_ROUNDS = 2
+"""How often a scan is de-skewed anew with the motion just found, while that still changes."""
+_SPEEDS_MPS = np.arange(-2.5, 32.6, 2.5)
+"""Forward speeds tried on a first scan."""
+_FAR_BETTER = 1.2
+"""What another height must fit better by before the prior's is given up."""
+TWIST_AGE_S = 1.0
+"""Two poses farther apart in time than this say little about the present velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """One scan, localised."""
+
+    scan: Scan
+    registration: Registration
+    points: F32
+    """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed with the motion found."""
+    trusted: bool
+    """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
+
+
+class Tracker:
+    """Follows one vehicle. Scans must come in order of time.
+
+    ``map_around``: the NDT map to use near a position (3,), for a finished map a
+    :class:`mapvote.matching.ndt_map.MapWindow`.
+    """
+
+    def __init__(self, map_around: Callable[[F64], NdtMap], settings: NdtSettings) -> None:
+        self.map_around = map_around
+        self.settings = settings
+        self.twist = np.zeros(6)
+        """Motion per second in the lidar frame (velocity, angular velocity), from the last two trusted poses."""
+        self.last_pose: F64 | None = None
+        self.last_stamp_ns = 0
+        self._measured = False
+        """Whether ``twist`` was measured from two poses, so that it predicts the next."""
+        self._usual_score = 0.0
+        """What trusted scans scored lately: far less than that means the wrong place, however sure it looks."""
+
+    def localise(self, scan: Scan, prior: PosePrior | None = None) -> Fix:
+        """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin.
+
+        A prior is a guess and a factor, no gate: whether a pose can be voted with is the Localiser's to say.
+        """
+        seed, reach = self._seed(scan.stamp_ns, prior)
+        ndt_map = self.map_around(seed[:3, 3])
+        sample = Sample(scan)
+        if reach >= _STEP_M:
+            seed = self._levelled(ndt_map, sample, seed)
+        twist = (
+            self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan.stamp_ns, sample, seed, prior)
+        )
+        clouds = sample.clouds(twist)
+        result = refine(ndt_map, clouds, seed, prior, self._first_level(reach))
+        if result.score < _POOR * self._usual_score:
+            result = self._reconsider(ndt_map, clouds, scan.stamp_ns, result, prior)
+        trusted = self.is_sound(result)
+        if not trusted:
+            centre = prior.T_map_lidar if prior is not None else seed
+            result = self._search(ndt_map, clouds, centre, reach, prior)
+            trusted = self.is_sound(result)
+        found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
+        for _ in range(_ROUNDS):
+            if scan.time_s is None or found is None or not _differ(twist, found):
+                break
+            twist = found
+            result = refine(ndt_map, sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
+            trusted = self.is_sound(result)
+            found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
+        if trusted:
+            self._accept(result.T_map_lidar, scan.stamp_ns, found, twist)
+            rate = 0.2 if self._usual_score else 1.0
+            self._usual_score += rate * (result.score - self._usual_score)
+        return Fix(scan, result, deskew(scan, twist), trusted)
+
+    def _first_level(self, reach: float) -> int:
+        """The coarsest level that a guess needs which may be off by ``reach`` metres."""
+        if self.last_pose is None or reach > 0.5 * _STEP_M:
+            return 0
+        return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
+
+    def _knows_motion(self, scan: Scan) -> bool:
+        return scan.time_s is None or bool(self.twist.any()) or self._measured
+
+    def guess_motion(
+        self, ndt_map: NdtMap, stamp_ns: int, sample: Sample, seed: F64, prior: PosePrior | None = None
+    ) -> F64:
+        """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
+        age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+        moved: list[tuple[float, F64]] = []
+        for speed in _SPEEDS_MPS:
+            twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+            start = seed if self.last_pose is None else self.last_pose @ exp(age * twist)
+            moved.append((refine(ndt_map, sample.coarse(twist), start, prior).score, twist))
+        return max(moved, key=lambda found: found[0])[1]
+
+    def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
+        """Take the first pose as given: where there is no map yet, the first scan makes it."""
+        self._accept(T_map_lidar, scan.stamp_ns, self._motion_to(T_map_lidar, scan.stamp_ns), self.twist)
+        registration = Registration(T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True)
+        return Fix(scan, registration, deskew(scan, self.twist), True)
+
+    def _seed(self, stamp_ns: int, prior: PosePrior | None) -> tuple[F64, float]:
+        """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
+        if self.last_pose is not None:
+            age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+            known = self._measured or bool(self.twist.any())
+            drift = 0.5 * ACCELERATION_MPS2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
+            if prior is None or drift < prior.sigma_m:
+                return self.last_pose @ exp(age * self.twist), drift
+        if prior is None:
+            return np.eye(4), _REACH_M
+        return prior.T_map_lidar, 2.0 * prior.sigma_m
+
+    def _levelled(self, ndt_map: NdtMap, sample: Sample, seed: F64) -> F64:
+        """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
+        road that lies metres from the scan's own."""
+        steps = np.arange(_STEP_M, _REACH_M + 1e-6)
+        guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
+        fits = fitnesses(ndt_map, sample.coarse(np.zeros(6))[0], np.array(guesses))
+        best = int(np.argmax(fits))
+        return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
+
+    def move_to(self, T_map_lidar: F64, stamp_ns: int, twist: F64 | None = None, score: float = 0.0) -> None:
+        """The vehicle was here then: the track goes on from this pose, with this motion or none known."""
+        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+        self.twist, self._measured = (np.zeros(6), False) if twist is None else (twist, True)
+        self._usual_score = score
+
+    def correct(self, T_map_lidar: F64, twist: F64) -> None:
+        """The last scan was taken here, a little beside where it was found: the track goes on from this pose."""
+        self.last_pose, self.twist = T_map_lidar, twist
+
+    def is_sound(self, result: Registration) -> bool:
+        """Whether a registration converged, overlaps the map and is certain enough; pose_check tests the place."""
+        s, position = self.settings, result.covariance[:3, :3]
+        if not result.converged or result.inlier_share < s.min_inlier_share:
+            return False
+        if np.sqrt(position[0, 0] + position[1, 1] + position[2, 2]) < 0.99 * s.max_sigma_m:
+            return True  # no direction has more than all of them together, which takes less to ask
+        return bool(np.sqrt(np.linalg.eigvalsh(position)[-1]) <= s.max_sigma_m)
+
+    def _reconsider(
+        self, ndt_map: NdtMap, clouds: list[F32], stamp_ns: int, result: Registration, prior: PosePrior | None
+    ) -> Registration:
+        """The best of ``result``, the prior's place, and every speed that a vehicle may have had since the last scan.
+
+        A street looks alike along itself: a scan that fits worse than usual may have settled one house too early.
+        """
+        guesses = [] if prior is None else [prior.T_map_lidar]
+        if self.last_pose is not None:
+            age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+            guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
+        found = best_of(ndt_map, clouds, guesses, _RECONSIDERED, prior)
+        return found if found.score > result.score else result
+
+    def _search(
+        self, ndt_map: NdtMap, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
+    ) -> Registration:
+        """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
+        rings = int(np.ceil(min(max(reach, _STEP_M), _REACH_M) / _STEP_M))
+        offsets = _STEP_M * np.arange(-rings, rings + 1)
+        guesses = [
+            centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
+        ]
+        return best_of(ndt_map, clouds, guesses, _REFINED, prior, 1000)
+
+    def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
+        """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""
+        seconds = 1e-9 * (stamp_ns - self.last_stamp_ns)
+        if self.last_pose is None or not 0 < seconds <= TWIST_AGE_S:
+            return None
+        return twist_between(self.last_pose, T_map_lidar, seconds)
+
+    def _accept(self, T_map_lidar: F64, stamp_ns: int, found: F64 | None, twist: F64) -> None:
+        """The track goes on from this pose with the motion that was ``found`` to lead there, else with ``twist``."""
+        self.twist = twist if found is None else found
+        self._measured = self._measured or found is not None
+        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+
+
+def _differ(twist: F64, other: F64) -> bool:
+    """Whether two motions bend a scan differently: by more than 2 cm, at its ends and 20 m away."""
+    change = np.abs(twist - other)
+    return bool(change[:3].max() * 0.05 > 0.02 or change[3:].max() * 0.05 * 20.0 > 0.02)

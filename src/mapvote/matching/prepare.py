@@ -1,0 +1,157 @@
+"""A scan made ready for NDT: de-skewed to its stamp, thinned for each level, without rain, snow and exhaust.
+
+Neighbouring rays hit the same surface; a drop is hit by one ray. Where a tenth of the rays end on drops, a third of the
+points are drops once the scan is thinned to a point a voxel, and every right pose would fit worse than any threshold.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.geometry import inverse, log
+from mapvote.core.kernel import kernel
+from mapvote.core.types import F32, F64, I64, Scan
+from mapvote.core.voxels import slot_of, thin, voxel_key
+from mapvote.matching.ndt_map import LEVELS
+
+_ENOUGH = 20_000
+"""Points that are thinned at least: of a dense scan every third, fifth .. is used. Odd, so that no beam is left
+out where points are stored firing by firing."""
+
+
+def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F32]:
+    """The scan as each level wants it, (3, m): one point per voxel of the level's ``points_m``."""
+    source = np.ascontiguousarray(points_lidar, dtype=np.float32)
+    chosen = thinned(source)
+    return [in_rows(source[chosen[level.points_m]]) for level in LEVELS]
+
+
+def in_rows(points_lidar: NDArray[np.floating]) -> F32:
+    """(3, n) of points (n, 3): rows of x, y and z, as the kernels want them."""
+    return np.ascontiguousarray(points_lidar.T, dtype=np.float32)
+
+
+def thinned(points_lidar: F32) -> dict[float, I64]:
+    """By size, metres: indices, ascending, of one of (n, 3) points per voxel of each size that the levels want."""
+    sizes = sorted({level.points_m for level in LEVELS})
+    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // _ENOUGH - 1) | 1))
+    chosen = {sizes[0]: few}
+    for size in sizes[1:]:
+        few = few[thin(points_lidar.take(few, axis=0), size)]
+        chosen[size] = few
+    return chosen
+
+
+@kernel
+def _deskew(points: F32, time_s: F32, v: F32, w: F32, out: F32) -> None:
+    half = np.float32(0.5)
+    for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
+        t, x, y, z = time_s[i], points[i, 0], points[i, 1], points[i, 2]
+        # exp(t * twist) to second order: a first-order rotation would leave centimetres at 50 m in a bend.
+        ux, uy, uz = v[0] + w[1] * z - w[2] * y, v[1] + w[2] * x - w[0] * z, v[2] + w[0] * y - w[1] * x
+        h = half * t * t
+        out[i, 0] = x + t * ux + h * (w[1] * uz - w[2] * uy)
+        out[i, 1] = y + t * uy + h * (w[2] * ux - w[0] * uz)
+        out[i, 2] = z + t * uz + h * (w[0] * uy - w[1] * ux)
+
+
+def deskew(scan: Scan, twist: F64) -> F32:
+    """The scan's points (n, 3) in the lidar frame at ``stamp_ns``, given the sensor's (6,) motion per second.
+
+    ``twist`` is (velocity, angular velocity) in the lidar frame. Scans without point times come back as they are.
+    """
+    return deskewed(scan.points, scan.time_s, twist)
+
+
+def deskewed(points: F32, time_s: F32 | None, twist: F64) -> F32:
+    """:func:`deskew` of points (n, 3) measured at ``time_s`` (n,) from the stamp."""
+    if time_s is None:
+        return points
+    out, (v, w) = np.empty_like(points), twist.astype(np.float32).reshape(2, 3)
+    _deskew(points, time_s, v, w, out)
+    return out
+
+
+def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64:
+    """(6,) constant motion per second, in the moving lidar's frame, that leads from one pose to the other."""
+    return log(inverse(T_map_lidar_0) @ T_map_lidar_1) / seconds
+
+
+def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
+    """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
+    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
+    if before == after:
+        return np.zeros(6)
+    seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])
+    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
+
+
+_VOXEL_M = 0.5
+_REACH_M = 20.0
+"""Beyond, sparse surfaces and drops look alike, and drops are few: their share of all returns falls with the range."""
+_SHARE = 0.1
+"""Of the rays that a surface across the whole voxel would catch: drops catch some .01 of them where a tenth of all rays
+end on drops, an open crown .1 and more."""
+_RAYS = 40_000
+"""Looked at, evenly through the scan: enough for a share."""
+_SOLID_ANGLE = 0.5 * 2.0 * np.pi
+"""That a spinning sensor's rays cover: 29 degrees of elevation all around."""
+
+
+def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
+    """(m, 3) one point in each voxel of side ``size``, without what hangs in the air.
+
+    ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
+    """
+    few = points_lidar.take(thin(points_lidar, size), axis=0).astype(np.float64)
+    every = -(-len(points_lidar) // _RAYS) or 1
+    range2 = (few**2).sum(axis=1)
+    rays = -(-len(points_lidar) // every)
+    expected = rays / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
+    table = np.zeros((2, max(1024, 1 << (4 * len(few) - 1).bit_length())), dtype=np.int64)
+    hits = np.empty(len(few), dtype=np.int64)
+    _hits_around(np.ascontiguousarray(points_lidar, dtype=np.float32), every, few, table[0], table[1], hits)
+    return few[(range2 > _REACH_M**2) | (hits > _SHARE * expected)]
+
+
+@kernel
+def _hits_around(points: F32, every: int, few: F64, keys: I64, counts: I64, at: I64) -> None:
+    """Into ``at`` (m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel of each of ``few``.
+
+    The table (``keys``, ``counts``; zeros) holds these voxels alone, and at most a quarter of it: rays that end
+    elsewhere leave it as it is.
+    """
+    far2 = (_REACH_M + 2.0 * _VOXEL_M) ** 2
+    for i in range(len(few)):
+        key = voxel_key(few[i, 0], few[i, 1], few[i, 2], _VOXEL_M)
+        at[i] = slot_of(key, keys)
+        keys[at[i]] = key
+    for i in range(0, len(points), every):
+        if points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2 > far2:
+            continue
+        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], _VOXEL_M)
+        slot = slot_of(key, keys)
+        counts[slot] += 1 if keys[slot] == key else 0
+    for i in range(len(few)):
+        at[i] = counts[at[i]]
+
+
+class Sample:
+    """The points of one scan that each level compares with the map."""
+
+    def __init__(self, scan: Scan) -> None:
+        time_s = scan.time_s
+        self._parts = {
+            size: (scan.points.take(few, axis=0), None if time_s is None else time_s.take(few))
+            for size, few in thinned(scan.points).items()
+        }
+
+    def clouds(self, twist: F64) -> list[F32]:
+        """(3, m) by level, at the scan's stamp if the sensor's motion per second was ``twist`` (6,)."""
+        clouds = {size: in_rows(deskewed(*part, twist)) for size, part in self._parts.items()}
+        return [clouds[level.points_m] for level in LEVELS]
+
+    def coarse(self, twist: F64) -> list[F32]:
+        """The same, of the fewest points at every level: to try many guesses."""
+        return [in_rows(deskewed(*self._parts[max(self._parts)], twist))] * len(LEVELS)

@@ -1,0 +1,281 @@
+"""One scan against the reference: its observation of each cell, and the state that follows (paper III-A, III-B).
+
+An observation is 16 bits per cell and does not depend on how the paper's open sentences are read: the number of points,
+whether the cell could be seen under every rule of sight, whether the map is too tall there. Every reading of the paper
+is a look-up table over these words, so stored words answer all readings without the scan.
+
+Each open sentence of the paper is a setting of ``[paper]``. The defaults are the readings that reproduce the paper's
+Tables II to IV; docs/method.md says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from typing import get_args
+
+import numpy as np
+from pydantic import ValidationError
+
+from mapvote.config import PaperSettings, VotingSettings
+from mapvote.core.columns import EVERY_BIT, below_top, span_of
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, window_around
+from mapvote.core.kernel import kernel
+from mapvote.core.point_map import PointMap
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError, Reference
+from mapvote.core.voting import VOTE_UNIT, cast, plurality, weight_table
+from mapvote.perception.frontend import Observation
+from mapvote.perception.raycast import ScanView, Sight, cast_rays
+from mapvote.rules.voter import TileVotes
+
+MOST_POINTS = 15
+"""Points are counted up to this number, where Eq. (1) has reached its bound."""
+CLEAR, CLEAR_OF_CELLS, BEFORE_FARTHEST, THROUGH_COLUMN, FIRED = (1 << k for k in range(4, 9))
+"""Nothing above the ground before the cell; nothing in an occupied cell; not behind the farthest return; a ray through
+the heights in which the map has points; any ray that way at all. Movers hide what is behind them."""
+WITHOUT_MOVERS = 5
+"""The same five, this many bits higher, of the scan without the points of moving objects."""
+BEGINS_ABOVE, REACHES_HIGHER = 1 << 14, 1 << 15
+"""The map begins above the sensor's view at that range; it reaches higher than the scan's points."""
+WORDS = 1 << 16
+_BEHIND, _CLEAR, _NEVER = np.uint8(Sight.BEHIND), np.uint8(Sight.CLEAR), np.uint8(Sight.NEVER)
+LEVEL = np.array([0.0, 0.0, 1.0])
+_SIGHT = {
+    "points": CLEAR,
+    "cells": CLEAR_OF_CELLS,
+    "farthest": BEFORE_FARTHEST,
+    "column": THROUGH_COLUMN,
+}
+_TALL = {"bottom": BEGINS_ABOVE, "height": REACHES_HIGHER}
+
+
+@kernel
+def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: int, words: U16) -> None:
+    """The five bits of one view into ``words``, in place; all planes (rows, cols)."""
+    for r in range(sight.shape[0]):
+        for c in range(sight.shape[1]):
+            if sight[r, c] == _NEVER:
+                continue
+            word = FIRED
+            if sight[r, c] >= _BEHIND:
+                word |= BEFORE_FARTHEST
+            if sight[r, c] == _CLEAR:
+                word |= CLEAR
+            if clear_of_cells[r, c] == _CLEAR:
+                word |= CLEAR_OF_CELLS
+            if (span_of(occupied[r, c]) & passed[r, c] != 0) if occupied[r, c] else sight[r, c] >= _BEHIND:
+                word |= THROUGH_COLUMN
+            words[r, c] |= np.uint16(word << shift)
+
+
+@kernel
+def _of_points(
+    counts: I32, hit: U64, occupied: U64, bottom_z: F32, eye: tuple[F64, F64], x0: float, y0: float, tan_top: float,
+    words: U16,
+) -> None:  # fmt: skip
+    """``eye``: the sensor's place and its upward axis, (3,) each."""
+    origin, up = eye
+    for r in range(counts.shape[0]):
+        for c in range(counts.shape[1]):
+            word = min(counts[r, c], MOST_POINTS)
+            if occupied[r, c]:
+                dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
+                dz = bottom_z[r, c] - origin[2]
+                above = dx * up[0] + dy * up[1] + dz * up[2]  # as the sensor leans, not as the world lies
+                if above > tan_top * np.sqrt(max(dx * dx + dy * dy + dz * dz - above * above, 0.0)):
+                    word |= BEGINS_ABOVE
+            if occupied[r, c] > below_top(hit[r, c]):
+                word |= REACHES_HIGHER
+            words[r, c] |= np.uint16(word)
+
+
+def cell_words(
+    view: ScanView,
+    reference: Reference,
+    origin_map: F64,
+    sensor: Sensor,
+    clear_of_cells: U8 | None = None,
+    without_movers: tuple[ScanView, U8] | None = None,
+    up_map: F64 = LEVEL,
+) -> U16:
+    """(rows, cols) words of one scan seen from ``origin_map`` (3,), map metres, by a sensor with the upward axis
+    ``up_map`` (3,).
+
+    ``clear_of_cells``: the :class:`Sight` of each cell where only occupied cells hide; ``without_movers``: view and
+    that sight of the scan without its movers. What is not given is taken to be like the rest.
+    """
+    words = np.zeros(view.counts.shape, dtype=np.uint16)
+    tan_top, grid = float(np.tan(np.radians(sensor.fov_top_deg))), view.grid
+    _of_points(
+        view.counts,
+        view.hit,
+        reference.occupied,
+        reference.bottom_z,
+        (origin_map, up_map),
+        grid.x0,
+        grid.y0,
+        tan_top,
+        words,
+    )
+    cells = view.sight if clear_of_cells is None else clear_of_cells
+    _of_sight(view.sight, cells, view.passed, reference.occupied, 0, words)
+    still, still_cells = (view, cells) if without_movers is None else without_movers
+    _of_sight(still.sight, still_cells, still.passed, reference.occupied, WITHOUT_MOVERS, words)
+    return words
+
+
+def sightings(seen: Observation, sensor: Sensor, n_min: int, asked: PaperSettings | None = None) -> U16:
+    """(rows, cols) words over the view's grid; only those bits are worked out that the reading ``asked`` looks at, or
+    all of them. ``n_min``: points that make a cell occupied, for what hides where only occupied cells do."""
+    by_cells = asked is None or asked.line_of_sight == "cells"
+    removed = asked is None or asked.movers == "removed"
+    everything = np.ones(len(seen.moving), dtype=np.bool_)
+    cells = _clear_of_cells(seen, everything, n_min) if by_cells else None
+    without = None
+    if removed:
+        still = ~seen.moving
+        view = _cast(seen, still, seen.scan.obstacle)
+        without = view, _clear_of_cells(seen, still, n_min) if by_cells else view.sight
+    words = cell_words(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without, seen.scan.up_map)
+    if asked is not None:
+        words[~votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)] = 0
+    return words
+
+
+def votes_in(grid: Grid, origin_map: F64, window_m: float) -> Bool:
+    """(rows, cols) of ``grid``: the cells of the square of ``window_m`` around the vehicle."""
+    inner = window_around(grid.lattice, float(origin_map[0]), float(origin_map[1]), window_m).intersection(grid)
+    out = np.zeros(grid.shape, dtype=np.bool_)
+    out[inner.slices_in(grid)] = True
+    return out
+
+
+def _clear_of_cells(seen: Observation, chosen: Bool, n_min: int) -> U8:
+    """Sight where only those returns hide what is behind them that lie in cells with n_min obstacle points or more."""
+    scan = seen.scan
+    counted = chosen & scan.obstacle & (scan.cell >= 0)
+    counts = np.bincount(scan.cell[counted], minlength=seen.reference.counts.size)
+    return _cast(seen, chosen, counted & (counts[scan.cell] >= n_min)).sight
+
+
+def _cast(seen: Observation, chosen: Bool, obstacle: Bool) -> ScanView:
+    """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that hide what is behind them."""
+    scan, still = seen.scan, np.zeros(int(chosen.sum()), dtype=np.bool_)
+    points, cell = scan.points_map[chosen], scan.cell[chosen]
+    return cast_rays(points, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
+
+
+@lru_cache(maxsize=64)
+def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32]:
+    """The reading as a table: (states (2, 65536) by whether the map holds points and by word, weights (65536,)).
+
+    A cell with n_min points or more is occupied and worth w(n), Eq. (1), in VOTE_UNITs; with fewer undetermined or
+    empty; with none empty if it was visible, else undetermined or without a vote. NO_VOTE where no ray was fired, and,
+    in case 5 (``skip_tall_cells``), where the map is too tall.
+    """
+    words = np.arange(WORDS)
+    n = words & MOST_POINTS
+    shift = WITHOUT_MOVERS if paper.movers == "removed" else 0
+    visible = words & (_SIGHT[paper.line_of_sight] << shift) != 0
+    fired = words & (FIRED << shift) != 0
+    occupied = n >= paper.n_min
+    empty = (n == 0) & visible
+    if paper.few_points == "empty":
+        empty |= (n > 0) & ~occupied
+    unseen = int(CellState.UNDETERMINED) if paper.occluded == "votes" else NO_VOTE
+    states = np.empty((2, WORDS), dtype=np.uint8)
+    for mapped, if_occupied, if_empty in (
+        (0, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY),
+        (1, CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY),
+    ):
+        states[mapped] = np.where(n > 0, CellState.UNDETERMINED, np.where(fired, unseen, NO_VOTE))
+        states[mapped, empty] = if_empty
+        states[mapped, occupied] = if_occupied
+        if voting.skip_tall_cells:
+            states[mapped, words & _TALL[paper.tall_rule] != 0] = NO_VOTE
+    points = weight_table(voting.weighted, voting.a, voting.b, voting.k, paper.n_min, MOST_POINTS)
+    return states, np.where(occupied, points[n], VOTE_UNIT).astype(np.int32)
+
+
+def classify_paper(words: U16, mapped: Bool, voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32]:
+    """The paper's five states and the votes each is worth: (states uint8, weights int32 in VOTE_UNITs), (rows, cols).
+
+    ``words`` (rows, cols) what the scan says (:func:`sightings`), ``mapped`` where the map holds
+    obstacle points; see :func:`reading_table`.
+    """
+    states, weights = reading_table(voting, paper)
+    return states[mapped.astype(np.intp), words], weights[words]
+
+
+class Tally:
+    """Votes per cell and class over a drive: :func:`mapvote.core.voting.cast` on the tiles that a window touches."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, I32] = {}
+        """(256, 256, 5) int32 in VOTE_UNITs."""
+
+    def cast(self, grid: Grid, states: U8, weights: I32) -> None:
+        """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
+        for tile in grid.tiles():
+            window = self.lattice.tile(tile)
+            common = window.intersection(grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
+            inner, outer = common.slices_in(window), common.slices_in(grid)
+            cast(self.tiles[tile][inner], states[outer], weights[outer])
+
+
+class PaperVoter:
+    """Paper III: every scan classifies every cell and casts its votes."""
+
+    def __init__(self, voting: VotingSettings, paper: PaperSettings, sensor: Sensor, point_map: PointMap) -> None:
+        self.voting, self.paper, self.sensor = voting, paper, sensor
+        self._tally = Tally(point_map.lattice)
+
+    def observe(self, seen: Observation) -> U64:
+        """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
+        words = sightings(seen, self.sensor, self.paper.n_min, self.paper)
+        states, weights = classify_paper(words, seen.reference.counts > 0, self.voting, self.paper)
+        self._tally.cast(seen.view.grid, states, weights)
+        return np.where(states == CellState.CHANGED_OCCUPIED, EVERY_BIT, np.uint64(0))
+
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """Every tile with a vote, in ascending order; ``only``: of these tiles."""
+        for tile, tally in sorted(self._tally.tiles.items()):
+            if (only is None or tile in only) and tally.any():
+                new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
+                yield tile, TileVotes(tally, plurality(tally), None, new, None)
+
+
+_TRIED = {"n_min": (3, 5, 8), "window_m": (80.0, 60.0, 40.0)}
+"""Numbers that a sweep of the readings tries."""
+
+
+def readings_of(base: PaperSettings, only: str | None = None) -> dict[str, PaperSettings]:
+    """By name ("as set", "occluded abstains", "n_min 3", ..): ``base``, and it with one sentence read otherwise.
+
+    ``only``: the one setting that is varied; None: each in turn.
+    """
+    found = {"as set": base}
+    for setting, field in PaperSettings.model_fields.items():
+        for value in _TRIED.get(setting) or get_args(field.annotation):
+            if only in (None, setting) and value != getattr(base, setting):
+                found[f"{setting} {value}"] = base.model_copy(update={setting: value})
+    return found
+
+
+def read(base: PaperSettings, said: str) -> PaperSettings:
+    """``base`` with what ``said`` changes: "occluded=abstains, n_min=3". MapvoteError names what there is."""
+    values = base.model_dump()
+    for piece in said.split(","):
+        setting, _, value = (part.strip() for part in piece.partition("="))
+        if setting not in values:
+            raise MapvoteError(f"reading {piece.strip()!r}: choose {', '.join(values)}, as in occluded=abstains")
+        values[setting] = value
+    try:
+        return PaperSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise MapvoteError(f"reading {first['loc'][0]}={first['input']}: {first['msg']}") from error

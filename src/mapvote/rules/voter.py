@@ -1,0 +1,213 @@
+"""What a change rule gives of each tile: its votes, and the points of what may be new.
+
+They are kept tile by tile, so that memory follows the road, not its length in scans.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.core.kernel import kernel
+from mapvote.core.point_map import cut_tiles
+from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool
+from mapvote.core.voxels import first_of_each, voxel_keys
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.rules.packed_tiles import Shelf, Slot
+
+
+@dataclass(frozen=True, slots=True)
+class TileVotes:
+    """The votes of one drive on one tile."""
+
+    tally: I32
+    """(256, 256, 5) votes in VOTE_UNITs."""
+    states: U8
+    """(256, 256) decided by this vehicle alone."""
+    gone: U64 | None
+    """(256, 256) words of the map voxels that are gone: of changed-empty cells, and of cells that stand. None: all of
+    changed-empty cells."""
+    new: U64
+    """(256, 256) words of the voxels whose points are new in changed-occupied cells."""
+    free: U64 | None
+    """(256, 256) words of the voxels that rays showed to be free and the map did not know to be; None: the rule has
+    none."""
+    looked: F64 | None = None
+    """(m, k) features of each changed cell, ascending (rules/surfaces.py); None: the rule has none."""
+
+
+class Voter(Protocol):
+    """The paper's votes of each scan (rules/paper.py), or surfaces (rules/surfaces.py)."""
+
+    def observe(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
+
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The votes of the scans so far, for every tile with votes, in any order: one by one, so that no drive is too
+        long for memory. ``only``: of these tiles. The call changes nothing."""
+
+
+_COMPACT_AT = 50_000
+"""Points sorted together: so many take a few milliseconds, so that no scan waits longer."""
+REACH_M = 70.0
+"""New points are taken up to this range, farther than votes are cast: the map is at hand for a tile's width around the
+vehicle."""
+
+
+def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
+    """Indices of the points (n, 3), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
+
+    ``cell`` (n,) the flat cell of each point, -1 outside; ``base`` (cells,) the lowest layer of each column.
+    """
+    chosen = np.empty(len(points) + 1, np.int64)
+    return chosen[: _select(points, cell, wanted, unwanted, words, base, chosen)].copy()
+
+
+@kernel
+def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64) -> np.int64:
+    """:func:`select` into the first of ``chosen`` (n + 1,); returns how many. Each index is written, and written over
+    if its point is not chosen: a branch could not be predicted."""
+    near = np.uint64(0)
+    for i in range(np.uint64(0), np.uint64(len(points))):
+        k = np.uint64(max(cell[i], np.int32(0)))
+        here = wanted[i] & (not unwanted[i]) & (cell[i] >= 0)
+        chosen[near] = i
+        near += np.uint64(1) if here & (words[k] != 0) else np.uint64(0)
+    found = np.uint64(0)
+    for w in range(np.uint64(0), near):
+        point = np.uint64(chosen[w])
+        k = np.uint64(cell[point])
+        chosen[found] = point
+        found += words[k] >> np.uint64(column_bit(points[point, 2], base[k])) & np.uint64(1)
+    return np.int64(found)
+
+
+@kernel
+def _beyond(
+    points: F64, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
+    corner: tuple[int, int], found: I64,
+) -> int:  # fmt: skip
+    """Into the first of ``found`` (n,) which of the points (n, 3) outside the local grid (``cell`` -1) are obstacles,
+    within reach, and in voxels that the map does not hold; returns how many. The map is the planes (rows, cols) whose
+    first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
+    rows, cols = occupied.shape
+    n, (x0, y0), (row0, col0) = 0, lattice, corner
+    for i in range(len(points)):
+        if cell[i] >= 0 or (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 >= REACH_M**2:
+            continue
+        c = int(np.floor((points[i, 0] - x0) / CELL_SIZE)) - col0
+        r = int(np.floor((points[i, 1] - y0) / CELL_SIZE)) - row0
+        if not (0 <= r < rows and 0 <= c < cols):
+            continue
+        z = points[i, 2]
+        if height_above(z, ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
+            continue
+        if not (occupied[r, c] >> np.uint64(column_bit(z, base[r, c]))) & np.uint64(1):
+            found[n] = i
+            n += 1
+    return n
+
+
+class NewPoints:
+    """One point per 0.3 m voxel, the first one offered: candidates for changed-occupied cells."""
+
+    def __init__(self, lattice: Lattice, beyond: bool = True, *, intensity: bool = False) -> None:
+        """``beyond``: also take points outside the local grid. The paper takes none, and the filter of moving objects
+        does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``intensity``:
+        keep it with each point."""
+        self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
+        self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Slot]](list)
+        """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
+        self._last: F64 | None = None
+        """The last run, if it is still small."""
+        self._waiting: list[F64] = []
+        self._count = 0
+
+    def gather(self, seen: Observation, may_be_new: U64) -> None:
+        """Offer the points of one scan that lie in ``may_be_new`` (rows, cols) of its view, or outside the view."""
+        scan = seen.scan
+        words, base = may_be_new.ravel(), np.ascontiguousarray(scan.reference.base).ravel()
+        self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
+        if self.beyond:
+            self._offer_of(scan, self._strange_beyond(scan))
+
+    def _offer_of(self, scan: PlacedScan, chosen: I64) -> None:
+        intensity = None if scan.intensity is None or not self.intensity else scan.intensity[chosen]
+        self.offer(scan.points_map[chosen], intensity)
+
+    def _strange_beyond(self, scan: PlacedScan) -> I64:
+        """(m,) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
+
+        They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
+        """
+        grid, outer = scan.outer.grid, scan.outer
+        lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
+        found = np.empty(len(scan.points_map), np.int64)
+        n = _beyond(
+            scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
+            found,
+        )  # fmt: skip
+        return found[:n].copy()
+
+    def offer(self, points_map: F64, intensity: F32 | None = None) -> None:
+        """Points (n, 3), map metres, and their intensity (n,); 0 where None."""
+        if len(points_map):
+            if self.intensity:
+                points_map = np.column_stack(
+                    [points_map, np.zeros(len(points_map)) if intensity is None else intensity]
+                )
+            self._waiting.append(points_map)
+            self._count += len(points_map)
+            if self._count > _COMPACT_AT:
+                self._compact()
+
+    def _compact(self) -> None:
+        """Sort the points since the last run into a new run, together with the last run if that is still small."""
+        run = self._one_a_voxel([*self._short(), *self._waiting])
+        self._last = run if len(run) < _COMPACT_AT else None
+        if self._last is None:
+            for tile, points in self._of_tiles(run).items():
+                self._runs[tile].append(self._shelf.put(points.tobytes()))
+        self._waiting, self._count = [], 0
+
+    def _short(self) -> list[F64]:
+        return [] if self._last is None else [self._last]
+
+    def _run(self, place: Slot) -> F64:
+        return np.frombuffer(self._shelf.read(place)).reshape(-1, 4 if self.intensity else 3)
+
+    def _one_a_voxel(self, clouds: list[F64]) -> F64:
+        every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
+        keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
+        first = first_of_each(keys)
+        return every[first[np.argsort(keys[first])]]
+
+    def by_tile(self) -> Callable[[TileIndex], F64]:
+        """What gives the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 4) with their intensity. Those
+        of all tiles of a long drive are never held together."""
+        rest = self._of_tiles(self._one_a_voxel([*self._short(), *self._waiting]))
+
+        def of_tile(tile: TileIndex) -> F64:
+            last = [rest[tile]] if tile in rest else []
+            return self._one_a_voxel([*map(self._run, self._runs.get(tile, [])), *last])
+
+        return of_tile
+
+    def _of_tiles(self, points: F64) -> dict[TileIndex, F64]:
+        return {tile: points[mine] for tile, mine in cut_tiles(points, self.lattice)}
+
+
+def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32, U8 | None]:
+    """Those of ``points_map`` (n, 3 or 4) that lie in voxels of ``words`` (256, 256) of a tile: (m, 3) float32 from its
+    corner, and the intensity (m,) of those that came with one, 255 for 1.0."""
+    rows, cols, _ = window.indices_of(points_map)
+    cell = (rows * window.cols + cols).astype(np.int32)
+    every = np.ones(len(points_map), np.bool_)
+    kept = points_map[select(points_map, cell, every, ~every, words.ravel(), base.ravel())]
+    return window.from_map(kept[:, :3]), np.rint(kept[:, 3] * 255.0).astype(np.uint8) if kept.shape[1] == 4 else None

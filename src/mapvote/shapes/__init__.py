@@ -1,0 +1,1 @@
+"""Shapes of what changed: outlines, objects, GeoJSON, cut-out clouds, pictures."""

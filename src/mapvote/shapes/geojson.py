@@ -1,0 +1,157 @@
+"""Change objects and tiles as GeoJSON, and any list of the server as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.types import F64
+from mapvote.formats.geo.frame import MapFrame, frame_of
+from mapvote.shapes.change_objects import ChangeObject
+from mapvote.shapes.outlines import Ring
+
+
+def to_geojson(
+    objects: Sequence[ChangeObject],
+    lattice: Lattice,
+    *,
+    map_id: str,
+    from_version: int | None = None,
+    to_version: int | None = None,
+    georeference: Mapping[str, str] | None = None,
+    lonlat: bool = False,
+) -> dict[str, Any]:
+    """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``json.dumps``; its member "frame" says where
+    coordinates lie.
+
+    ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
+    """
+    frame = frame_of(georeference or {})
+    features = [_feature(o, lattice, _neighbours(o, objects)) for o in objects]
+    if lonlat and not frame.is_local:
+        for feature in features:
+            rings_to_lonlat(feature["geometry"], frame)
+    return {
+        "type": "FeatureCollection",
+        "frame": "WGS 84 longitude, latitude" if lonlat and not frame.is_local else f"{MAP_METRES}: {frame.told()}",
+        "map_id": map_id,
+        "georeference": dict(georeference or {}),
+        "from_version": from_version,
+        "to_version": to_version,
+        "features": features,
+    }
+
+
+def rings_to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
+    """Rings in map metres to degrees, in place; 1e-8 degrees are a millimetre. The sense of the rings stays."""
+    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    for polygon in polygons:
+        for i, ring in enumerate(polygon):
+            corners = np.column_stack([np.array(ring), np.zeros(len(ring))])
+            polygon[i] = np.round(frame.to_lonlat(corners)[:, :2], 8).tolist()
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows as CSV with a header; lists joined by spaces. Text that looks like a formula gets a quote."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer.writerow(names)
+    writer.writerows([[_cell(row.get(name)) for name in names] for row in rows])
+    return out.getvalue()
+
+
+def feature_rows(collection: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The features of :func:`to_geojson` without their outlines, for a table."""
+    return [{"id": f["id"]} | f["properties"] for f in collection["features"]]
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        value = " ".join(map(str, value))
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
+    """Ids of other large things whose box is within 15 m, nearest first."""
+    near, a = [], change.box
+    for other in objects:
+        if other is not change and other.size == "large":
+            gaps = [max(a[i] - other.box[i + 2], other.box[i] - a[i + 2], 0.0) for i in (0, 1)]
+            near.append((CELL_SIZE * math.hypot(*gaps), other.id))
+    return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
+
+
+def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
+    polygons = [[_corners(ring, lattice) for ring in polygon] for polygon in change.outline]
+    single = len(polygons) == 1
+    return {
+        "type": "Feature",
+        "id": change.id,
+        "geometry": {
+            "type": "Polygon" if single else "MultiPolygon",
+            "coordinates": polygons[0] if single else polygons,
+        },
+        "properties": {name: _rounded(name, getattr(change, name)) for name in _FACTS}
+        | {
+            "first_seen": utc(change.first_seen_ns),
+            "last_seen": utc(change.last_seen_ns),
+            "versions": change.versions,
+            "box": _corners(np.reshape(change.box, (2, 2)), lattice),
+            "near": near,
+        },
+    }
+
+
+_FACTS = (
+    *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
+    *("against_median", "share_for", "probability"),
+)
+_DIGITS = {"area_m2": 2, "height_m": 2, "volume_m3": 2, "share_for": 3, "probability": 3}
+
+
+def _rounded(name: str, value: Any) -> Any:
+    return value if value is None or name not in _DIGITS else round(value, _DIGITS[name])
+
+
+def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
+    metres = np.round(ring * CELL_SIZE + np.array([lattice.x0, lattice.y0]), 3) + 0.0  # + 0.0: no "-0.0" in the file
+    corners: list[list[float]] = metres.tolist()
+    return corners
+
+
+def utc(stamp_ns: int | None) -> str | None:
+    """ISO 8601 in UTC, whole seconds, the year 9999 at most; ``None`` where unknown."""
+    if stamp_ns is None:
+        return None
+    return datetime.fromtimestamp(min(stamp_ns // 10**9, _LAST_S), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+_LAST_S = 253_402_300_799
+NEAR_M = 15.0
+MOST_NEIGHBOURS = 5
+MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
+
+
+def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
+    """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
+    side, squares = TILE_CELLS * CELL_SIZE, []
+    for tile in tiles:
+        window = lattice.tile((tile["row"], tile["col"]))
+        x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))
+        ring = [[x, y], [x1, y], [x1, y1], [x, y1], [x, y]]
+        squares.append(({"type": "Polygon", "coordinates": [ring]}, dict(tile)))
+    return collection(squares)
+
+
+def collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+    """Things in map metres, each (geometry, properties), as GeoJSON."""
+    features = [{"type": "Feature", "geometry": geometry, "properties": properties} for geometry, properties in things]
+    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}

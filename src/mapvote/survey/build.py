@@ -1,0 +1,269 @@
+"""NDT SLAM: drives become the first reference map (paper I, II; [7], [9]).
+
+Two passes. The first finds where the vehicles were: each scan is registered to the NDT map grown so far, drives
+one after the other into the same map; then all poses are settled together: precise priors (a survey vehicle's RTK)
+hold the map in their frame, ordinary ones (GNSS) place it where all of them together have it. The second reads the
+scans again and adds them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel
+(survey.clean_map).
+
+Ordinary priors (GNSS) neither guide nor gate a registration that succeeds: they err by more than it does, and alike
+for a while, which would bend the map. They help where registration fails, moved into the frame of what was driven so
+far. A scan that would jump against the vehicle's motion is not registered; where nothing fits any more the map is
+broken, the track begins anew at the prior, and the report names the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+
+from mapvote.config import Settings
+from mapvote.core.geometry import exp, inverse, transform
+from mapvote.core.grid import Lattice
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.sensor_height import Heights, check_heights, two_levels
+from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
+from mapvote.core.voxels import VoxelCloud, thin
+from mapvote.matching.ndt import refine
+from mapvote.matching.ndt_map import LEVELS, NdtMap
+from mapvote.matching.odometry import ACCELERATION_MPS2, Fix, Tracker
+from mapvote.matching.prepare import in_rows, twist_between
+from mapvote.survey.clean_map import Mapper
+from mapvote.survey.driven_road import road_under, wrong_attitude
+from mapvote.survey.pose_graph import DriveTrack, carried_along, fit_to_priors, settle_poses
+
+Progress = Callable[[int, int], None]
+MOST_OFF = 0.3
+"""Share of a path that may disagree with the ground by more than 0.3 m before the map is refused: below, it is a place
+(a bridge over another drive, a stretch without points); above, something is wrong with the drive."""
+
+_FIRST_DATE_NS = 946_684_800 * 10**9
+"""2000. Clocks that count from zero are below it."""
+_MIN_INLIER_SHARE = 0.4
+"""As the setting of ndt, while the map is still growing: half of a scan may observe unmapped places."""
+_POINTS_M = 0.3
+"""Scans enter the NDT map thinned to one point per such voxel: the paper's storage resolution."""
+_FINE = replace(LEVELS[-1], floor_m=0.03, points_m=0.5)
+"""Of a last look at each scan, narrower than any vehicle needs."""
+_JUMP_M = 0.5
+"""A scan this far from where the last ones were heading, beyond what a vehicle can brake or swerve, is not there."""
+_POLISH_M = 0.1
+"""The last look moves a scan no farther."""
+_PATIENCE = 5
+"""Scans in turn without a registration before the map counts as broken."""
+
+
+@dataclass(frozen=True, slots=True)
+class BuildReport:
+    """What came of building a map."""
+
+    tracks: tuple[DriveTrack, ...]
+    points: int
+    bent_m: float
+    """How far the priors moved a scan at most, after the whole survey was shifted and turned to fit them; 0 without
+    priors."""
+    two_levels: tuple[float, float, float] | None
+    """(x, y, metres apart) where drives ran above each other, the farthest apart: of the two, each cell keeps the road
+    whose path is nearer, below both the lower one. None if nowhere."""
+
+    @property
+    def held_by_prior(self) -> bool:
+        """Whether a precise prior fixed the map's frame; otherwise all priors together, or the first scan, did."""
+        return any(track.drive.has_precise_prior for track in self.tracks)
+
+
+def build_map(
+    drives: Sequence[Drive], settings: Settings | None = None, *, progress: Progress | None = None
+) -> tuple[PointMap, BuildReport]:
+    """One map of all ``drives``, in the frame of their priors (without any, the first scan's lidar frame).
+
+    ``progress(done, total)`` is called after each scan of each of the two passes. Raises MapvoteError if there is
+    nothing to map, or if fewer than half of a drive's scans could be registered.
+    """
+    settings = settings or Settings()
+    scans = sum(len(drive) for drive in drives)
+    if scans == 0:
+        raise MapvoteError("nothing to map: no drive with at least one scan")
+    wrong = [wrong_attitude(drive) for drive in drives]
+    drives = [
+        drive if w is None else replace(drive, prior_sigma_deg=w.sigma_deg)
+        for drive, w in zip(drives, wrong, strict=True)
+    ]
+    surveyor = Surveyor(settings, all(drive.has_precise_prior for drive in drives))
+    _go_through(chain.from_iterable(map(surveyor.follow, drives)), progress, 0, 2 * scans)
+    tracks, bent_m = settle_poses(surveyor.tracks)
+    cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
+    del surveyor  # and with it the largest part of what the first pass took
+    road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud) for track in tracks])
+    mapper = Mapper(map_from_points(cloud, lattice=lattice, road=road), settings, road)
+    _go_through(chain.from_iterable(map(mapper.enter, tracks)), progress, scans, 2 * scans)
+    point_map = replace(
+        mapper.finish(),
+        driven=tuple(track.driven for track in tracks),
+        georeference=dict(_place_on_earth(drives)),
+        surveyed_ns=_last_stamp(drives),
+    )
+    tracks = [
+        replace(track, heights=_agreed_heights(track, point_map), wrong_attitude=found)
+        for track, found in zip(tracks, wrong, strict=True)
+    ]
+    return point_map, BuildReport(tuple(tracks), point_map.n_points, bent_m, two_levels(road) if len(road) else None)
+
+
+def _go_through(scans: Iterable[None], progress: Progress | None, done: int, total: int) -> None:
+    """Let a pass enter its ``scans`` one by one."""
+    for number, _ in enumerate(scans, start=done + 1):
+        if progress:
+            progress(number, total)
+
+
+def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
+    """Where the drives' priors lie. MapvoteError if they lie in different frames: the map could only be in one."""
+    known = [drive.georeference for drive in drives if drive.georeference]
+    if any(other != known[0] for other in known):
+        raise MapvoteError(
+            "the drives' priors lie in different frames (each at its own first fix?): give all of them the same origin "
+            "in drive.toml"
+        )
+    return known[0] if known else {}
+
+
+def _last_stamp(drives: Sequence[Drive]) -> int | None:
+    """When the last drive ended; None if the clock of one has no date."""
+    ends = [int(drive.stamps_ns[-1]) for drive in drives]
+    return max(ends) if min(ends) > _FIRST_DATE_NS else None
+
+
+def _agreed_heights(track: DriveTrack, point_map: PointMap) -> Heights:
+    """Heights of the driven positions over the ground; MapvoteError if that cannot be the road under them."""
+    heights = check_heights(point_map, track.driven)
+    if heights.off_share > MOST_OFF:
+        raise MapvoteError(
+            f"{track.drive.path}: {heights.complaint}. Such a map would be wrong: do the drives' heights "
+            "agree (one datum, no drift in z), and is z up? `mapvote doctor` checks it; else build the drives apart"
+        )
+    return heights
+
+
+class Surveyor:
+    """The NDT map as it grows, drive after drive."""
+
+    def __init__(self, settings: Settings, all_precise: bool = False) -> None:
+        """``all_precise``: only drives with a surveyor's prior will come; they get no final check."""
+        self._all_precise = all_precise
+        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
+        self.ndt_map = NdtMap(np.zeros(3))
+        self.fine_map: NdtMap | None = None
+        """The same points in narrower distributions, of one level."""
+        self.draft = VoxelCloud(Lattice())
+        """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
+        self.tracks: list[DriveTrack] = []
+        """Of the drives followed so far, in the frame of the draft."""
+        self._found: list[F64] = []
+        self._told: list[F64] = []
+        """Positions (3,) of registered scans and of their priors, which determine the frame of the priors."""
+
+    def follow(self, drive: Drive) -> Iterator[None]:
+        """Find the trajectory of one drive, a scan a step: each is entered once registered. At the end it is the last
+        of ``tracks``. MapvoteError if fewer than half of the scans could be registered."""
+        tracker = Tracker(self.ndt_map.around, self.ndt)
+        tracker.twist = _first_motion(drive)
+        precise = drive.has_precise_prior
+        poses, registered, broken, lost = [], [], [], 0
+        for i, scan in enumerate(drive):
+            prior = PosePrior.of(drive, i)
+            fix = self._locate(tracker, scan, prior if precise or not len(self.draft) else None)
+            if not fix.trusted and not precise and prior is not None:
+                prior = self._in_draft(prior)
+                fix = self._locate(tracker, scan, prior)
+            # A surveyor enters where no drive has been yet: a precise prior is as good as a registration.
+            if not fix.trusted and prior is not None and (precise or lost >= _PATIENCE):
+                fix = tracker.begin(scan, prior.T_map_lidar)
+                broken += [] if precise else [i]
+            lost = 0 if fix.trusted else lost + 1
+            poses.append(fix.registration.T_map_lidar)
+            registered.append(fix.trusted)
+            if fix.trusted:
+                self._enter(fix, drive, i)
+            yield
+        if np.mean(registered) < 0.5:
+            raise MapvoteError(
+                f"{drive.path}: only {int(np.sum(registered))} of {len(drive)} scans could be registered to the map "
+                "so far; is the drive in order of time, and its prior in the same frame as the other drives'?"
+            )
+        unknown = np.full(len(poses), np.nan)
+        self.tracks.append(DriveTrack(drive, np.array(poses), np.array(registered), tuple(broken), unknown))
+
+    def _locate(self, tracker: Tracker, scan: Scan, prior: PosePrior | None) -> Fix:
+        """The scan in the map so far; untrusted if it would jump."""
+        if not len(self.draft):
+            return tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
+        before = tracker.last_pose, tracker.last_stamp_ns, tracker.twist
+        moving = tracker.last_pose is not None and bool(tracker.twist.any())
+        fix = tracker.localise(scan, prior)
+        if not fix.trusted or not moving or before[0] is None:
+            return fix
+        age = 1e-9 * (scan.stamp_ns - before[1])
+        ahead = before[0] @ exp(age * before[2])
+        off = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - ahead[:3, 3]))
+        if off <= _JUMP_M + 0.5 * ACCELERATION_MPS2 * age**2:
+            return self._polished(tracker, fix, before[0], age) if prior is None else fix
+        tracker.move_to(before[0], before[1], before[2], fix.registration.score)
+        return replace(fix, trusted=False)
+
+    def _polished(self, tracker: Tracker, fix: Fix, last_pose: F64, age: float) -> Fix:
+        """The fix after a last look at the narrower distributions; as it is if they do not agree nearly.
+
+        Wide distributions pull every scan to where the map already is, at 11 m/s by 5 mm and a little nose up; over a
+        kilometre such a pull adds up.
+        """
+        T_map_lidar = fix.registration.T_map_lidar
+        if self.fine_map is None:
+            return fix
+        points = in_rows(fix.points[thin(fix.points, _FINE.points_m)])
+        found = refine(self.fine_map.around(T_map_lidar[:3, 3]), [points], T_map_lidar)
+        if not found.converged or np.linalg.norm(found.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]) > _POLISH_M:
+            return fix
+        tracker.correct(found.T_map_lidar, twist_between(last_pose, found.T_map_lidar, age))
+        return replace(fix, registration=replace(fix.registration, T_map_lidar=found.T_map_lidar))
+
+    def _in_draft(self, prior: PosePrior) -> PosePrior:
+        """A prior moved to the frame of what was driven so far, as uncertain as the priors proved there."""
+        if not self._told:
+            return prior
+        found, told = np.array(self._found), np.array(self._told)
+        T_prior_draft = fit_to_priors(found, told, prior.sigma_m)
+        off = np.linalg.norm(found @ T_prior_draft[:3, :3].T + T_prior_draft[:3, 3] - told, axis=1)
+        T_map_lidar = inverse(T_prior_draft) @ prior.T_map_lidar
+        return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.median(off))))
+
+    def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
+        T_map_lidar = fix.registration.T_map_lidar
+        points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
+        spread = points_map.take(thin(points_map - position, _POINTS_M), axis=0)
+        self.ndt_map.around(position).enter(spread)
+        if not self._all_precise:
+            if self.fine_map is None:
+                self.fine_map = NdtMap(position, (_FINE,))
+            self.fine_map.enter(spread)
+        self.draft.enter(points_map)
+        if drive.T_map_lidar_prior is not None:
+            self._found.append(position.copy())
+            self._told.append(drive.T_map_lidar_prior[i, :3, 3])
+
+
+def _first_motion(drive: Drive) -> F64:
+    """(6,) motion per second at the start by the priors: to the next scan, or the middle one of several over a second
+    if they are coarse, of which one may be wild."""
+    told = drive.T_map_lidar_prior
+    if told is None or len(drive) < 2:
+        return np.zeros(6)
+    seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
+    k = 1 if drive.has_precise_prior else max(1, int(np.searchsorted(seconds, 1.0)))
+    k = min(k, len(drive) - 1)
+    tries = 1 if drive.has_precise_prior else min(k, len(drive) - k)
+    motions = [twist_between(told[i], told[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
+    return np.asarray(np.median(motions, axis=0))

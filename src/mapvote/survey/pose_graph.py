@@ -1,0 +1,355 @@
+"""Where all scans of all drives were, settled together: the shape from registration, the place from every prior.
+
+Registration to a growing map is smooth but drifts; a prior does not drift but is rough. Gauss-Newton on SE(3) over the
+whole trajectory keeps the shape of the one in the frame of the other. Source: Barfoot, State Estimation for Robotics,
+8.1 and 9.
+
+A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild. Odometry
+keeps its shape far better than satellites keep their place, and satellites keep their place far better than one of them
+does. So the first prior founds nothing: the whole is turned about the vertical and shifted to the robust least-squares
+fit of them all. Then the graph lets the priors bend it only as far as their number of *independent* errors allows, none
+of them more than its distance from the others allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu, spsolve
+from scipy.spatial import cKDTree
+
+from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
+from mapvote.core.sensor_height import UNKNOWN, Heights
+from mapvote.core.types import F64, I64, PRECISE_PRIOR_M, Bool, Drive
+from mapvote.survey.driven_road import WrongAttitude
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far a drive's poses lie from its prior. With a coarse prior this is mostly the prior's own error."""
+
+    median_m: float
+    max_m: float
+    median_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class DriveTrack:
+    """The trajectory of one drive: as surveyed, in the frame of the draft, then settled, in that of the map."""
+
+    drive: Drive
+    """As precise as its scans show it, see ``wrong_attitude``."""
+    T_map_lidar: F64
+    """(n, 4, 4) a pose per scan; that of a scan that could not be registered is the best guess."""
+    registered: Bool
+    """(n,) whether the scan could be registered; the others do not enter the map."""
+    broken: tuple[int, ...]
+    """Scans at which the track began anew because nothing fitted: there only priors tie the map together."""
+    sigma_m: F64
+    """(n,) standard deviation of each settled position in the frame of the priors, NaN without any."""
+    heights: Heights = UNKNOWN
+    """Of the sensor over the map's ground."""
+    wrong_attitude: WrongAttitude | None = None
+    """What contradicts the precise attitude that the prior states: the drive is built with a coarser one."""
+
+    @property
+    def vehicle(self) -> str:
+        return self.drive.vehicle
+
+    @property
+    def drive_id(self) -> str:
+        return self.drive.drive_id
+
+    @property
+    def driven(self) -> F64:
+        """(m, 3) the positions of its registered scans, map metres."""
+        return np.asarray(self.T_map_lidar[self.registered, :3, 3])
+
+    @property
+    def length_m(self) -> float:
+        """Of the way from scan to scan."""
+        return float(np.linalg.norm(np.diff(self.T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
+
+    @property
+    def drift(self) -> Drift | None:
+        """Against the prior, where there is one."""
+        prior = self.drive.T_map_lidar_prior
+        if prior is None:
+            return None
+        off = np.linalg.norm((self.T_map_lidar - prior)[:, :3, 3], axis=1)
+        turn = np.degrees(rotation_angles(inverses(prior) @ self.T_map_lidar))
+        return Drift(float(np.median(off)), float(off.max()), float(np.median(turn)))
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """Measured motions: pose ``second[k]`` in the frame of pose ``first[k]``."""
+
+    first: I64
+    second: I64
+    T_first_second: F64
+    """(k, 4, 4)."""
+    sigma_m: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """Poses known in the map beforehand."""
+
+    pose: I64
+    T_map: F64
+    """(k, 4, 4)."""
+    sigma_m: float
+    sigma_rad: float
+    said_m: float = 1.0
+    """What each claims of itself alone; ``sigma_m`` is wider where many err alike."""
+    weights: F64 | None = None
+    """(k,) in (0, 1], how far each is believed; None: all."""
+
+
+def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations: int = 4) -> F64:
+    """Poses (n, 4, 4) moved to the least-squares solution; those that nothing fixes stay where they are."""
+    poses = T_map.copy()
+    for _ in range(iterations):
+        H, gradient = _normal_equations(poses, links, anchors)
+        step = -np.asarray(spsolve(H, gradient.ravel())).reshape(len(poses), 6)
+        poses = poses @ exps(step)
+        if np.abs(step).max(initial=0.0) < 1e-6:
+            break
+    return poses
+
+
+def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], asked: I64) -> F64:
+    """(k,) standard deviation of the positions of the poses ``asked`` (k,), the largest over all directions."""
+    H, _ = _normal_equations(T_map, links, anchors)
+    solve = splu(H).solve
+    out = []
+    for i in asked.tolist():
+        unit = np.zeros((6 * len(T_map), 3))
+        unit[6 * i : 6 * i + 3] = np.eye(3)
+        out.append(np.sqrt(np.linalg.eigvalsh(solve(unit)[6 * i : 6 * i + 3])[-1]))
+    return np.array(out)
+
+
+def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[sparse.csc_matrix, F64]:
+    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step itself keeps what is free."""
+    n = len(poses)
+    gradient = np.zeros((n, 6))
+    every = np.arange(n)
+    blocks = [(every, every, np.broadcast_to(1e-6 * np.eye(6), (n, 6, 6)))]
+    for link in links:
+        W, (i, j) = _weight(link.sigma_m, link.sigma_rad), (link.first, link.second)
+        T_i_j = inverses(poses[i]) @ poses[j]
+        r = logs(inverses(link.T_first_second) @ T_i_j)
+        A_t = -adjoints(inverses(T_i_j)).transpose(0, 2, 1)
+        A_t_W = A_t * W
+        np.add.at(gradient, i, (A_t_W * r[:, None, :]).sum(axis=2))
+        np.add.at(gradient, j, W * r)
+        blocks += [
+            (i, i, A_t_W @ A_t.transpose(0, 2, 1)),
+            (j, j, np.broadcast_to(np.diag(W), (len(j), 6, 6))),
+            (i, j, A_t_W),
+            (j, i, A_t_W.transpose(0, 2, 1)),
+        ]
+    for anchor in anchors:
+        W, i = _weight(anchor.sigma_m, anchor.sigma_rad), anchor.pose
+        believed = np.ones(len(i)) if anchor.weights is None else anchor.weights
+        np.add.at(gradient, i, believed[:, None] * W * logs(inverses(anchor.T_map) @ poses[i]))
+        blocks.append((i, i, believed[:, None, None] * np.diag(W)))
+    first, second, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    row = np.broadcast_to(6 * first[:, None, None] + np.arange(6)[:, None], values.shape)
+    col = np.broadcast_to(6 * second[:, None, None] + np.arange(6), values.shape)
+    # Blocks that stand in the same place add up.
+    H = sparse.csc_matrix((values.ravel(), (row.ravel(), col.ravel())), shape=(6 * n, 6 * n))
+    return H, gradient
+
+
+def _weight(sigma_m: float, sigma_rad: float) -> F64:
+    """(6,) the diagonal of an information matrix."""
+    return np.array([sigma_m**-2] * 3 + [sigma_rad**-2] * 3)
+
+
+PRIOR_MEMORY_S = 20.0
+"""How long the errors of a coarser prior stay alike: those of GNSS without corrections change over such times."""
+_SLACK = 5.0
+"""Widens a precise prior's sigma: its errors are alike for a while."""
+_LINK_SIGMA_M, _LINK_SIGMA_RAD = 0.003, float(np.radians(0.01))
+"""Random error of the motion from scan to scan."""
+_REVISIT_M, _REVISIT_S = 10.0, 10.0
+"""A scan this near to one at least so much older is linked to it."""
+_REWEIGHTED = 3
+"""How often the priors' weights are taken anew."""
+_TOGETHER = 100_000
+"""Points that are moved together: each needs its own motion."""
+_ASKED = 12
+"""Poses of a drive whose covariance is worked out; the others lie between."""
+
+
+def settle_poses(tracks: Sequence[DriveTrack]) -> tuple[list[DriveTrack], float]:
+    """(the tracks with poses that agree with each other's motion and with all priors; how far the priors moved a scan
+    at most, after the whole had been shifted and turned to fit them, metres). As given if there are no priors."""
+    drives = [track.drive for track in tracks]
+    starts = np.cumsum([0] + [len(track.T_map_lidar) for track in tracks])
+    T = np.concatenate([track.T_map_lidar for track in tracks])
+    known = np.flatnonzero(np.concatenate([track.registered for track in tracks]))
+    if not any(drive.T_map_lidar_prior is not None for drive in drives):
+        return list(tracks), 0.0
+    if not any(drive.has_precise_prior for drive in drives):
+        T = _laid_on_priors(drives, T, known, starts) @ T
+    rigid = T
+    links = _links(drives, T, known, _pieces(tracks, starts))
+    anchors = _anchors(drives, T, starts)
+    for _ in range(_REWEIGHTED):
+        T = optimise(T, links, anchors)
+        anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
+    bent_m = float(np.linalg.norm((T - rigid)[:, :3, 3], axis=1).max())
+    settled = zip(tracks, np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), strict=True)
+    return [replace(track, T_map_lidar=poses, sigma_m=sigma_m) for track, poses, sigma_m in settled], bent_m
+
+
+def carried_along(points: F64, found: Sequence[DriveTrack], settled: Sequence[DriveTrack]) -> F64:
+    """Points (n, 3) of the draft, each moved as the nearest scan was when the tracks ``found`` were settled.
+
+    The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
+    is not bent alike lies too high here and too low there, by all that the first pass has drifted.
+    """
+    before, after = (np.concatenate([t.T_map_lidar[t.registered] for t in tracks]) for tracks in (found, settled))
+    if np.array_equal(before, after):
+        return points
+    moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
+    for first in range(0, len(points), _TOGETHER):
+        some = points[first : first + _TOGETHER]
+        T = moved[tree.query(some)[1]]
+        out[first : first + _TOGETHER] = np.einsum("nij,nj->ni", T[:, :3, :3], some) + T[:, :3, 3]
+    return out
+
+
+def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> list[F64]:
+    ends = list(pairwise(starts.tolist()))
+    asked = [np.unique(np.linspace(a, b - 1, _ASKED).round().astype(np.int64)) for a, b in ends]
+    sigmas = position_sigmas(T, links, anchors, np.concatenate(asked))
+    pieces = np.split(sigmas, np.cumsum([len(a) for a in asked])[:-1])
+    return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
+
+
+def _pieces(tracks: Sequence[DriveTrack], starts: I64) -> I64:
+    """(n,) number of the unbroken stretch that each scan belongs to."""
+    begins = np.zeros(int(starts[-1]), dtype=np.int64)
+    begins[starts[:-1]] = 1
+    for start, one in zip(starts, tracks, strict=False):
+        begins[start + np.array(one.broken, dtype=np.int64)] = 1
+    return np.cumsum(begins)
+
+
+def _laid_on_priors(drives: Sequence[Drive], T: F64, known: I64, starts: I64) -> F64:
+    """(4, 4) one motion of the whole, from all drives' priors."""
+    positions, priors, said = [], [], []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is not None:
+            mine = known[(known >= start) & (known < start + len(drive))]
+            positions.append(T[mine, :3, 3])
+            priors.append(drive.T_map_lidar_prior[mine - start, :3, 3])
+            said.append(drive.prior_sigma_m)
+    return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(said))
+
+
+def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
+    """All priors of all drives; of errors that last, as many scans as share one share one weight."""
+    out = []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is None:
+            continue
+        slack = _SLACK
+        if not drive.has_precise_prior:
+            seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
+            alike = min(1.0, PRIOR_MEMORY_S / max(seconds, 1e-3)) * len(drive)
+            slack = float(np.sqrt(max(alike, 1.0)))
+        sigma_rad = _SLACK * slack * float(np.radians(drive.prior_sigma_deg))
+        anchor = Anchors(
+            np.arange(start, start + len(drive)),
+            drive.T_map_lidar_prior,
+            slack * drive.prior_sigma_m,
+            sigma_rad if not drive.has_precise_prior else slack * float(np.radians(drive.prior_sigma_deg)),
+            said_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
+        )
+        out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
+    return out
+
+
+def _off(T: F64, anchors: Anchors) -> F64:
+    return np.asarray(np.linalg.norm(T[anchors.pose, :3, 3] - anchors.T_map[:, :3, 3], axis=1))
+
+
+def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[Links]:
+    """The motion from scan to scan, and from each scan to the nearest much older one near by: it was registered to the
+    map that the older one made."""
+    order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
+    consecutive = piece_of[known[:-1]] == piece_of[known[1:]]
+    pairs = [(known[:-1][consecutive], known[1:][consecutive])]
+    tree = cKDTree(T[known, :3, 3])
+    first, second = [], []
+    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], _REVISIT_M), strict=True):
+        older = [i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j)))]
+        if older:
+            first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
+            second.append(j)
+    pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
+    return [Links(a, b, inverses(T[a]) @ T[b], _LINK_SIGMA_M, _LINK_SIGMA_RAD) for a, b in pairs]
+
+
+def _apart(stamps_ns: I64, i: int, j: int) -> bool:
+    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * _REVISIT_S)
+
+
+_ROUNDS = 30
+WILD_SIGMAS = 2.5
+"""A prior so many sigmas off weighs half; farther off, less and less (Cauchy)."""
+
+
+def trust_in(off_m: F64, sigma_m: float) -> F64:
+    """(n,) weight in (0, 1] of priors that lie ``off_m`` (n,) from where the others have them."""
+    return np.asarray(1.0 / (1.0 + (off_m / (WILD_SIGMAS * sigma_m)) ** 2))
+
+
+def fit_to_priors(positions: F64, prior_positions: F64, sigma_m: float, yaw_rad: float = 0.0) -> F64:
+    """(4, 4) turn about z and shift that fits positions (n, 3) to their priors (n, 3), robustly.
+
+    ``yaw_rad`` is kept where the track is too short to say anything about it. Source: Umeyama 1991 for the fit, Cauchy
+    weights for the wild.
+    """
+    spread = float(np.linalg.norm(positions[:, :2].std(axis=0)))
+    T = _shifted(positions, prior_positions, yaw_rad, np.ones(len(positions)))
+    scale = max(sigma_m, float(np.median(_distances(T, positions, prior_positions))))
+    for _ in range(_ROUNDS):
+        weights = trust_in(_distances(T, positions, prior_positions), scale)
+        yaw = _yaw(positions, prior_positions, weights) if spread > 3.0 * sigma_m else yaw_rad
+        moved = _shifted(positions, prior_positions, yaw, weights)
+        # The scale comes down to the stated sigma step by step: at first the whole track may look wild.
+        scale = max(sigma_m, 0.7 * scale)
+        if scale == sigma_m and np.abs(moved - T).max() < 1e-6:
+            return moved
+        T = moved
+    return T
+
+
+def _distances(T: F64, positions: F64, priors: F64) -> F64:
+    return np.asarray(np.linalg.norm(positions @ T[:3, :3].T + T[:3, 3] - priors, axis=1))
+
+
+def _yaw(positions: F64, priors: F64, weights: F64) -> float:
+    w = weights / weights.sum()
+    a, b = positions[:, :2] - w @ positions[:, :2], priors[:, :2] - w @ priors[:, :2]
+    cross, dot = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), w @ (a * b).sum(axis=1)
+    return float(np.arctan2(cross, dot))
+
+
+def _shifted(positions: F64, priors: F64, yaw: float, weights: F64) -> F64:
+    T = from_xyz_rpy(0.0, 0.0, 0.0, 0.0, 0.0, yaw)
+    w = weights / weights.sum()
+    T[:3, 3] = w @ priors - T[:3, :3] @ (w @ positions)
+    return T

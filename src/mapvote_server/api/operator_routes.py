@@ -1,0 +1,367 @@
+"""Routes of operators: publish, roll back, see what changed and why; keys, retention, integrity, health."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Executor
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import Annotated, Any, Literal, cast
+
+import structlog
+from fastapi import APIRouter, Query, Request, Response
+from prometheus_client import generate_latest
+
+from mapvote.codec.ballot import tile_key
+from mapvote.core.types import MapvoteError
+from mapvote.shapes.geojson import feature_rows, tile_squares
+from mapvote_server.api.schemas import (
+    AS_CSV,
+    Cancelled,
+    Changes,
+    Checked,
+    Coverage,
+    Digest,
+    From,
+    Health,
+    Info,
+    IssueAsk,
+    KeyIssued,
+    KeysAnswer,
+    KeysRevoked,
+    Log,
+    MinCells,
+    Newest,
+    Places,
+    PolicyAsk,
+    PublishAsk,
+    Published,
+    Publishes,
+    Ready,
+    ReplayAsk,
+    Restored,
+    RevokeAsk,
+    RollbackAsk,
+    RolledBack,
+    RotateAsk,
+    TableOrMap,
+    Vehicles,
+    Withdrawn,
+    as_json,
+    as_table,
+    problems,
+)
+from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Services
+from mapvote_server.errors import Held, Unavailable
+from mapvote_server.questions.explain import CellStory, explain_cell
+from mapvote_server.questions.history import changes_between, log_of, overview, page_between
+from mapvote_server.questions.vehicles import (
+    contradictions,
+    standing_rows,
+    tiles_seen,
+    vehicle_standings,
+    wanted_passes,
+)
+from mapvote_server.store import keys
+from mapvote_server.store.integrity import check, restore_plane, set_aside
+from mapvote_server.store.policy import PolicyChange
+from mapvote_server.store.publish import Outcome, preview, publish
+from mapvote_server.store.queries import log_event
+from mapvote_server.store.retention import Cleared, clear
+from mapvote_server.store.rollback import replay, rollback
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import withdraw
+
+_MOST_EVIDENCE = 50
+router = APIRouter()
+
+
+@router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
+async def publish_now(by: Operator, parts: Parts, ask: PublishAsk) -> Published:
+    """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
+    return await parts.decide(_publish, parts, ask, by)
+
+
+@router.get("/v1/publish", response_model=Publishes, responses=problems(403), summary="How far a publish is")
+async def publishing_now(by: Reviewer, parts: Parts) -> Response:
+    """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
+    return as_json({"running": parts.publishing.now()})
+
+
+@router.delete(
+    "/v1/publish", response_model=Cancelled, responses=problems(403, 404), summary="Cancel what is being published"
+)
+async def cancel_publishing(by: Operator, parts: Parts) -> Response:
+    """Every publish under way ends before its next tiles with 409; no part of it is published."""
+    return as_json({"cancelled": parts.publishing.cancel(by)})
+
+
+def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
+    with parts.metrics.publish_seconds.time(), _round(parts, by, ask.dry_run) as executor:
+        if ask.dry_run:
+            done = preview(parts.store, parent=ask.parent, gate=parts.gate, executor=executor)
+        else:
+            said: dict[str, Any] = {"reason": ask.reason, "parent": ask.parent, "override": ask.override}
+            done = publish(parts.store, by=by, **said, gate=parts.gate, executor=executor)
+    for damage in (damage for fused in done.fused for damage in fused.damaged):
+        structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
+    return _as_answer(done)
+
+
+@contextmanager
+def _round(parts: Services, by: str, dry_run: bool) -> Iterator[Executor]:
+    """An executor for a round, which can be seen and cancelled. A publish that the policy holds is an event for
+    listeners. A stopping server ends the threads that fuse: what they had not begun is cancelled, more is refused."""
+    try:
+        with parts.publishing.watched(parts.fusing, by, dry_run) as executor:
+            yield executor
+    except Held as error:
+        with parts.store.database.writing() as connection:
+            log_event(connection, parts.store.clock(), "held back", by, "; ".join(error.reasons))
+        raise
+    except (CancelledError, RuntimeError) as error:
+        if not parts.stopping.is_set():
+            raise
+        raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
+
+
+def _as_answer(done: Outcome) -> Published:
+    return Published(
+        version=done.version,
+        published=done.published,
+        tiles=[tile_key(tile) for tile in done.tiles],
+        points_added=done.added,
+        points_deleted=done.deleted,
+        held=list(done.held),
+    )
+
+
+@router.post(
+    "/v1/rollback", response_model=RolledBack, responses=problems(403, 404, 409), summary="Go back to an older version"
+)
+async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
+    """A new version with the tiles of the old one; the votes that led away from it count no more."""
+    version = await parts.decide(rollback, parts.store, ask.to, by=by, reason=ask.reason)
+    return as_json({"version": version.number})
+
+
+@router.get(
+    "/v1/changes",
+    response_model=Changes,
+    responses=problems(404) | AS_CSV,
+    summary="What changed, as GeoJSON in map metres or as CSV",
+)
+def changes(
+    parts: Parts,
+    known: Known,
+    old: From,
+    new: Newest = None,
+    min_cells: MinCells = 1,
+    lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map is georeferenced")] = False,
+    format: Literal["geojson", "csv"] = "geojson",
+) -> Response:
+    """Things built and demolished between two versions; ``to`` is the newest by default."""
+    newest = parts.store.current() if new is None else new
+    found = changes_between(parts.store, old, newest, min_cells, lonlat=lonlat, known=known)
+    return as_table(feature_rows(found)) if format == "csv" else as_json(found)
+
+
+@router.get(
+    "/v1/changes/page",
+    response_class=Response,
+    responses=problems(404) | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
+    summary="What changed, as a page that needs no server",
+)
+def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_cells: MinCells = 1) -> Response:
+    """A file to keep or to mail: the clouds of the largest changes, before and after."""
+    store = parts.store
+    newest = store.current() if new is None else new
+    page = page_between(store, old, newest, changes_between(store, old, newest, min_cells, known=known))
+    kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
+    return Response(page, media_type="text/html", headers=kept)
+
+
+@router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
+def cell(parts: Parts, known: Known, x: float, y: float) -> Response:
+    """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
+    return as_json(explain_cell(parts.store, x, y, known=known))
+
+
+@router.get(
+    "/v1/coverage",
+    response_model=Coverage | Places,
+    responses=problems() | AS_CSV,
+    summary="Freshness of every tile",
+)
+def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
+    """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
+    answer = tiles_seen(parts.store, known)
+    if format == "csv":
+        return as_table(answer)
+    return as_json(tile_squares(answer, parts.store.lattice) if format == "geojson" else {"tiles": answer})
+
+
+@router.get("/v1/coverage/passes", response_model=Places, responses=problems(403), summary="Where to drive next")
+def passes(by: Reviewer, parts: Parts) -> Response:
+    """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
+    return as_json(wanted_passes(parts.store))
+
+
+@router.get(
+    "/v1/vehicles",
+    response_model=Vehicles | Places,
+    responses=problems(403) | AS_CSV,
+    summary="Vehicles that contradict the others",
+)
+def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
+    """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
+    found = vehicle_standings(parts.store)
+    if format == "csv":
+        return as_table(standing_rows(found))
+    if format == "geojson":
+        return as_json(contradictions(found))
+    return as_json({"vehicles": [replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]})
+
+
+@router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
+def policy(parts: Parts) -> Response:
+    """The policy in force, who set it and why."""
+    return as_json(parts.store.policy_changes()[-1])
+
+
+@router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
+def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
+    """In force at once. 422 names the value that is not possible, or the key that does not exist."""
+    parts.store.change_policy(ask.values, by=by, reason=ask.reason)
+    return policy(parts)
+
+
+@router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
+def info(parts: Parts) -> Response:
+    """The map, its newest version, and how much there is of everything."""
+    return as_json(overview(parts.store))
+
+
+@router.get("/v1/log", response_model=Log, responses=problems(403), summary="What happened")
+def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
+    """Every version, and the last so many events."""
+    return as_json(log_of(parts.store, events))
+
+
+@router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
+async def whole(by: Operator, parts: Parts) -> Response:
+    """Reads the whole store and names what is damaged. Nothing is changed."""
+    return as_json({"damage": await parts.decide(check, parts.store)})
+
+
+@router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
+async def mend(by: Operator, parts: Parts) -> Response:
+    """As GET; damaged items are also quarantined."""
+    return as_json({"damage": await parts.decide(check, parts.store, mend=True, by=by)})
+
+
+@router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
+async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) -> Restored:
+    """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
+    raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
+    return Restored(restored=await parts.decide(restore_plane, parts.store, digest, raw, by=by))
+
+
+@router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
+async def begin_anew(by: Operator, parts: Parts, everybody: bool) -> Withdrawn:
+    """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
+    if not everybody:
+        raise MapvoteError("name a vehicle in the path, or say everybody=true")
+    return Withdrawn(withdrawn=await parts.decide(withdraw, parts.store, None, by=by))
+
+
+@router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
+async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Published:
+    """Every version again without its votes; the difference to the newest is one new version."""
+    return await parts.decide(_replay, parts, ask, by)
+
+
+def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
+    with _round(parts, by, ask.dry_run) as executor:
+        return _as_answer(replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor))
+
+
+@router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
+async def clearable(by: Operator, parts: Parts) -> Response:
+    """Old versions and ballots that POST would delete."""
+    return as_json(await parts.decide(clear, parts.store, dry_run=True))
+
+
+@router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
+async def clear_now(by: Operator, parts: Parts) -> Response:
+    """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
+    return as_json(await parts.decide(clear, parts.store, dry_run=False, by=by))
+
+
+@router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
+def listed_keys(by: Operator, parts: Parts) -> Response:
+    """All keys ever issued, revoked and expired ones too."""
+    standing, now = keys.ballots_standing(parts.store), parts.store.clock()
+    listed = keys.listed(parts.store)
+    told = [asdict(key) | {"valid": key.valid_at(now), "ballots": standing.get(key.name, 0)} for key in listed]
+    return as_json({"keys": told})
+
+
+@router.post("/v1/keys", response_model=KeyIssued, responses=problems(403), summary="Issue a key")
+def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
+    """The answer is the only place where the key is ever seen: the store keeps its hash."""
+    role = cast("keys.Role", ask.role)
+    return as_json({"key": keys.issue(parts.store, ask.name, role, by=by, days=ask.days)})
+
+
+@router.post("/v1/keys/rotate", response_model=KeyIssued, responses=problems(403, 404), summary="Replace a key")
+def rotate_key(by: Operator, parts: Parts, ask: RotateAsk) -> Response:
+    """A new key of the same role and length for who has a valid one."""
+    return as_json({"key": keys.rotate(parts.store, ask.name, by=by, overlap_days=ask.overlap_days)})
+
+
+@router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
+def revoke_keys(by: Operator, parts: Parts, ask: RevokeAsk) -> KeysRevoked:
+    """Its standing ballots count no more, unless ``keep_votes``."""
+    revoked, ballots = keys.revoke(parts.store, ask.name, by=by, keep_votes=ask.keep_votes)
+    return KeysRevoked(revoked=revoked, ballots=ballots)
+
+
+_NAMED = 20
+"""Damaged things that /readyz names; the log has all."""
+
+
+def _damaged(store: Store) -> list[str]:
+    """The items in quarantine, as "kind name: why"."""
+    with store.database.reading() as connection:
+        return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
+
+
+@router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
+async def live() -> Response:
+    """200 without content. Neither this nor `/readyz` needs a key; without a key `/readyz` has no content either."""
+    return Response()
+
+
+@router.get("/healthz", responses=problems(), summary="Can the store be read?")
+async def health(parts: Parts) -> Health:
+    """200 with the newest version, 503 if the database does not answer."""
+    return Health(status="ok", version=await parts.newest.put(None))
+
+
+@router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
+async def ready(parts: Parts) -> Ready:
+    """200 if the database can be written now; 503 with its error if not, or if the server is stopping.
+
+    ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
+    """
+    version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
+    return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
+
+
+@router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
+async def metrics(parts: Parts) -> Response:
+    """Counters, latencies, the newest version."""
+    parts.metrics.version.set(await parts.newest.put(None))
+    parts.metrics.tell_damaged(await parts.look_up(_damaged))
+    return Response(generate_latest(parts.metrics.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

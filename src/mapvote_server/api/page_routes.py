@@ -1,0 +1,183 @@
+"""The operator's page, the data that it draws in 3D, and the API's documentation.
+
+Data: levels of detail, points added and deleted, votes per cell, paths.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request, Response
+
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import compress
+from mapvote.shapes.packed_cloud import N_LEVELS
+from mapvote_server.api.schemas import (
+    AS_CSV,
+    Digest,
+    From,
+    Places,
+    TableOrMap,
+    To,
+    VersionQuery,
+    as_json,
+    as_table,
+    problems,
+    sends_bytes,
+)
+from mapvote_server.api.services import Parts, Reviewer, name_of
+from mapvote_server.errors import NotFound
+from mapvote_server.questions.explain import evidence
+from mapvote_server.questions.vehicles import paths
+
+_FOR_EVER = "private, max-age=31536000, immutable"
+_Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
+_OPEN = b"""<p class="open-server" role="alert">This server is open: every user of this machine can vote, publish and
+roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --role operator</code></p>"""
+_DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
+<link rel="stylesheet" href="viewer/pages.css"></head>
+<body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
+<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
+_STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
+_PRELOADED = b'<link rel="modulepreload" href="viewer/%s">'
+_OF_A_FILE = "standalone.js", "bundle.js"
+"""Modules of a page that lies in a file of its own."""
+_KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+router = APIRouter()
+
+
+@router.get("/v1/clouds/overview", summary="A whole version, coarse", **sends_bytes(404))
+def overview(request: Request, parts: Parts, version: VersionQuery | None = None) -> Response:
+    """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
+    number = parts.store.current() if version is None else version
+    return packed(request, parts.clouds.overview(number), "private, no-cache")
+
+
+@router.get("/v1/clouds/changed", summary="Points added and deleted between two versions", **sends_bytes(404))
+def changed(request: Request, parts: Parts, old: From, new: To) -> Response:
+    """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
+    return packed(request, parts.clouds.changed(old, new), _FOR_EVER)
+
+
+@router.get("/v1/clouds/{points}/{ground}/{level}", summary="One level of detail of a tile", **sends_bytes(404))
+def level_of(
+    request: Request,
+    parts: Parts,
+    points: Digest,
+    ground: Digest,
+    level: Annotated[int, Path(ge=0, lt=N_LEVELS)],
+    fields: Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}$")] = None,
+) -> Response:
+    """Immutable. Levels add to one another: every point is in exactly one of the six. With the hash of the tile's
+    ``fields`` the intensity of each point follows, a byte, if there is one."""
+    hashes = TileHashes(points, ground, None, fields=fields)
+    return packed(request, parts.clouds.levels(hashes).part(level), _FOR_EVER)
+
+
+@router.get("/v1/evidence/{row}/{col}", summary="Votes cell by cell", **sends_bytes(403))
+def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
+    """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
+
+    Of one ``vehicle`` only for reviewers and operators.
+    """
+    if vehicle is not None:
+        name_of(request, "reviewer", "operator")
+    plane = evidence(parts.store, (row, col), vehicle)
+    return packed(request, plane.tobytes(), "private, no-cache")
+
+
+@router.get("/v1/paths", response_model=Places, responses=problems(403) | AS_CSV, summary="Paths of the drives")
+def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
+    """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
+    ``csv`` without the lines."""
+    found = paths(parts.store, vehicle)
+    return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
+
+
+def packed(request: Request, data: bytes, cache: str) -> Response:
+    """Bytes, compressed where the client takes it."""
+    headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        data, headers["Content-Encoding"] = compress(data, 1), "zstd"
+    return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+@router.get("/docs", include_in_schema=False)
+def docs(request: Request) -> Response:
+    """The API on one page, from its OpenAPI document, without any script or request to elsewhere."""
+    rows = []
+    for path, methods in request.app.openapi()["paths"].items():
+        for method, about in methods.items():
+            cells = (
+                method.upper(),
+                path,
+                about["summary"],
+                about.get("description", ""),
+                ", ".join(about["responses"]),
+            )
+            rows.append("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells) + "</tr>")
+    return _page(request, _DOCS.replace("ROWS", "".join(rows)).encode())
+
+
+@router.get("/", include_in_schema=False)
+async def index(request: Request) -> Response:
+    """The operator's page."""
+    return _page(request, _index())
+
+
+@router.get("/viewer/{name:path}", include_in_schema=False)
+async def asset(request: Request, name: str) -> Response:
+    """A script or style of the operator's page."""
+    found = _assets().get(name)
+    if found is None or found.kind == "text/html":
+        raise NotFound(f"there is no page {name[:80]!r}")
+    headers = {"Cache-Control": "no-cache", "ETag": found.tag, "Vary": "Accept-Encoding"}
+    if request.headers.get("if-none-match") == found.tag:
+        return Response(status_code=304, headers=headers)
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        return Response(found.packed, media_type=found.kind, headers=headers | {"Content-Encoding": "zstd"})
+    return Response(found.plain, media_type=found.kind, headers=headers)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asset:
+    kind: str
+    plain: bytes
+    packed: bytes
+    tag: str
+
+
+@cache
+def _assets() -> dict[str, _Asset]:
+    """Every file of the page by its name; nothing else can be asked for."""
+    shapes = resources.files("mapvote.shapes") / "viewer"
+    found = {}
+    for home, folder in ((resources.files("mapvote_server") / "web", ""), (shapes, ""), (shapes / "vendor", "vendor/")):
+        for file in home.iterdir():
+            kind = _KINDS.get("." + file.name.rpartition(".")[2])
+            if kind is not None:
+                data = file.read_bytes()
+                tag = f'"{hashlib.sha256(data).hexdigest()[:20]}"'
+                found[folder + file.name] = _Asset(kind, data, compress(data, 12), tag)
+    return found
+
+
+@cache
+def _index() -> bytes:
+    """The operator's page, which asks for all its modules at once: each would be asked for by the one before it."""
+    assets = _assets()
+    modules = [name for name in assets if name.endswith(".js") and name not in ("app.js", *_OF_A_FILE)]
+    links = b"".join(_PRELOADED % name.encode() for name in sorted(modules, key=lambda name: ("/" not in name, name)))
+    return assets["index.html"].plain.replace(b"</head>", links + b"</head>", 1)
+
+
+def _page(request: Request, text: bytes) -> Response:
+    """A page, with a warning at its end if the server needs no key."""
+    if request.state.key is None:
+        text = text.replace(b"</head>", _STYLE + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
+    return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache"})

@@ -1,0 +1,473 @@
+"""What clients of the API send and are answered, as OpenAPI declares it to programs in other languages; and the one
+table from errors to status codes.
+
+Routes encode their answers themselves (:func:`as_json`). A test holds every answer to its model: it has the model's
+members and no others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+from fastapi import Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from mapvote.codec.manifest import Manifest, TileHashes
+from mapvote.core.types import MapvoteError
+from mapvote.shapes.change_objects import Kind, Size
+from mapvote.shapes.geojson import as_csv
+from mapvote_server.api.services import Progress
+from mapvote_server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
+from mapvote_server.questions.vehicles import VehicleStanding
+from mapvote_server.store.integrity import Damage
+
+STATUS: Mapping[type[MapvoteError], int] = {
+    Unauthorised: 401,
+    Forbidden: 403,
+    NotFound: 404,
+    Conflict: 409,
+    TooLarge: 413,
+    MapvoteError: 422,
+    TooMany: 429,
+    Unavailable: 503,
+}
+"""An entry also holds for the subclasses of its class."""
+LEAST, MOST = -(1 << 31), (1 << 31) - 1
+"""Range of a version's number in a database."""
+PLAIN = r"^[^\x00-\x1f]*$"
+"""No control characters: PostgreSQL stores no NUL."""
+
+Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+Number = Annotated[int, Path(ge=LEAST, le=MOST)]
+Table = Literal["json", "csv"]
+TableOrMap = Literal["json", "geojson", "csv"]
+"""Formats of a list; lists of places can be GeoJSON."""
+VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
+From = Annotated[int, Query(alias="from", ge=LEAST, le=MOST)]
+To = Annotated[int, Query(alias="to", ge=LEAST, le=MOST)]
+Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
+"""As :data:`To`, the newest version if it is left out."""
+MinCells = Annotated[int, Query(ge=1, le=100_000)]
+
+
+class Ask(BaseModel):
+    """A body; members that it does not name are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+Reason = Annotated[str, Field(max_length=200, pattern=PLAIN)]
+
+
+class PublishAsk(Ask):
+    """How to publish; an empty object publishes the standing ballots."""
+
+    dry_run: bool = False
+    override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
+    parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
+    reason: Reason = ""
+
+
+class ReplayAsk(Ask):
+    """Whose votes to take out of every version."""
+
+    vehicle: str = Field(max_length=64, pattern=PLAIN)
+    dry_run: bool = Field(default=True, description="only say what would change; false publishes it")
+
+
+class PolicyAsk(Ask):
+    """Changes of the policy."""
+
+    values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
+    reason: Reason = ""
+
+
+class IssueAsk(Ask):
+    """Whose key, and what it opens."""
+
+    name: str = Field(max_length=200, pattern=PLAIN, description="1-64 of letters, digits, dot, underscore, dash")
+    role: str = Field(default="vehicle", max_length=20, description="vehicle, reader, reviewer or operator")
+    days: float | None = Field(default=None, description="the key expires after so many days; null: never")
+
+
+class RotateAsk(Ask):
+    """Whose key is replaced."""
+
+    name: str = Field(max_length=200, pattern=PLAIN)
+    overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
+
+
+class RevokeAsk(Ask):
+    """Whose keys are revoked."""
+
+    name: str = Field(max_length=200, pattern=PLAIN)
+    keep_votes: bool = Field(default=False, description="whether its standing ballots still count")
+
+
+class RollbackAsk(Ask):
+    """The version to go back to."""
+
+    to: int = Field(ge=LEAST, le=MOST)
+    reason: Reason = ""
+
+
+class Answer(BaseModel):
+    """Members that a model does not name never come."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Problem(Answer):
+    """An error, and how to mend it."""
+
+    detail: Any
+    reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
+
+
+def _answer(name: str, what: str | None, **members: Any) -> type[Answer]:
+    return create_model(name, __base__=Answer, __doc__=what, **members)
+
+
+def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **instead: Any) -> type[Answer]:
+    """The model of an answer that the codec defines, with some members of other types."""
+    members: dict[str, Any] = {}
+    for member in msgspec.structs.fields(kind):
+        if member.name not in leave_out:
+            default = ... if member.required else member.default
+            members[member.name] = instead.get(member.name, member.type), default
+    return _answer(kind.__name__, kind.__doc__, **members)
+
+
+Planes = _answer_of(TileHashes, leave_out=["memory"])
+ManifestAnswer = _answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[valid-type]
+
+
+class VersionEntry(Answer):
+    """The origin of a version."""
+
+    number: int
+    parent: int | None
+    kind: Literal["import", "publish", "rollback", "replay"]
+    target: int | None = Field(description="of a rollback or replay: the version it goes back to")
+    published_by: str
+    reason: str
+
+
+class DatedVersion(VersionEntry):
+    """A version with the policy that it was made by."""
+
+    created: str
+    policy: dict[str, Any]
+
+
+class Withdrawn(Answer):
+    """Number of ballots."""
+
+    withdrawn: int
+
+
+class Published(Answer):
+    """The result of a publish, or of a dry run."""
+
+    version: int
+    published: bool
+    tiles: list[str]
+    points_added: int
+    points_deleted: int
+    held: list[str]
+
+
+class VerdictAnswer(Answer):
+    """A reviewer's verdict on a change."""
+
+    seq: int
+    verdict: Literal["accepted", "held", "rejected"]
+    by: str
+    comment: str
+    at_ns: int
+
+
+class VerdictGiven(Answer):
+    """The verdict's number in the log."""
+
+    seq: int
+
+
+class Geometry(Answer):
+    """A feature collection of RFC 7946."""
+
+    type: Literal["Point", "LineString", "Polygon", "MultiPolygon"]
+    coordinates: list[Any]
+
+
+class ChangeFacts(Answer):
+    """One thing that was built or demolished."""
+
+    kind: Kind
+    size: Size
+    area_m2: float
+    height_m: float
+    volume_m3: float = Field(description="of its columns")
+    cells: int
+    points: int
+    votes_min: int
+    votes_median: float
+    against_median: float
+    share_for: float | None
+    probability: float | None = Field(description="mean over its cells that each of them changed")
+    first_seen: str | None
+    last_seen: str | None
+    versions: list[int]
+    box: list[list[float]]
+    near: list[str] = Field(description="ids of large things within 15 m")
+
+
+class PendingFacts(ChangeFacts):
+    """A change on the desk."""
+
+    verdict: VerdictAnswer | None
+    waits: str | None = Field(default=None, description="why it is not deleted yet")
+    false_deletion: float | None = Field(
+        default=None, description="largest probability that something that stands goes"
+    )
+    drive_by: list[float] | None = Field(default=None, description="x, y where a vehicle should drive by")
+
+
+class ChangeFeature(Answer):
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    id: str
+    geometry: Geometry
+    properties: ChangeFacts
+
+
+class PendingFeature(ChangeFeature):
+    """GeoJSON."""
+
+    properties: PendingFacts
+
+
+class _Collection(Answer):
+    """GeoJSON; ``frame`` says what its coordinates are."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    map_id: str
+    georeference: dict[str, str]
+    from_version: int | None
+    to_version: int | None
+
+
+class Changes(_Collection):
+    """The differences between two versions."""
+
+    features: list[ChangeFeature]
+    damaged: list[str] | None = Field(default=None, description="tiles that cannot be read")
+
+
+class Pending(_Collection):
+    """The changes that a publish would make."""
+
+    features: list[PendingFeature]
+
+
+class Drawn(Answer):
+    """The planes of a tile that the page draws."""
+
+    points: str
+    ground: str
+
+
+class DeskAnswer(Answer):
+    """The review desk."""
+
+    version: int
+    held: list[str] = Field(description="why the policy would hold the version")
+    pending: Pending
+    waiting: list[PendingFeature]
+    reviewed: list[PendingFeature]
+    tiles: dict[str, Drawn | None] = Field(description="as a publish would make them; null: without points")
+
+
+class PlacedFeature(Answer):
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    geometry: Geometry
+    properties: dict[str, Any]
+
+
+class Places(Answer):
+    """GeoJSON in map metres."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    features: list[PlacedFeature]
+
+
+class CoveredTile(Answer):
+    """Row and column of a tile, how many vehicles saw it, and when the last did."""
+
+    row: int
+    col: int
+    vehicles: int
+    last_seen: str | None
+
+
+class Info(Answer):
+    """The content of the store."""
+
+    map_id: str
+    version: int
+    published_ns: int
+    oldest_version: int
+    tiles: int
+    fields: str
+    ballots: int
+    vehicles: int
+    votes_on_tiles: int
+    planes: int
+    plane_bytes: int
+    quarantined: int
+
+
+class LoggedVersion(VersionEntry):
+    """A version in the log."""
+
+    created_ns: int
+
+
+class LoggedEvent(Answer):
+    """One line of the log."""
+
+    seq: int
+    at_ns: int
+    kind: str
+    actor: str
+    detail: str
+
+
+class Log(Answer):
+    """Versions oldest first, events newest first."""
+
+    versions: list[LoggedVersion]
+    events: list[LoggedEvent]
+
+
+class Restored(Answer):
+    """A plane is as it was written; ``restored``: by this request."""
+
+    restored: bool
+
+
+class KeyEntry(Answer):
+    """A key that was issued; never the key itself."""
+
+    name: str
+    role: str
+    created_ns: int
+    revoked_ns: int | None
+    expires_ns: int | None
+    valid: bool
+    ballots: int = Field(description="standing ballots of this name")
+
+
+class KeysRevoked(Answer):
+    """Number of keys, and of ballots that count no more."""
+
+    revoked: int
+    ballots: int
+
+
+class Health(Answer):
+    """The store can be read."""
+
+    status: Literal["ok"]
+    version: int
+
+
+class Ready(Answer):
+    """Ballots are taken in."""
+
+    status: Literal["ready"]
+    version: int
+    quarantine: list[str]
+    quarantined: int
+
+
+Versions = _answer("Versions", "Oldest first.", versions=list[DatedVersion])
+Publishes = _answer("Publishes", "Those under way, oldest first.", running=list[Progress])
+Cancelled = _answer("Cancelled", "Number of publishes.", cancelled=int)
+RolledBack = _answer("RolledBack", "The new version.", version=int)
+Coverage = _answer("Coverage", "Extent of all tiles of the map and of standing ballots.", tiles=list[CoveredTile])
+Vehicles = _answer("Vehicles", "By name.", vehicles=list[VehicleStanding])
+Checked = _answer("Checked", "The damaged items.", damage=list[Damage])
+KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=list[KeyEntry])
+KeyIssued = _answer("KeyIssued", "The only time that the key is seen.", key=str)
+
+AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
+AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+
+
+def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
+    """For the OpenAPI document: the refusals that every route knows, and these."""
+    return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
+
+
+def sends_bytes(*codes: int) -> dict[str, Any]:
+    """The arguments of a route that answers bytes, or with these refusals."""
+    return {"responses": problems(*codes) | AS_BYTES, "response_class": Response}
+
+
+def as_json(content: object) -> Response:
+    """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
+    all others."""
+    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type="application/json")
+
+
+def _plain(model: Any) -> Any:
+    return model.model_dump(mode="json")
+
+
+def as_table(rows: Sequence[Mapping[str, Any]]) -> Response:
+    """Rows as CSV."""
+    return Response(as_csv(rows), media_type="text/csv")
+
+
+def refuse(error: Exception) -> Response:
+    """The answer to a MapvoteError: {"detail": what to do about it}, and the reasons of a held version."""
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    content: dict[str, object] = {"detail": str(error)}
+    headers = {}
+    if isinstance(error, Held):
+        content["reasons"] = error.reasons
+    if status in (429, 503):
+        headers["Retry-After"] = str(math.ceil(error.after_s)) if isinstance(error, TooMany) else "1"
+    response = JSONResponse(content, status, headers)
+    if status == 401:  # two lines: browsers read one challenge a line, and ask for a password only for Basic
+        response.headers.append("WWW-Authenticate", 'Basic realm="mapvote: the key is the password", charset="UTF-8"')
+        response.headers.append("WWW-Authenticate", "Bearer")
+    return response
+
+
+async def unreadable(request: Request, error: Exception) -> Response:
+    """A body that is not even UTF-8: FastAPI answers 400, but every unusable body is 422 here.
+
+    Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
+    """
+    return refuse(MapvoteError("the body is no JSON in UTF-8"))
+
+
+async def unusable(request: Request, error: Exception) -> Response:
+    """A parameter or a body that is not what OpenAPI declares: 422 with each place and what is wrong there, as text
+    that can be encoded whatever was sent."""
+    assert isinstance(error, RequestValidationError)
+    found = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+    return refuse(MapvoteError(found[:1000].encode(errors="replace").decode()))

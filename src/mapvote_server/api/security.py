@@ -1,0 +1,234 @@
+"""The outermost layer of every request: host and origin, key, security headers, metrics, one log line.
+
+A page on the Internet can give its own name the address 127.0.0.1 (DNS rebinding) and so speak to a server on the
+visitor's machine as if it were its own. The browser still says in ``Host`` and ``Origin`` whose page it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import ipaddress
+import re
+import time
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from concurrent.futures import Executor
+from functools import lru_cache, partial
+
+import structlog
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mapvote.core.types import MapvoteError
+from mapvote_server.api.schemas import refuse
+from mapvote_server.api.services import Batcher, Metrics, RateLimit
+from mapvote_server.errors import Forbidden, TooMany, Unauthorised, Unavailable
+from mapvote_server.store import keys
+from mapvote_server.store.store import Store
+
+_AT_ONCE = 256
+"""Keys looked up in one query at most."""
+_REMEMBERED = 10_000
+_PAUSE_S = 1.0
+_WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
+"""Wrong keys from one address that are looked up."""
+
+
+class Guard:
+    """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
+
+    The key of every request is looked up in the store, many in one query, so a revoked key works no longer at once. The
+    key of a ballot is looked up in the transaction that writes the ballot
+    (:meth:`mapvote_server.store.admission.Intake.write`). Before that its name suffices, which never changes.
+
+    ``opened``: no key is needed as long as the store holds none. The first key that is issued ends that for good.
+    ``owner``: every request is that of an operator of this name.
+    """
+
+    def __init__(self, store: Store, threads: Executor, *, opened: bool, owner: str | None = None) -> None:
+        self._opened = opened
+        self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
+        self._any_issued = partial(keys.any_issued, store)
+        self._threads = threads
+        self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE, threads)
+        self._known: dict[str, keys.Key] = {}
+        self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
+
+    async def who(
+        self, authorization: str | None, peer: str, *, ballot: bool = False
+    ) -> tuple[keys.Key, str | None] | None:
+        """The key of a request and its hash (None of the owner); None if the server is open.
+
+        Unauthorised if the key is missing, unknown or revoked; of a ``ballot`` a known key passes, and the store
+        decides. TooMany if ``peer`` has sent too many wrong keys: no new key from there is looked up for a while.
+        """
+        if self._owner is not None:
+            return self._owner, None
+        if self._opened:
+            self._opened = not await asyncio.get_running_loop().run_in_executor(self._threads, self._any_issued)
+        if self._opened:
+            return None
+        secret = _secret_of(authorization)
+        if secret is None:
+            raise Unauthorised("this server needs a key: send it as `Authorization: Bearer KEY`")
+        digest = keys.hash_of(secret)
+        key = self._known.get(digest) if ballot else None
+        if key is None:
+            key = await self._look_up(digest, peer)
+            if len(self._known) > _REMEMBERED:
+                self._known.clear()
+            self._known[digest] = key
+        return key, digest
+
+    async def _look_up(self, digest: str, peer: str) -> keys.Key:
+        if digest not in self._known:
+            try:
+                self._wrong.check(peer)
+            except TooMany:
+                await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of sending more
+                raise
+        try:
+            return await self._looked_up.put(digest)
+        except Unauthorised:
+            self._wrong.take(peer)
+            raise
+
+
+def _secret_of(authorization: str | None) -> str | None:
+    scheme, _, value = (authorization or "").partition(" ")
+    if scheme.lower() == "bearer" and value.strip():
+        return value.strip()
+    if scheme.lower() == "basic":
+        try:
+            return base64.b64decode(value, validate=True).decode().partition(":")[2] or None
+        except (binascii.Error, UnicodeDecodeError):
+            return None
+    return None
+
+
+HEADERS = (
+    ("X-Content-Type-Options", "nosniff"),
+    ("Referrer-Policy", "no-referrer"),
+    (
+        "Content-Security-Policy",
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    ),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+)
+"""On every answer, errors too: no guessed types, no referrer, nothing loaded from other servers."""
+
+
+class Hosts:
+    """The names of this server: localhost, any IP address (no page can rebind one), and ``allowed`` names."""
+
+    def __init__(self, allowed: Sequence[str]) -> None:
+        self._allowed = frozenset(name.lower() for name in allowed) | {"localhost"}
+        self._ours = lru_cache(maxsize=256)(self._is_ours)
+
+    def check(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
+        """Forbidden for a request to another name, or by a page of another server."""
+        host = origin = None
+        for name, value in headers:
+            if name == b"host":
+                host = value.decode("latin-1") if host is None else ""
+            elif name == b"origin":
+                origin = value.decode("latin-1")
+        if not host or not self._ours(host):
+            raise Forbidden(f"{(host or '')[:80]!r} is not a name of this server: {_MEND}")
+        theirs = "" if origin is None else origin.partition("://")[2].lower()
+        # Of IP addresses only the one that was addressed: another machine's page has an address too.
+        foreign = theirs != host.lower() and _name_in(theirs) not in self._allowed - {"localhost"}
+        if origin is not None and foreign:
+            raise Forbidden(f"pages of {origin[:80]!r} may not use this server: {_MEND}")
+
+    def _is_ours(self, host: str) -> bool:
+        name = _name_in(host)
+        if name in self._allowed:
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
+
+
+_HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?")
+_MEND = "if it should be, add it to [server] hosts in the server's configuration"
+
+
+def _name_in(host: str) -> str:
+    """The name or address in ``name:port``, without brackets; "" if it is neither."""
+    found = _HOST.fullmatch(host.lower())
+    return (found[1] or found[2]) if found else ""
+
+
+PROBES = ("/livez", "/readyz")
+"""Who asks without a key, by any name of the server, gets a status without content."""
+_PROBE_S = 1.0
+log = structlog.get_logger("mapvote")
+
+
+class Watch:
+    """The outermost layer. No key, header or query is ever logged.
+
+    ``ready`` raises Unavailable if no ballot can be taken now. Probes call it once a second at most.
+    """
+
+    def __init__(
+        self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, ready: Callable[[], Awaitable[object]]
+    ) -> None:
+        self._app, self._hosts, self._guard, self._metrics, self._ready = app, hosts, guard, metrics, ready
+        self._probed, self._until = 503, 0.0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        start, status, key = time.perf_counter(), 500, None
+
+        async def watched(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            self._hosts.check(scope["headers"])
+            sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
+            authorization = None if sent is None else sent.decode("latin-1")
+            peer = (scope["client"] or ("",))[0]
+            ballot = scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/")
+            whose = await self._guard.who(authorization, peer, ballot=ballot)
+            key, key_hash = whose or (None, None)
+            scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
+            await self._app(scope, receive, watched)
+        except MapvoteError as error:
+            asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
+            probed = asks and scope["path"] in PROBES
+            answer = Response(status_code=await self._status(scope["path"])) if probed else refuse(error)
+            await answer(scope, receive, watched)
+        except asyncio.CancelledError:  # the server stops and waits no longer
+            await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
+        finally:
+            seconds = time.perf_counter() - start
+            method = scope["method"]
+            self._metrics.requests.labels(method, status).inc()
+            self._metrics.seconds.labels(method).observe(seconds)
+            tell = log.warning if status >= 500 else log.info
+            name = key.name if key else "-"
+            tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))
+
+    async def _status(self, path: str) -> int:
+        """The answer to a probe."""
+        if path == "/livez":
+            return 200
+        if time.monotonic() >= self._until:
+            self._until = time.monotonic() + _PROBE_S
+            try:
+                await self._ready()
+                self._probed = 200
+            except Unavailable:
+                self._probed = 503
+        return self._probed

@@ -1,0 +1,437 @@
+"""The parts of one running app, which its routes use: threads for each kind of work, what a client may send at a time,
+counters, manifests as JSON, publishes under way; and what a key permits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter as TallyOf
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from threading import Event, Lock
+from typing import Annotated, Generic, NamedTuple, ParamSpec, TypeVar
+
+import msgspec
+from anyio import CapacityLimiter, to_thread
+from fastapi import Depends, Request
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from starlette.requests import ClientDisconnect
+
+from mapvote.config import Settings
+from mapvote.core.types import MapvoteError
+from mapvote_server.errors import Conflict, Forbidden, NotFound, TooLarge, TooMany, Unavailable
+from mapvote_server.questions.clouds import Clouds
+from mapvote_server.questions.history import Feed
+from mapvote_server.store import keys
+from mapvote_server.store.admission import Incoming, Intake, Quota, Receipt
+from mapvote_server.store.fusion_jobs import Watched
+from mapvote_server.store.integrity import KINDS
+from mapvote_server.store.publish import Gate
+from mapvote_server.store.queries import current_number
+from mapvote_server.store.store import Store
+
+Asked = TypeVar("Asked")
+Answer = TypeVar("Answer")
+Given = ParamSpec("Given")
+READING = 1
+"""Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
+that answer vehicles."""
+
+
+class RateLimit:
+    """A token bucket for each name: ``burst`` at once, ``per_minute`` on average. For one thread (the event loop)."""
+
+    def __init__(
+        self, per_minute: float, burst: float, what: str = "ballots", clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._what = what
+        self._per_s = per_minute / 60.0
+        self._burst = float(burst)
+        self._clock = clock
+        self._buckets: dict[str, tuple[float, float]] = {}
+
+    def check(self, name: str) -> None:
+        """TooMany if the bucket of ``name`` is empty; takes nothing."""
+        lacking = 1.0 - self._tokens(name, self._clock())
+        if lacking > 0.0:
+            too_fast = f"{name!r} sends more than {self._per_s * 60:g} {self._what} a minute: try again later"
+            raise TooMany(too_fast, lacking / self._per_s)
+
+    def take(self, name: str) -> None:
+        """One request of ``name``; TooMany if its bucket is empty."""
+        self.check(name)
+        now = self._clock()
+        self._buckets[name] = (self._tokens(name, now) - 1.0, now)
+        if len(self._buckets) > 10_000:  # full buckets carry no information: drop them
+            wait = self._burst / self._per_s
+            self._buckets = {n: b for n, b in self._buckets.items() if now - b[1] < wait}
+
+    def _tokens(self, name: str, now: float) -> float:
+        tokens, then = self._buckets.get(name, (self._burst, now))
+        return min(self._burst, tokens + (now - then) * self._per_s)
+
+
+_MEND = "send a shorter drive, or raise [server] max_body_bytes"
+
+
+class Uploads:
+    """Ballots that are being received. For one thread (the event loop).
+
+    One has at most ``each`` bytes, all together at most ``together`` in memory. Beyond that the largest is dropped, so
+    small ballots never wait for large ones. A vehicle sends at most ``AT_ONCE`` at a time.
+    """
+
+    AT_ONCE = 4
+
+    def __init__(self, each: int, together: int) -> None:
+        self._each, self._together = each, together
+        self._bytes = 0
+        self._under_way: dict[_Upload, None] = {}
+        self._of: TallyOf[str] = TallyOf()
+
+    async def read(self, vehicle: str, stream: AsyncIterator[bytes], declared: str | None) -> bytes:
+        """A whole body. TooLarge beyond the limit for one; TooMany if the vehicle sends more than it may at a time;
+        Unavailable if this one was dropped; MapvoteError if the client disconnected."""
+        if declared is not None and declared.isdigit() and int(declared) > self._each:
+            raise TooLarge(f"the body has {declared[:20]} bytes, the limit is {self._each}: {_MEND}")
+        if self._of[vehicle] >= self.AT_ONCE:
+            raise TooMany(f"{vehicle[:64]!r} sends {self.AT_ONCE} ballots already: wait until these are answered")
+        upload = _Upload()
+        self._of[vehicle] += 1
+        self._under_way[upload] = None
+        try:
+            async for chunk in stream:
+                self._take(upload, chunk)
+            return b"".join(upload.chunks)
+        except ClientDisconnect as error:
+            raise MapvoteError("only a part of the ballot arrived: the client disconnected") from error
+        finally:
+            self._forget(upload)
+            self._of[vehicle] -= 1
+            if not self._of[vehicle]:
+                del self._of[vehicle]
+
+    def _take(self, upload: _Upload, chunk: bytes) -> None:
+        if upload in self._under_way:
+            upload.chunks.append(chunk)
+            upload.size += len(chunk)
+            self._bytes += len(chunk)
+            while self._bytes > self._together:
+                self._forget(max(self._under_way, key=lambda u: u.size))
+        if upload not in self._under_way:
+            raise Unavailable("too many large ballots are on their way at once: send this one again")
+        if upload.size > self._each:
+            raise TooLarge(f"the body is larger than {self._each} bytes: {_MEND}")
+
+    def _forget(self, upload: _Upload) -> None:
+        """Free its memory at once, even if its sender stays connected."""
+        if upload in self._under_way:
+            del self._under_way[upload]
+            self._bytes -= upload.size
+            upload.chunks.clear()
+
+
+@dataclass(eq=False, slots=True)
+class _Upload:
+    chunks: list[bytes] = field(default_factory=list)
+    size: int = 0
+
+
+class Batcher(Generic[Asked, Answer]):
+    """Calls ``work`` in one of ``threads``, one batch of at most ``limit`` after another. Lives on one event loop.
+
+    ``work`` gives one answer for each item, in order; an exception among the answers is raised to its caller. If
+    ``work`` itself raises, every caller of the batch gets that exception.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Sequence[Asked]], Sequence[Answer | Exception]],
+        limit: int,
+        threads: Executor | None = None,
+    ) -> None:
+        self._work = work
+        self._limit = limit
+        self._threads = threads
+        self._waiting: list[tuple[Asked, asyncio.Future[Answer]]] = []
+        self._worker: asyncio.Task[None] | None = None
+
+    async def put(self, item: Asked) -> Answer:
+        """The answer to one item, once the batch that holds it is done."""
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._waiting.append((item, future))
+        if self._worker is None or self._worker.done():
+            self._worker = asyncio.create_task(self._run())
+        return await future
+
+    async def close(self) -> None:
+        """Wait until every item is done."""
+        while self._worker is not None and not self._worker.done():
+            await self._worker
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._waiting:
+            await asyncio.sleep(0)  # requests of the same moment join
+            some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
+            answers: Sequence[Answer | Exception]
+            try:
+                answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in some])
+            except Exception as error:
+                answers = [error] * len(some)
+            for (_, future), answer in zip(some, answers, strict=True):
+                if future.cancelled():
+                    continue
+                if isinstance(answer, Exception):
+                    future.set_exception(answer)
+                else:
+                    future.set_result(answer)
+
+
+class Metrics:
+    """All metrics of one server."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        counter, histogram = partial(Counter, registry=self.registry), partial(Histogram, registry=self.registry)
+        self.requests = counter("mapvote_requests", "Requests answered", ["method", "status"])
+        self.ballots = counter("mapvote_ballots", "Ballots acknowledged", ["result"])
+        self.seconds = histogram("mapvote_request_seconds", "Time to answer", ["method"])
+        self.publish_seconds = histogram("mapvote_publish_seconds", "Time to publish", buckets=(0.1, 1, 10, 60, 600))
+        self.version = Gauge("mapvote_version", "Newest version", registry=self.registry)
+        self.quarantined = Gauge("mapvote_quarantined", "Damaged, and set aside", ["kind"], registry=self.registry)
+
+    def tell_damaged(self, found: Sequence[str]) -> None:
+        """``found``: "kind name: why"."""
+        counts = TallyOf(text.partition(" ")[0] for text in found)
+        for kind in KINDS:
+            self.quarantined.labels(kind).set(counts[kind])
+
+
+_KEPT = 16
+
+
+class Made(NamedTuple):
+    """A manifest on its way out."""
+
+    content: bytes
+    """JSON."""
+    tag: str
+    """Its ETag."""
+
+
+class Manifests:
+    """The JSON of the manifests that were requested last; thread-safe."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = Lock()
+        self._made: dict[tuple[int, int | None], Made] = {}
+
+    def ready(self, number: int, since: int | None) -> Made | None:
+        """A manifest that was made before."""
+        return self._made.get((number, since))
+
+    def make(self, number: int, since: int | None) -> Made:
+        """A version; ``since`` as in :meth:`Store.manifest`. NotFound if there is no such version."""
+        with self._lock:  # of many requests for a new version, one makes it
+            made = self._made.get((number, since))
+            if made is None:
+                manifest = self._store.manifest(number, since=since)
+                made = Made(msgspec.json.encode(manifest), manifest.tag(since))
+                while len(self._made) >= _KEPT:
+                    del self._made[next(iter(self._made))]
+                self._made[number, since] = made
+        return made
+
+
+@dataclass(slots=True)
+class Progress:
+    """One publish or dry run."""
+
+    by: str
+    dry_run: bool
+    done: int = 0
+    """Tiles fused so far."""
+    of: int = 0
+    cancelled_by: str | None = None
+
+    def report(self, done: int, of: int) -> None:
+        """Note how many tiles are done. Conflict, with the name, once an operator has cancelled the publish."""
+        self.done, self.of = done, of
+        if self.cancelled_by is not None:
+            raise Conflict(f"cancelled by {self.cancelled_by} after {done} of {of} tiles: nothing was published")
+
+
+@dataclass(frozen=True, slots=True)
+class Publishing:
+    """All rounds under way in this server; thread-safe."""
+
+    _rounds: list[Progress] = field(default_factory=list)
+    _lock: Lock = field(default_factory=Lock)
+
+    @contextmanager
+    def watched(self, executor: Executor, by: str, dry_run: bool) -> Iterator[Executor]:
+        """An executor for one round, which can be seen and cancelled as long as it lasts."""
+        mine = Progress(by, dry_run)
+        with self._lock:
+            self._rounds.append(mine)
+        try:
+            yield Watched(executor, mine.report)
+        finally:
+            with self._lock:
+                self._rounds.remove(mine)
+
+    def now(self) -> list[Progress]:
+        """The rounds under way, oldest first."""
+        with self._lock:
+            return list(self._rounds)
+
+    def cancel(self, by: str) -> int:
+        """Stop every publish under way before its next tiles; how many. Dry runs go on. NotFound if there is none."""
+        stopped = [one for one in self.now() if not one.dry_run]
+        if not stopped:
+            raise NotFound("nothing is being published")
+        for one in stopped:
+            one.cancelled_by = by
+        return len(stopped)
+
+
+_BATCH = 64
+"""Ballots written in one transaction at most."""
+_BURST = 0.1
+"""Share of a minute's ballots that a vehicle may send at once."""
+_UPLOADS = 8
+"""Largest bodies that fit into the memory for all ballots on their way."""
+_READERS = 1024
+"""Requests answered by one query of the newest version."""
+
+
+class Services:
+    """The parts that live as long as the app, on an open store; :func:`services` gives them to a route.
+
+    Each kind of work has its own threads, so that none blocks another. All other work runs in FastAPI's own pool of
+    :data:`READING` threads: what operators read. ``executor`` as in :func:`mapvote_server.api.app.create_app`.
+    ``limited``: whether the quotas of vehicles hold.
+    """
+
+    def __init__(
+        self, store: Store, settings: Settings, gate: Gate | None, executor: Executor | None, *, limited: bool = True
+    ) -> None:
+        most = settings.server
+        self.store, self.settings = store, settings
+        self.gate = gate
+        """Compares a version with the one before, before it is published."""
+        self.receiving = ThreadPoolExecutor(3, "ballots")
+        self.lookups = ThreadPoolExecutor(2, "lookups")
+        """Keys, the newest version, health: short questions before every answer."""
+        self._fuse = ThreadPoolExecutor(2, "fuse")
+        self.fusing = executor or self._fuse
+        """The executor that fuses tiles."""
+        self.fetching = CapacityLimiter(4)
+        """Threads for manifests and tiles."""
+        self._deciding = CapacityLimiter(4)
+        quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
+        self.writer: Batcher[Incoming, Receipt] = Batcher(Intake(store, quota).write, _BATCH, self.receiving)
+        """Writes ballots, many in one transaction."""
+        self.newest: Batcher[None, int] = Batcher(lambda asked: [store.current()] * len(asked), _READERS, self.lookups)
+        """The number of the newest version, read once for all requests that wait for it."""
+        self.manifests = Manifests(store)
+        self.publishing = Publishing()
+        self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()
+        self.limit = RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute))
+        self.uploads = Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes)
+        self.stopping = Event()
+        """Set once the server stops."""
+
+    async def check_ready(self) -> int:
+        """The newest version, of a database that takes a writer now; Unavailable if it does not, or if the server is
+        stopping."""
+        if self.stopping.is_set():
+            raise Unavailable("the server is stopping")
+        return await self.look_up(_newest_if_writable)
+
+    async def look_up(self, ask: Callable[[Store], Answer]) -> Answer:
+        """The result of a short question to the store, in the threads for lookups."""
+        return await asyncio.get_running_loop().run_in_executor(self.lookups, ask, self.store)
+
+    async def decide(self, work: Callable[Given, Answer], *given: Given.args, **more: Given.kwargs) -> Answer:
+        """The result of slow work, which fuses tiles or reads the whole store, in the threads for it."""
+        return await to_thread.run_sync(partial(work, *given, **more), limiter=self._deciding)
+
+    def stop_fusing(self) -> None:
+        """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
+        self.stopping.set()
+        self._fuse.shutdown(wait=False, cancel_futures=True)
+
+    async def close(self) -> None:
+        """Wait until every accepted ballot is written."""
+        await self.writer.close()
+        for pool in (self._fuse, self.receiving, self.lookups):
+            pool.shutdown(cancel_futures=True)
+
+
+def _newest_if_writable(store: Store) -> int:
+    with store.database.writing() as connection:
+        return current_number(connection)
+
+
+def services(request: Request) -> Services:
+    """The parts of the app of a request."""
+    found: Services = request.app.state.services
+    return found
+
+
+async def _parts(request: Request) -> Services:
+    return services(request)
+
+
+def own(request: Request, vehicle: str) -> str:
+    """The name on a key that may change this vehicle's ballots: the vehicle within its rate, or an operator. Else
+    Forbidden."""
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return vehicle
+    if key.role != "operator":
+        if key.role != "vehicle" or key.name != vehicle:
+            raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
+        services(request).limit.take(key.name)
+    return key.name
+
+
+async def operator(request: Request) -> str:
+    """The operator's name; Forbidden for other roles."""
+    return name_of(request, "operator")
+
+
+async def reviewer(request: Request) -> str:
+    """The name of a reviewer or an operator; Forbidden for other roles."""
+    return name_of(request, "reviewer", "operator")
+
+
+async def sees_names(request: Request) -> bool:
+    """Whether the key permits the names of vehicles and exact times; others get pseudonyms and days."""
+    key: keys.Key | None = request.state.key
+    return key is None or key.role in ("reviewer", "operator")
+
+
+def name_of(request: Request, *roles: keys.Role) -> str:
+    """The name on a key of one of these roles; Forbidden for others."""
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return "operator"
+    if key.role not in roles:
+        raise Forbidden(f"only an {roles[-1]} can do this" if len(roles) == 1 else f"only a {' or '.join(roles)} can")
+    return key.name
+
+
+Parts = Annotated[Services, Depends(_parts)]
+"""Parameters of routes. Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
+Routes that hundreds of vehicles ask at once look for themselves, which takes 50 us less."""
+Operator = Annotated[str, Depends(operator)]
+Reviewer = Annotated[str, Depends(reviewer)]
+Known = Annotated[bool, Depends(sees_names)]

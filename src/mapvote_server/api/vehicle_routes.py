@@ -1,0 +1,171 @@
+"""Routes of vehicles: the map, its tiles, and ballots.
+
+OpenAPI is the contract for vehicles in other languages: every answer is declared at its route."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from functools import partial
+from typing import Any
+
+import msgspec
+from anyio import to_thread
+from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.routing import APIRoute
+
+from mapvote.codec.planes import unpack_bytes
+from mapvote.codec.tile_planes import MAX_PLANE_BYTES
+from mapvote.shapes.geojson import utc
+from mapvote_server.api.schemas import (
+    AS_CSV,
+    Digest,
+    ManifestAnswer,
+    Name,
+    Number,
+    Table,
+    VersionQuery,
+    Versions,
+    Withdrawn,
+    as_json,
+    as_table,
+    problems,
+)
+from mapvote_server.api.services import Parts, own, services
+from mapvote_server.questions.history import origin_of
+from mapvote_server.store.admission import Receipt, examine
+from mapvote_server.store.votes import withdraw
+
+_AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
+router = APIRouter()
+
+
+@router.get(
+    "/v1/map",
+    response_model=ManifestAnswer,
+    responses=problems(404) | _AS_YOU_HAVE,
+    summary="Manifest of the newest version",
+)
+async def newest(request: Request, since: VersionQuery | None = None) -> Response:
+    """Tiles with the hashes of their planes; with ``since``, only what changed after that version."""
+    return await _manifest(request, None, since)
+
+
+@router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
+def versions(parts: Parts, format: Table = "json") -> Response:
+    """Every version, oldest first, with the policy it was made by."""
+    found = parts.store.versions()
+    listed = [origin_of(v) | {"created": utc(v.created_ns)} for v in found]
+    if format == "csv":
+        return as_table(listed)
+    return as_json({"versions": [one | {"policy": v.policy} for one, v in zip(listed, found, strict=True)]})
+
+
+@router.get(
+    "/v1/map/versions/{number}",
+    response_model=ManifestAnswer,
+    responses=problems(404) | _AS_YOU_HAVE,
+    summary="Manifest of one version",
+)
+async def one_version(request: Request, number: Number, since: VersionQuery | None = None) -> Response:
+    """As ``/v1/map``, of any version; one that does not exist is 404."""
+    return await _manifest(request, number, since)
+
+
+@router.get(
+    "/v1/tiles/{digest}",
+    responses=problems(404) | _AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
+    response_class=Response,
+    summary="One plane of a tile",
+)
+async def plane(request: Request, digest: Digest) -> Response:
+    """Raw little-endian values (of ``fields`` a msgpack map of name to type and values), zstd on the wire where the
+    client takes it. Immutable: the hash is of the values."""
+    headers = {
+        "ETag": f'"{digest}"',
+        "Cache-Control": "private, max-age=31536000, immutable",
+        "Vary": "Accept-Encoding",
+    }
+    parts = services(request)
+    data = await to_thread.run_sync(parts.store.blob, digest, limiter=parts.fetching)
+    if request.headers.get("if-none-match") == f'"{digest}"':
+        return Response(status_code=304, headers=headers)
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        headers["Content-Encoding"] = "zstd"
+    else:
+        data = unpack_bytes(data, MAX_PLANE_BYTES, "tile plane")
+    return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+@router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Withdraw a ballot")
+async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
+    """Withdraw a ballot: later versions are as if it had never been cast."""
+    by = own(request, vehicle)
+    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by))
+
+
+@router.delete("/v1/ballots/{vehicle}", responses=problems(403, 404, 429), summary="Withdraw a vehicle's ballots")
+async def unvote_all_drives(request: Request, vehicle: Name) -> Withdrawn:
+    """Withdraw the ballots of all its drives."""
+    by = own(request, vehicle)
+    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, by=by))
+
+
+async def _manifest(request: Request, number: int | None, since: int | None) -> Response:
+    parts = services(request)
+    number = await parts.newest.put(None) if number is None else number
+    made = parts.manifests.ready(number, since)
+    if made is None:
+        made = await to_thread.run_sync(parts.manifests.make, number, since, limiter=parts.fetching)
+    headers = {"ETag": made.tag, "Cache-Control": "private, no-cache"}
+    if request.headers.get("if-none-match") == made.tag:
+        return Response(status_code=304, headers=headers)
+    return Response(made.content, media_type="application/json", headers=headers)
+
+
+_BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+
+
+class BallotRoute(APIRoute):
+    """The route that takes ballots: declared to FastAPI for OpenAPI, but handled without it.
+
+    FastAPI's handling of a request (dependencies, parsed body, response model) takes longer than all that a ballot
+    needs, and the ballot's decoder checks it anyway. So the request goes to :func:`vote` as it came.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler that Starlette calls; see "Custom Request and APIRoute class" in FastAPI's documentation."""
+
+        async def handle(request: Request) -> Response:
+            return await vote(request, request.path_params["vehicle"], request.path_params["drive"])
+
+        return handle
+
+
+async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
+    """One ballot, on disk before the answer. 201: new; 200: it replaced one of the same drive, or was there already.
+
+    422 if the names in the address are not those in the ballot.
+    """
+    own(request, vehicle)
+    parts = services(request)
+    body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
+    work = partial(examine, body, (vehicle, drive), request.state.key_hash)
+    incoming = await asyncio.get_running_loop().run_in_executor(parts.receiving, work)
+    receipt = await parts.writer.put(incoming)
+    parts.metrics.ballots.labels(receipt.result).inc()
+    created = receipt.result == "created"
+    return Response(msgspec.json.encode(receipt), 201 if created else 200, media_type="application/json")
+
+
+router.add_api_route(
+    "/v1/ballots/{vehicle}/{drive}",
+    vote,
+    methods=["PUT"],
+    route_class_override=BallotRoute,
+    response_model=Receipt,
+    responses=problems(403, 409, 413, 429) | {201: {"model": Receipt}},
+    openapi_extra={"requestBody": {"required": True, "content": _BYTES}},
+    summary="Vote",
+)

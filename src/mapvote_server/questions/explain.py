@@ -1,0 +1,424 @@
+"""What votes say of cells: on one cell, each ballot and why it counted or not; on a tile, cell by cell.
+
+What a version counted is read from its decision record (store/decisions.py). Only what the next version would count is
+decided here, of the one tile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import UNSAID, in_nats
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
+from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
+from mapvote.fusion.change_time import expected_days
+from mapvote.fusion.decision_record import REASONS, Record, Standing, Why
+from mapvote.fusion.fuse import Decision, decide_tile, rule_of
+from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
+from mapvote.shapes.geojson import utc
+from mapvote_server.store import schema
+from mapvote_server.store.fusion_jobs import standings_of
+from mapvote_server.store.integrity import DamagedBallots, ballot_name
+from mapvote_server.store.keys import pseudonyms
+from mapvote_server.store.policy import Policy, policy_in
+from mapvote_server.store.queries import records_of, tile_as_of, version_of
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import (
+    FOREVER,
+    Electorate,
+    Judged,
+    StoredVote,
+    electorate_now,
+    from_sound_ballots,
+    judged_on,
+    judged_votes,
+    read_votes,
+    recent_votes,
+    standing_tiles,
+    stored_votes,
+)
+
+MOST_RECORDS = 30
+"""So many of the last versions that decided a cell are asked which votes they counted."""
+UNREADABLE = "unreadable"
+ENDED = {
+    "ballot": "replaced by a later ballot of this drive",
+    "withdraw": "withdrawn",
+    "key revoked": "its vehicle's key was revoked",
+}
+"""Reasons by the kind of the event that ended a ballot."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A version that did not count a ballot, though the ballot stood."""
+
+    version: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class CellDecision:
+    """The decision of one version about a cell."""
+
+    version: int
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class CellVote:
+    """One ballot's vote on a cell. The ballot stands, or a version counted it and it was withdrawn since."""
+
+    vehicle: str
+    drive: str
+    version: int
+    """Version of the map that the vehicle used."""
+    state: str
+    """Lower case; no_vote where it says nothing."""
+    marks: int | None
+    """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
+    sure: float | None
+    """Probability that the cell did change so, by its own evidence; None where it does not say."""
+    end: str | None
+    """End of the drive, ISO 8601."""
+    counts: bool
+    """Whether the next version counts it."""
+    why: str
+    """Why it does not count; empty if it does."""
+    counted_in: tuple[int, ...]
+    """Versions that counted it on this cell, of the last 30 that decided the cell."""
+    left_out_of: tuple[LeftOut, ...]
+    """Those of the 30 that did not."""
+
+
+@dataclass(frozen=True, slots=True)
+class CellStory:
+    """One cell: every standing vote on it, and every decision about it."""
+
+    row: int
+    col: int
+    votes: list[CellVote]
+    decisions: list[CellDecision]
+    """One for each version that decided this cell."""
+    probability: float | None
+    """Probability that the cell changed as the last decision states (fusion/loss_budget.py); None if it states no
+    change."""
+    thing: str
+    """Text: what stands in the cell, whether a new object is temporary, and how many earlier objects stood there."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Now:
+    """A cell of the newest version, and the ballots that stand on its tile."""
+
+    tile: Tile
+    cell: tuple[int, int]
+    asked: Electorate
+    judged: Sequence[Judged]
+    standings: Sequence[Standing]
+    """Of ``judged``, in the next version."""
+    said: Mapping[int, TileVote]
+    """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
+    decided: Decision
+    """The decision of the next version, if it were published now."""
+
+
+def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> CellStory:
+    """The votes behind the cell that holds (x, y), map metres. ``known``: with the names of vehicles and exact times,
+    else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
+    if not (abs(x) < 1e7 and abs(y) < 1e7):
+        raise MapvoteError(f"({x}, {y}): give map metres, within 10,000 km of the map's origin")
+    rows, cols = store.lattice.cells_of(np.array([[x, y]]))
+    row, col = int(rows[0]), int(cols[0])
+    index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
+    with store.database.reading() as connection:
+        tile = tile_as_of(connection, store.lattice.tile(index), version_of(connection).number)
+        now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
+        found = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
+        decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
+        votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]], known)
+    if not known:
+        shown = pseudonyms(store, {vote.vehicle for vote in votes})
+        votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
+    probability = _probability(decisions[-1][0], cell) if decisions else None
+    by_version = [CellDecision(record.version, state) for record, state in decisions]
+    return CellStory(row, col, votes, by_version, probability, _thing(now))
+
+
+def seen(stamp_ns: int | None, known: bool) -> int | None:
+    """The time of a drive, or only its day for readers that may not know the vehicle (not ``known``): on a road with
+    few vehicles the minute would identify it."""
+    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
+
+
+def state_name(state: int) -> str:
+    """A cell state as users read it."""
+    return "no_vote" if state == NO_VOTE else CellState(state).name.lower()
+
+
+def said_by(vote: TileVote) -> U8:
+    """(256, 256) the state of each cell by one vote: its states or, in one stage, the decision of its tally. A tie is
+    undetermined, as in every decision."""
+    if vote.states is not None:
+        return vote.states
+    assert vote.tally is not None
+    return plurality(vote.tally.astype(np.int32))
+
+
+def sound_votes(
+    connection: sa.Connection, index: TileIndex, ballots: Collection[int]
+) -> dict[int, tuple[StoredVote, TileVote]]:
+    """The votes of some ballots on a tile, standing or not, by their ``seq``; without damaged and deleted ones."""
+    stored = stored_votes(connection, index, ballots) if ballots else []
+    while True:
+        try:
+            said = read_votes(connection, index, stored)
+        except DamagedBallots as error:
+            lost = {damage.name for damage in error.found}
+            stored = [one for one in stored if lost.isdisjoint((str(one.seq), ballot_name(one.seq, *index)))]
+        else:
+            return {one.seq: (one, vote) for one, vote in zip(stored, said, strict=True)}
+
+
+def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], asked: Electorate) -> _Now:
+    """The standing ballots on a tile, without those that cannot be read."""
+
+    def look(asked: Electorate) -> tuple[Electorate, Sequence[Judged], Mapping[int, TileVote]]:
+        judged = judged_on(connection, tile, asked)
+        readable = [one.stored for one in judged if one.why != "damaged"]
+        said = read_votes(connection, tile.index, readable)
+        return asked, judged, {stored.seq: vote for stored, vote in zip(readable, said, strict=True)}
+
+    asked, judged, said = from_sound_ballots(connection, asked, look)
+    policy, counting = asked.policy, [one.vote for one in judged if one.vote is not None]
+
+    def history() -> Sequence[TileVote]:
+        return recent_votes(connection, tile, asked)
+
+    past = history if policy.round.stage == "two-stage" else None
+    decided = decide_tile(tile, counting, rule_of(policy.round.method), policy.fuse, past)
+    standings = standings_of(judged, decided.copies, decided.heard)
+    return _Now(tile, cell, asked, judged, standings, said, decided)
+
+
+def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], known: bool) -> list[CellVote]:
+    """Every standing vote, then those that some version counted on the cell and that stand no more."""
+    flat = now.cell[0] * TILE_CELLS + now.cell[1]
+    past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
+    said = {**now.said, **{seq: vote for seq, (_, vote) in past.items()}}
+    counted, left_out = defaultdict[int, list[int]](list), defaultdict[int, list[LeftOut]](list)
+    for record in records:
+        for standing in _standings(record):
+            if standing.ballot in said and said[standing.ballot].spoken()[now.cell]:
+                why = standing.why_not(flat)
+                if why:
+                    left_out[standing.ballot].append(LeftOut(record.version, REASONS[why]))
+                else:
+                    counted[standing.ballot].append(record.version)
+    gone = sorted(past.keys() & counted.keys())
+    ended = _ended(connection, gone)
+    everyone = [(one.stored, _why_not(standing, now)) for one, standing in zip(now.judged, now.standings, strict=True)]
+    everyone += [(past[seq][0], ended.get(seq, "stands no more")) for seq in gone]
+    found = []
+    for stored, reason in everyone:
+        vote, seq = said.get(stored.seq), stored.seq
+        text: tuple[str, int | None, float | None] = UNREADABLE, None, None
+        if vote is not None:
+            text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
+        whose, end = (stored.vehicle, stored.drive, stored.version), utc(seen(stored.end_ns, known))
+        found.append(CellVote(*whose, *text, end, not reason, reason, tuple(counted[seq]), tuple(left_out[seq])))
+    return found
+
+
+def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str]:
+    """The reason why each of some ballots ended."""
+    b, e = schema.ballots.c, schema.events.c
+    ends = sa.select(b.seq, e.kind).join(schema.events, e.seq == b.gone_seq).where(b.seq.in_(ballots))
+    return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
+
+
+def _why_not(standing: Standing, now: _Now) -> str:
+    """Why the next version would not count a standing ballot on the cell; "" if it would."""
+    if not standing.why and not now.said[standing.ballot].spoken()[now.cell]:
+        return "says nothing here"
+    why: Why = standing.why_not(now.cell[0] * TILE_CELLS + now.cell[1])
+    fuse, memory = now.asked.settings, now.tile.memory
+    if why == "window":
+        return f"older than {fuse.max_age_days:g} days or not among the last {fuse.latest_vehicles} vehicles"
+    if why == "spent" and memory is not None:
+        return f"spent: version {memory.changed[now.cell]} has changed the cell since"
+    return REASONS[why] if why else ""
+
+
+def _standings(record: Record) -> Sequence[Standing]:
+    """None of a record that is damaged."""
+    try:
+        return record.standings
+    except MapvoteError:
+        return ()
+
+
+def _state_in(record: Record, cell: tuple[int, int]) -> str:
+    try:
+        return state_name(int(record.states[cell]))
+    except MapvoteError:
+        return UNREADABLE
+
+
+def _probability(record: Record, cell: tuple[int, int]) -> float | None:
+    """Probability that the cell changed as the record states, without the changes in cells of other tiles. None if the
+    record states no change or cannot be read any more."""
+    try:
+        states, counted = record.states, record.tally[cell].astype(np.int64) // VOTE_UNIT
+        odds = record.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
+    except MapvoteError:
+        return None
+    state = int(states[cell])
+    if state not in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        return None
+    rows, cols = np.nonzero(states == state)
+    beside = alike_beside(rows, cols, np.zeros(len(rows), np.int64))[(rows == cell[0]) & (cols == cell[1])]
+    against = counted[: CellState.UNDETERMINED].sum() - counted[state]
+    asked = np.array([counted[state]]), np.array([against])
+    return round(float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0]), 3)
+
+
+def _thing(now: _Now) -> str:
+    """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
+    tile, cell, fuse = now.tile, now.cell, now.asked.settings
+    text = _waits(now)
+    if tile.obstacle_words[cell]:
+        brought = tile.memory is not None and tile.memory.came_s[cell] > 0
+        text.append("stands: brought by vehicles" if brought else "stands: surveyed")
+    stays = 0 if tile.memory is None else int(tile.memory.stays[cell])
+    if stays and tile.memory is not None:
+        here = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+        here[cell] = True
+        days = int(tile.memory.stayed_s[cell]) / 86_400 / stays
+        expected = float(expected_days(tile.memory, here, 0.0, fuse)[0])
+        past = f"{stays} things came and went here, after {days:.1f} days on average"
+        text.append(f"{past}; the next can be expected to stay {expected:.1f}")
+    return "; ".join(text)
+
+
+def _waits(now: _Now) -> list[str]:
+    """Decisions that do not change the map yet, or change it otherwise than voted, with the reason."""
+    found, cell, text = now.decided, now.cell, []
+    if found.passing is not None and found.passing[cell]:
+        text.append("temporary: a new object here is not expected to stay, so the map does not take it")
+    elif found.denied is not None and found.denied[cell]:
+        text.append("waits: the last vehicle that looked says otherwise")
+    if found.edits[cell] != found.states[cell]:
+        text.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
+    likely = found.pending.at(cell)
+    if likely is not None:
+        text.append(
+            f"pending: the probability that emptying it deletes something that stands is {likely:.2g}, and the policy "
+            f"allows {now.asked.settings.false_deletions:g}; the cell is emptied once further votes lower it"
+        )
+    return text
+
+
+def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:
+    if vote.gone is None:
+        return None
+    mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
+    return int(mine[0]).bit_count() if len(mine) else 0
+
+
+def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
+    """The probability that a vehicle gives a change of the cell; None if it gives none."""
+    if vote.odds is None:
+        return None
+    said = vote.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
+    return None if said[0] == UNSAID else round(1.0 / (1.0 + math.exp(-float(in_nats(said)[0]))), 4)
+
+
+def _said_on(
+    connection: sa.Connection, index: TileIndex, policy: Policy, wanted: Callable[[StoredVote, Why], bool]
+) -> list[TileVote]:
+    """The standing votes on a tile, of any age, that are ``wanted``; without damaged ones."""
+
+    def read(asked: Electorate) -> list[TileVote]:
+        chosen = [vote for vote, why in judged_votes(connection, index, asked) if wanted(vote, why)]
+        return read_votes(connection, index, chosen)
+
+    return from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), read)
+
+
+def votes_by_tile(connection: sa.Connection, lattice: Lattice, policy: Policy) -> Iterator[tuple[Grid, list[TileVote]]]:
+    """Of each tile with standing votes: its window, and the votes inside the policy's window, one a vehicle."""
+    for index in standing_tiles(connection, FOREVER):
+        window = lattice.tile(index)
+        yield window, one_each(_said_on(connection, index, policy, lambda vote, why: not why), window)
+
+
+_NEVER_SEEN = 255
+
+
+def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
+    """(256, 256, 4) the standing votes on a tile's cells, of all vehicles or of one.
+
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never);
+    probability that the cell changed, in 1/255; the most frequent state (a tie is
+    undetermined; NO_VOTE: no vote).
+    """
+    with store.database.reading() as connection:
+        policy = policy_in(connection)
+
+        def wanted(vote: StoredVote, why: Why) -> bool:
+            return why != "damaged" and vehicle in (None, vote.vehicle)
+
+        votes = _said_on(connection, index, policy, wanted)
+    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
+    newest: dict[str, TileVote] = {}
+    last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
+    for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
+        states, before = said_by(vote), newest.get(vote.vehicle, silent)
+        assert before.states is not None
+        spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
+        last[spoken] = vote.end_ns
+        odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
+        newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
+    return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
+
+
+def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
+    counts = np.zeros((N_STATES, TILE_CELLS**2), dtype=np.int64)
+    said = counts[:4].reshape(4, TILE_CELLS, TILE_CELLS)
+    for vote in votes:
+        for state in range(4):
+            said[state] += vote.states == state
+    total = said.sum(axis=0)
+    days = np.clip((now_ns - last) // DAY_NS, 0, _NEVER_SEEN - 1)
+    out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
+    out[..., 0] = np.minimum(total, 255)
+    out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
+    out[..., 2] = np.rint(255 * _probabilities(said, votes, quorum))
+    out[..., 3] = decide_cells(counts, counts, True, 0).reshape(total.shape)
+    return out
+
+
+def _probabilities(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
+    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where no
+    vehicle votes for a change."""
+    changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
+    rows, cols = np.nonzero(changes.any(axis=0))
+    kinds = changes[:, rows, cols].argmax(axis=0)
+    votes = changes[kinds, rows, cols]
+    states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
+    against = said[:, rows, cols].sum(axis=0) - votes
+    out, claimed = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    claimed[rows, cols] = states
+    odds = agreed_odds(vehicles, claimed, quorum).at(rows * TILE_CELLS + cols)
+    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
+    return out

@@ -1,0 +1,285 @@
+"""The content of a store and its history: changes between versions, and its log in order, for its listeners (pages,
+integrators, webhooks), who share one poll of the database."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import islice
+from threading import Lock
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import names_in_plane
+from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, U8, MapvoteError
+from mapvote.fusion.decision_record import Standing, cells_in
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.shapes.change_objects import Decided, change_objects, changed_cells
+from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
+from mapvote.shapes.geojson import to_geojson
+from mapvote_server.errors import Unavailable
+from mapvote_server.questions.explain import seen, sound_votes
+from mapvote_server.store import schema
+from mapvote_server.store.integrity import set_aside
+from mapvote_server.store.keys import hash_of
+from mapvote_server.store.queries import (
+    Version,
+    current_number,
+    load_blob,
+    load_tile,
+    newest_seq,
+    oldest_kept,
+    records_of,
+    tiles_of,
+    tiles_that_differ,
+    version_of,
+)
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import (
+    StoredVote,
+)
+
+_LOOKED_AT = 3
+
+
+def overview(store: Store) -> dict[str, Any]:
+    """The figures of `mapvote info`."""
+    b, t = schema.ballots, schema.ballot_tiles
+    standing = sa.select(sa.func.count(), sa.func.count(sa.distinct(b.c.vehicle))).where(b.c.gone_seq.is_(None))
+    with store.database.reading() as connection:
+        newest = version_of(connection)
+        ballots, vehicles = connection.execute(standing).one()
+        planes, size = connection.execute(
+            sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(sa.func.length(schema.blobs.c.data)), 0))
+        ).one()
+        votes = connection.execute(sa.select(sa.func.count()).select_from(t)).scalar_one()
+        tiles = tiles_of(connection, newest.number)
+        return {
+            "map_id": store.map_id,
+            "version": newest.number,
+            "published_ns": newest.created_ns,
+            "oldest_version": oldest_kept(connection),
+            "tiles": len(tiles),
+            "fields": _fields(connection, tiles.values()),
+            "ballots": ballots,
+            "vehicles": vehicles,
+            "votes_on_tiles": votes,
+            "planes": planes,
+            "plane_bytes": int(size),
+            "quarantined": len(set_aside(connection)),
+        }
+
+
+def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
+    """Names of the point fields, by the first readable tiles that have any."""
+    names: dict[str, None] = {}
+    for digest in islice((hashes.fields for hashes in tiles if hashes.fields is not None), _LOOKED_AT):
+        try:
+            names |= dict.fromkeys(names_in_plane(load_blob(connection, digest), digest))
+        except Unavailable:
+            raise
+        except MapvoteError:
+            continue
+    return ", ".join(names) or "none"
+
+
+def origin_of(version: Version) -> dict[str, Any]:
+    """Where a version comes from."""
+    columns = ("number", "parent", "kind", "target", "published_by", "reason")
+    return {name: getattr(version, name) for name in columns}
+
+
+def log_of(store: Store, last: int) -> dict[str, Any]:
+    """The versions, oldest first, and the ``last`` so many events, newest first."""
+    versions = [origin_of(version) | {"created_ns": version.created_ns} for version in store.versions()]
+    return {"versions": versions, "events": last_events(store, last) if last else []}
+
+
+def changes_between(
+    store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False, known: bool = True
+) -> dict[str, Any]:
+    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
+    ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
+
+    NotFound if one of the versions does not exist.
+    """
+    with store.database.reading() as connection:
+        found, damaged = [], []
+        for index, *pair in tiles_that_differ(connection, old, new):
+            try:
+                before, after = (load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair)
+                found.append(changed_cells(before, after, _decided(connection, index, min(old, new), max(old, new))))
+            except Unavailable:
+                raise
+            except MapvoteError:
+                damaged.append(tile_key(index))
+    collection = to_geojson(
+        [
+            replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
+            for thing in change_objects(found, min_cells)
+        ],
+        store.lattice,
+        map_id=store.map_id,
+        from_version=old,
+        to_version=new,
+        georeference=store.georeference,
+        lonlat=lonlat,
+    )
+    return collection | ({"damaged": damaged} if damaged else {})
+
+
+def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
+    """The largest things of :func:`changes_between` with their surroundings, before and after."""
+    tiles = tiles_at(store, old), tiles_at(store, new)
+    large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
+    largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
+    return [of_feature(feature, tiles, store.lattice) for feature in largest]
+
+
+def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
+    """HTML of :func:`cutouts_between`, one file without any request."""
+    return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
+
+
+def tiles_at(store: Store, version: int) -> Tiles:
+    """Tiles of one version by their index, each loaded once. NotFound if there is no such version."""
+    with store.database.reading() as connection:
+        version_of(connection, version)
+        hashes = tiles_of(connection, version)
+
+    @cache
+    def load(index: TileIndex) -> Tile:
+        with store.database.reading() as connection:
+            return load_tile(connection, store.lattice.tile(index), hashes.get(index))
+
+    return load
+
+
+def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) -> list[Decided]:
+    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted;
+    MapvoteError if a record is damaged."""
+    records = records_of(connection, index, after=old, upto=new)
+    counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
+    sound = sound_votes(connection, index, counted)
+    return [(record, _drives(record.standings, sound)) for record in records]
+
+
+def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
+    """(end_ns, states) of the ballots that counted, in the cells where they did."""
+    found = []
+    for standing in standings:
+        _, vote = sound.get(standing.ballot, (None, None))
+        if not standing.why and vote is not None and vote.states is not None:
+            states = vote.states.copy()
+            for cells in (standing.spent, standing.reviewed):
+                states.reshape(-1)[cells_in(cells)] = NO_VOTE
+            found.append((vote.end_ns, states))
+    return found
+
+
+OF_THE_MAP = ("import", "publish", "rollback", "replay")
+"""Kinds that concern the map alone: actor and reason are open to every reader."""
+OF_VEHICLES = ("ballot", "withdraw")
+"""Kinds that reveal the minute of a drive."""
+_MOST = 500
+POLL_S = 0.9
+"""Least time between two polls of the database."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One line of the log."""
+
+    seq: int
+    at_ns: int
+    kind: str
+    actor: str
+    detail: str
+    version: int
+    """The newest version when the event was read."""
+
+
+def newest_event(store: Store) -> int:
+    """Number of the last event."""
+    with store.database.reading() as connection:
+        return newest_seq(connection)
+
+
+def taken_up_to(store: Store, address: str) -> int:
+    """The last event that the listener at this address took; of a new listener the newest event."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        taken = connection.execute(sa.select(d.c.seq).where(d.c.address == hash_of(address))).scalar_one_or_none()
+        if taken is None:
+            taken = newest_seq(connection)
+            connection.execute(d.insert().values(address=hash_of(address), seq=taken))
+    return int(taken)
+
+
+def take(store: Store, address: str, seq: int) -> None:
+    """Note that a known listener took all events up to this one."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        connection.execute(d.update().where(d.c.address == hash_of(address)).values(seq=seq))
+
+
+def events_after(store: Store, seq: int) -> list[Event]:
+    """The events after ``seq``, oldest first, 500 at most. Writing transactions are serial, so none appears later."""
+    e = schema.events
+    query = sa.select(e.c.seq, e.c.at_ns, e.c.kind, e.c.actor, e.c.detail).where(e.c.seq > seq).order_by(e.c.seq)
+    with store.database.reading() as connection:
+        rows = connection.execute(query.limit(_MOST)).all()
+        version = current_number(connection) if rows else 0
+    return [Event(*row, version) for row in rows]
+
+
+def last_events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
+    """The last events, newest first."""
+    e = schema.events.c
+    query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
+    with store.database.reading() as connection:
+        return [dict(row._mapping) for row in connection.execute(query)]
+
+
+class Feed:
+    """The latest events of one store, kept for all listeners; thread-safe.
+
+    Of the listeners that call :meth:`after` within ``poll_s`` seconds, the first polls the database.
+    """
+
+    def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._poll_s, self._seconds = store, poll_s, seconds
+        self._lock = Lock()
+        self._recent: deque[Event] = deque(maxlen=_MOST)
+        self._newest: int | None = None
+        self._polled_s = -poll_s
+
+    def after(self, seq: int) -> list[Event]:
+        """The events after ``seq``, oldest first, at most 500. Older events than those kept are read from the log."""
+        with self._lock:
+            now = self._seconds()
+            if self._newest is None:
+                self._newest, self._polled_s = newest_event(self._store), now
+            elif now - self._polled_s >= self._poll_s:
+                found = events_after(self._store, self._newest)
+                self._recent.extend(found)
+                self._newest, self._polled_s = (found[-1].seq if found else self._newest), now
+            if seq >= self._newest:
+                return []
+            if self._recent and self._recent[0].seq <= seq + 1:
+                return [event for event in self._recent if event.seq > seq]
+        return events_after(self._store, seq)
+
+
+def without_names(events: Sequence[Event]) -> list[Event]:
+    """Events for readers that may not see vehicles' names: none of ballots, others without actor and detail."""
+    shown = [e for e in events if e.kind not in OF_VEHICLES]
+    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in shown]

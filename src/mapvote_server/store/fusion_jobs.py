@@ -1,0 +1,234 @@
+"""Fusion of a round, tile by tile, on any concurrent.futures.Executor: threads, or Dask on a cluster.
+
+A worker reads the ballots from the database. It returns the decision and the planes that changed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from itertools import accumulate, groupby
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.planes import pack_plane
+from mapvote.codec.tile_planes import pack_tile
+from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import I64, Bool, MapvoteError
+from mapvote.fusion.change_time import emptied_and_filled
+from mapvote.fusion.decision_record import Record, Standing, pack_standings, pack_tally, packed_cells
+from mapvote.fusion.distrust import Copy
+from mapvote.fusion.fuse import fuse_tile, rule_of
+from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
+from mapvote.fusion.tile_vote import TileVote
+from mapvote_server.errors import Unavailable
+from mapvote_server.store.database import Database, address_of
+from mapvote_server.store.integrity import Damage, DamagedBallots
+from mapvote_server.store.queries import load_tile, tile_as_of
+from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
+
+_GROUP, _ROUND = 8, 8
+"""Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
+executor, so that all its workers have work and a round can be cancelled between groups."""
+_NOWHERE = np.empty(0, dtype=np.uint64)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One tile to fuse: everything a worker needs but the ballots."""
+
+    url: str
+    """Address of the database, without its password."""
+    window: Grid
+    version: int
+    """Number of the version to be made."""
+    tile: TileHashes | Tile | None
+    """The tile of the newest version: its hashes in the store, the tile itself, or None if there is none."""
+    asked: Electorate
+    misread: Mapping[int, Bool] | None = None
+    """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """The result of fusing one tile."""
+
+    index: TileIndex
+    record: Record | None
+    """The decision; None if the tile itself could not be read."""
+    vehicles: int
+    points: int
+    """Number of points before the edit."""
+    added: int
+    deleted: int
+    hashes: TileHashes | None
+    """Hashes of the edited tile; None if the tile does not change."""
+    planes: Mapping[str, bytes]
+    cells_gone: I64
+    """Flat cells whose last obstacle was deleted."""
+    cells_new: I64
+    """Flat cells that hold one for the first time."""
+    freed: int
+    """Number of cells in which free space was learned; 0 for a tile without known-free columns."""
+    tile: Tile | None
+    """The edited tile if the task held the tile itself (replay), else None."""
+    damaged: Sequence[Damage] = ()
+    """Damaged planes and ballots, which were left out."""
+    copies: Sequence[Copy] = ()
+    """Drives that did not count because another vehicle's drive is a copy of them."""
+    pending: PendingDeletions = field(default_factory=PendingDeletions.none)
+    """Deletions that wait because their probability of a false deletion exceeds the budget."""
+
+    @classmethod
+    def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
+        """The result for a tile that cannot be read."""
+        nowhere = np.empty(0, dtype=np.int64)
+        return cls(index, None, 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
+
+
+def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
+    """Read the votes that count on some tiles of a row, in one round, decide, edit. Pure but for reading the database.
+
+    Damaged ballots are left out and named; a damaged tile stays as it is and is named. In another process, where there
+    is no ``database`` at hand, one is opened by the tasks' ``url`` and kept.
+    """
+    with (database or _database(tasks[0].url)).reading() as connection:
+        tiles = [task.window.tile_index for task in tasks]
+        polled = poll(connection, tiles[0][0], [col for _, col in tiles], tasks[0].asked)
+        return [_fuse_sound(connection, task, polled) for task in tasks]
+
+
+def _fuse_sound(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
+    """One tile, without what is damaged."""
+    damaged: list[Damage] = []
+    while True:
+        try:
+            return replace(_fuse(connection, task, polled), damaged=damaged)
+        except DamagedBallots as error:
+            damaged += error.found
+            task = replace(task, asked=task.asked.leaving_out(error.found))
+        except Unavailable:
+            raise
+        except MapvoteError as error:
+            lost = Damage("plane", _plane_of(task, str(error)), str(error)[:180])
+            return Fused.nothing(task.window.tile_index, [*damaged, lost])
+
+
+def _plane_of(task: Task, error: str) -> str:
+    """Which plane an error is about: by its hash, so that mending it takes it out of quarantine."""
+    if not isinstance(task.tile, TileHashes):
+        return f"of tile {tile_key(task.window.tile_index)}"
+    return next((digest for digest in task.tile.planes().values() if digest[:12] in error), task.tile.points)
+
+
+def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
+    tile = _tile(connection, task)
+    judged = judged_on(connection, tile, task.asked, task.misread, polled)
+    votes = [one.vote for one in judged if one.vote is not None]
+    cast = task.asked.policy.round
+
+    def history() -> list[TileVote]:
+        return recent_votes(connection, tile, task.asked, task.misread, polled)
+
+    recent = history if cast.stage == "two-stage" else None
+    decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
+    stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
+    hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
+    held, holds = (tile.obstacle_words, edited.obstacle_words) if hashes else (_NOWHERE, _NOWHERE)
+    emptied, filled = emptied_and_filled(held.reshape(-1), holds.reshape(-1))
+    return Fused(
+        index=tile.index,
+        record=Record(
+            0,
+            pack_plane(decision.states, 1),  # quick rather than small
+            pack_tally(decision.tally),
+            pack_agreed(decision.odds, decision.states),
+            pack_standings(standings_of(judged, decision.copies, decision.heard)),
+        ),
+        vehicles=decision.vehicles,
+        points=len(tile.points),
+        added=decision.added,
+        deleted=decision.deleted,
+        hashes=hashes,
+        planes=planes,
+        cells_gone=emptied,
+        cells_new=filled,
+        freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
+        tile=None if task.misread is None else edited,
+        copies=decision.copies,
+        pending=decision.pending,
+    )
+
+
+def standings_of(judged: Sequence[Judged], copies: Iterable[Copy], heard: Collection[str]) -> list[Standing]:
+    """The standing of every ballot on a tile, by the copies among them and the vehicles that counted."""
+    copied = {(copy.vehicle, copy.digest): copy for copy in copies}
+    seqs = {(one.stored.vehicle, one.stored.digest): one.stored.seq for one in judged}
+    found = []
+    for one in judged:
+        why, alike = one.why, 0
+        copy = copied.get((one.stored.vehicle, one.stored.digest))
+        if copy is not None:
+            why, alike = "copy", seqs[copy.heard_vehicle, copy.heard_digest]
+        elif not why and one.stored.vehicle not in heard:
+            why = "opposes"
+        found.append(Standing(one.stored.seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike))
+    return found
+
+
+def _tile(connection: sa.Connection, task: Task) -> Tile:
+    if isinstance(task.tile, Tile):
+        return task.tile
+    if task.tile is not None:
+        return load_tile(connection, task.window, task.tile)
+    return tile_as_of(connection, task.window, task.version - 1)
+
+
+class Watched(Executor):
+    """Runs its work on another executor, and reports every tile that is done.
+
+    ``report`` is called with (tiles done, tiles in all), the first time before any tile is fused. An exception that it
+    raises ends the round; tiles that have not begun are not fused.
+    """
+
+    def __init__(self, within: Executor, report: Callable[[int, int], None]) -> None:
+        self.within = within
+        self._report = report
+
+    def map(
+        self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
+    ) -> Iterator[Any]:
+        """Results of the other executor, in order; the first of ``iterables`` holds groups of tiles."""
+        groups = [list(some) for some in iterables]
+        sizes = [len(group) for group in groups[0]]
+        self._report(0, sum(sizes))
+        results = self.within.map(fn, *groups, timeout=timeout, chunksize=chunksize)
+        for done in accumulate(sizes):
+            yield next(results)
+            self._report(done, sum(sizes))
+
+
+def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
+    """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another."""
+    where = executor.within if isinstance(executor, Watched) else executor
+    here = partial(fuse_stored, database=database)
+    rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
+    size = min(_GROUP, max(1, len(tasks) // _ROUND)) if executor else _GROUP
+    groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
+    work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
+    return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
+
+
+@lru_cache(maxsize=4)
+def _database(url: str) -> Database:
+    """Opened by the worker's own MAPVOTE_STORE if that names the same database, because tasks carry no password."""
+    own = os.environ.get("MAPVOTE_STORE", "")
+    return Database(own if own and address_of(sa.make_url(own)) == url else url)

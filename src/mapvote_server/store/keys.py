@@ -1,0 +1,160 @@
+"""Keys and whose they are: random, shown once, stored hashed, with a role and perhaps an end."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import sqlalchemy as sa
+
+from mapvote.core.types import MapvoteError
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote_server.errors import NotFound, Unauthorised
+from mapvote_server.store import schema
+from mapvote_server.store.queries import end_votes, log_event
+from mapvote_server.store.store import Store
+
+Role = Literal["vehicle", "reader", "reviewer", "operator"]
+"""A vehicle votes; a reader looks; a reviewer also sees who voted what and judges pending changes; an operator does
+all."""
+ROLES: tuple[Role, ...] = get_args(Role)
+UNKNOWN = "this key is unknown, revoked or past its end: ask the operator for a new one (mapvote keys)"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_MOST_DAYS = 36_500
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """Name of the vehicle or person."""
+
+    name: str
+    role: str
+    created_ns: int
+    revoked_ns: int | None
+    expires_ns: int | None = None
+
+    def valid_at(self, now_ns: int) -> bool:
+        """Whether it opens anything."""
+        return self.revoked_ns is None and (self.expires_ns is None or self.expires_ns > now_ns)
+
+
+def issue(store: Store, name: str, role: Role, *, by: str = "operator", days: float | None = None) -> str:
+    """A new key, good for so many days (None: until it is revoked); the only time that it is seen. A name may hold
+    several, all of one role. MapvoteError for a name that cannot be one, or that has valid keys of another role."""
+    with store.database.writing() as connection:
+        return put_in(connection, store.clock(), name, role, by, days)
+
+
+def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, days: float | None = None) -> str:
+    """:func:`issue` within a transaction."""
+    if not _NAME.fullmatch(name):
+        raise MapvoteError(f"{name!r} is no name: 1-64 of letters, digits, dot, underscore, dash")
+    if role not in ROLES:
+        raise MapvoteError(f"{role!r} is no role; choose one of {', '.join(ROLES)}")
+    if days is not None and not 0 < days <= _MOST_DAYS:
+        raise MapvoteError(f"a key for {days:g} days: give more than 0 and at most {_MOST_DAYS}, or leave it out")
+    others = {key.role for key in _keys_of(connection, name) if key.valid_at(now)} - {role}
+    if others:
+        raise MapvoteError(f"{name!r} has a valid key of a {others.pop()}: a name has one role; revoke that one first")
+    secret = secrets.token_urlsafe(32)
+    end = None if days is None else now + round(days * DAY_NS)
+    row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now, "expires_ns": end}
+    connection.execute(schema.keys.insert().values(**row))
+    log_event(connection, now, "key issued", by, f"{role} {name}" + ("" if days is None else f" for {days:g} days"))
+    return secret
+
+
+def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float = 1.0) -> str:
+    """A new key for who has one, of the same role and length; those that were valid end after ``overlap_days``.
+
+    NotFound if the name has no valid key.
+    """
+    k = schema.keys
+    with store.database.writing() as connection:
+        now = store.clock()
+        valid = [key for key in _keys_of(connection, name) if key.valid_at(now)]
+        if not valid:
+            raise NotFound(f"{name!r} has no valid key to take the place of; issue one")
+        last, end = valid[-1], now + round(overlap_days * DAY_NS)
+        later = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > end))
+        connection.execute(k.update().where(later).values(expires_ns=end))
+        days = None if last.expires_ns is None else (last.expires_ns - last.created_ns) / DAY_NS
+        return put_in(connection, now, name, last.role, by, days)  # type: ignore[arg-type]
+
+
+def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = False) -> tuple[int, int]:
+    """Revoke every key of a name: (keys, ballots that count no more). NotFound if it has no valid key.
+
+    Who is trusted no longer was not to be trusted before: its standing ballots count no more, unless ``keep_votes``.
+    What was published of them stays (:func:`mapvote_server.store.rollback.replay` takes that out too).
+    """
+    k, now = schema.keys, store.clock()
+    valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
+    with store.database.writing() as connection:
+        done = connection.execute(k.update().where(valid).values(revoked_ns=now))
+        if not done.rowcount:
+            raise NotFound(f"{name!r} has no valid key")
+        seq = log_event(connection, now, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
+        return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
+
+
+def ballots_standing(store: Store) -> dict[str, int]:
+    """Number of standing ballots, by the name of their vehicle."""
+    b = schema.ballots.c
+    query = sa.select(b.vehicle, sa.func.count()).where(b.gone_seq.is_(None)).group_by(b.vehicle)
+    with store.database.reading() as connection:
+        return {vehicle: int(count) for vehicle, count in connection.execute(query)}
+
+
+def listed(store: Store) -> list[Key]:
+    """All keys ever issued, oldest first; never the keys themselves."""
+    with store.database.reading() as connection:
+        return _keys_of(connection)
+
+
+def any_issued(store: Store) -> bool:
+    """Whether the store has ever seen a key: one that is revoked closes an open server as well."""
+    with store.database.reading() as connection:
+        return connection.execute(sa.select(schema.keys.c.name).limit(1)).first() is not None
+
+
+def check(store: Store, hashes: Sequence[str]) -> list[Key | Exception]:
+    """Whose keys these are, by :func:`hash_of`; Unauthorised in the place of one that opens nothing."""
+    with store.database.reading() as connection:
+        valid = of(connection, set(hashes), store.clock())
+    return [valid[digest] if digest in valid else Unauthorised(UNKNOWN) for digest in hashes]
+
+
+def of(connection: sa.Connection, hashes: Collection[str], now: int) -> dict[str, Key]:
+    """The keys among these that are valid ``now``, by :func:`hash_of`."""
+    if not hashes:
+        return {}
+    k = schema.keys
+    found = connection.execute(sa.select(k.c.hash, *_COLUMNS).where(k.c.hash.in_(hashes)))
+    return {digest: key for digest, *columns in found if (key := Key(*columns)).valid_at(now)}
+
+
+def hash_of(secret: str) -> str:
+    """SHA-256: a key is 256 random bits, so no slow hash is needed."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def pseudonyms(store: Store, names: Collection[str]) -> dict[str, str]:
+    """The pseudonym of each vehicle for vehicles and readers: constant, and specific to this store."""
+    with store.database.reading() as connection:
+        secret = connection.execute(sa.select(schema.maps.c.secret)).scalar_one().encode()
+    return {name: "vehicle-" + hmac.digest(secret, name.encode(), "sha256").hex()[:10] for name in names}
+
+
+_COLUMNS = tuple(schema.keys.c[name] for name in ("name", "role", "created_ns", "revoked_ns", "expires_ns"))
+
+
+def _keys_of(connection: sa.Connection, name: str | None = None) -> list[Key]:
+    k = schema.keys
+    query = sa.select(*_COLUMNS).order_by(k.c.created_ns)
+    return [Key(*row) for row in connection.execute(query if name is None else query.where(k.c.name == name))]

@@ -1,0 +1,118 @@
+"""The policy of a store: what a round is cast by, which votes are enough, when a version is held. One row a change.
+
+Everybody who publishes obeys the newest row, and every version records the policy that made it, so that any past round
+can be fused again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import sqlalchemy as sa
+from pydantic import Field, ValidationError
+
+from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_you_mean
+from mapvote.core.types import MapvoteError
+from mapvote_server.store import schema
+from mapvote_server.store.queries import log_event
+
+
+class RoundPolicy(Section):
+    """Method and settings of a round's ballots. Other ballots are refused, and standing ones do not count."""
+
+    method: Literal["paper", "surfaces"] = Field(default="surfaces", description="paper or surfaces")
+    stage: Literal["one-stage", "two-stage"] = "two-stage"
+    settings_hash: str = Field(
+        default="",
+        pattern="^([0-9a-f]{8,64})?$",
+        description="only ballots cast by these settings (`mapvote config` shows the digest of yours); empty: by any",
+    )
+
+    @property
+    def cast_by(self) -> str:
+        """Method and stage, as ballots are recorded with them."""
+        return f"{self.method}, {self.stage}"
+
+
+class GatePolicy(GateSettings):
+    """The reference drive by which a new version is judged."""
+
+    drive: str = Field(
+        default="",
+        max_length=1000,
+        pattern=r"^[^\x00-\x1f]*$",
+        description="drive on the machine that publishes; empty: no gate",
+    )
+
+
+class KeepPolicy(Section):
+    """The data that ``gc`` deletes (:mod:`mapvote_server.store.retention`)."""
+
+    versions: int = Field(
+        default=0, ge=0, le=1_000_000, description="older ones than the last so many may go; 0: none ever"
+    )
+    automatic: bool = Field(default=False, description="after every version, not only by `mapvote gc`")
+
+
+class Policy(Section):
+    """All that decides what becomes of the ballots."""
+
+    round: RoundPolicy = RoundPolicy()
+    fuse: FuseSettings = FuseSettings()
+    gate: GatePolicy = GatePolicy()
+    keep: KeepPolicy = KeepPolicy()
+
+    @classmethod
+    def of(cls, settings: Settings) -> Policy:
+        """The first policy of a store made by these settings: its fleet votes as they say."""
+        voting = settings.voting
+        stage: Literal["one-stage", "two-stage"] = "two-stage" if voting.two_stage else "one-stage"
+        asked = RoundPolicy(method=voting.method, stage=stage, settings_hash=settings.digest())
+        return cls(round=asked, fuse=settings.fuse, gate=GatePolicy.model_validate(settings.gate.model_dump()))
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyChange:
+    """One row: what held from an event on, and who said so."""
+
+    seq: int
+    at_ns: int
+    by: str
+    reason: str
+    policy: Policy
+
+
+def policy_in(connection: sa.Connection) -> Policy:
+    """The newest policy."""
+    p = schema.policies
+    newest = sa.select(p.c.policy).order_by(p.c.seq.desc()).limit(1)
+    return Policy.model_validate(connection.execute(newest).scalar_one())
+
+
+def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, reason: str) -> int:
+    """Let another policy hold from now on; the number of the event."""
+    seq = log_event(connection, now, "policy", by, reason)
+    connection.execute(schema.policies.insert().values(seq=seq, policy=policy.model_dump(mode="json")))
+    return seq
+
+
+def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
+    """The policy with some values changed, by "section.key"; texts are read as numbers where these are meant.
+
+    MapvoteError naming the key, and the nearest one that exists.
+    """
+    sections = policy.model_dump()
+    known = [f"{section}.{key}" for section, keys in sections.items() for key in keys]
+    for name, value in values.items():
+        if name not in known:
+            raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")
+        section, _, key = name.partition(".")
+        sections[section][key] = value
+    try:
+        return Policy.model_validate(sections)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"][:2])
+        raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error

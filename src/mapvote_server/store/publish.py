@@ -1,0 +1,400 @@
+"""New versions: what a publish would make now, and the publish.
+
+A round follows from the newest version, the ballots, the reviews, the policy and one reading of the clock. It holds
+until an event comes that can change it or, with a minimum age, until the next vote is old enough. It is decided once:
+desk, dry run, picture, review and publish share one :class:`Round`. It is decided on a snapshot, before the transaction
+that writes it. Of several publishers exactly one wins; the others get Conflict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, field, replace
+from threading import Lock
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import scipy
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
+from mapvote.config import FuseSettings
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.point_map import PointMap, with_changed
+from mapvote.core.tile import Tile
+from mapvote.core.types import I64, MapvoteError
+from mapvote.fusion.decision_record import Record
+from mapvote_server.errors import Conflict, Held
+from mapvote_server.store import schema
+from mapvote_server.store.database import address_of, insert_rows
+from mapvote_server.store.fusion_jobs import Fused, Task, fuse_round
+from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
+from mapvote_server.store.policy import GatePolicy
+from mapvote_server.store.queries import (
+    Version,
+    add_blobs,
+    current_number,
+    end_votes,
+    log_event,
+    newest_seq,
+    set_tiles,
+    tiles_of,
+    tiles_set_between,
+    version_of,
+)
+from mapvote_server.store.retention import clear
+from mapvote_server.store.store import Store
+from mapvote_server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The result of a publish, or of a dry run."""
+
+    version: int
+    """The new version, or the current one if nothing was published."""
+    published: bool
+    tiles: Sequence[TileIndex]
+    """Tiles that changed."""
+    added: int
+    deleted: int
+    held: Sequence[str]
+    """Why the policy would hold it back, or what the operator overrode."""
+    fused: Sequence[Fused] = field(default=(), repr=False)
+
+
+def preview(
+    store: Store,
+    settings: FuseSettings | None = None,
+    *,
+    parent: int | None = None,
+    gate: Gate | None = None,
+    executor: Executor | None = None,
+) -> Outcome:
+    """The result of :func:`publish` if it ran now. Nothing is written."""
+    return _outcome(store, store.clock(), settings, parent, gate, executor)[1]
+
+
+def publish(
+    store: Store,
+    settings: FuseSettings | None = None,
+    *,
+    by: str = "operator",
+    reason: str = "",
+    parent: int | None = None,
+    override: bool = False,
+    gate: Gate | None = None,
+    executor: Executor | None = None,
+) -> Outcome:
+    """Fuse the standing ballots, and publish the next version if anything changed.
+
+    The store's policy applies; ``settings`` replace its ``fuse`` in simulations of one round. ``parent``: publish only
+    if this is still the newest version. ``override``: publish in spite of the reasons to hold the version. Raises Held
+    with the reasons, Conflict if another version was published first, MapvoteError if the policy names a reference
+    drive and there is no ``gate``.
+    """
+    now = store.clock()
+    found, outcome = _outcome(store, now, settings, parent, gate, executor)
+    damaged = [damage for one in outcome.fused for damage in one.damaged]
+    copies = {str(copy) for one in outcome.fused for copy in one.copies}
+    if damaged or copies:
+        with store.database.writing() as connection:
+            quarantine(connection, damaged, now, by)
+            _log_copies(connection, copies, now, by)
+    policy = found.asked.policy
+    if gate is None and policy.gate.drive:
+        asked = policy.gate.drive
+        raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
+    if not outcome.tiles:
+        return outcome
+    if outcome.held and not override:
+        raise Held(list(outcome.held))
+    why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
+    newest, made_by = found.newest.number, policy.model_dump(mode="json")
+    version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
+    tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
+    write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused)
+    if policy.keep.automatic:
+        clear(store, by=by, dry_run=False)
+    return replace(outcome, version=version.number, published=True)
+
+
+def _outcome(
+    store: Store,
+    now: int,
+    settings: FuseSettings | None,
+    parent: int | None,
+    gate: Gate | None,
+    executor: Executor | None,
+) -> tuple[Round, Outcome]:
+    """The round, and what a publish of it would be."""
+    found = round_at(store, now, settings, executor)
+    newest, changed = found.newest.number, found.changed
+    if parent is not None and parent != newest:
+        raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
+    held, fused = reasons_to_hold(store, found, gate), list(found.decided.values())
+    added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
+    return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused)
+
+
+def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:
+    """Each is named once."""
+    e = schema.events.c
+    known = set(connection.execute(sa.select(e.detail).where(e.kind == "copy")).scalars())
+    for copy in sorted(set(copies) - known):
+        log_event(connection, now, "copy", by, copy)
+
+
+def write_version(
+    store: Store,
+    version: Version,
+    tiles: Mapping[TileIndex, TileHashes],
+    planes: Iterable[Mapping[str, bytes]],
+    decided: Iterable[Fused] = (),
+    unvoted: str | None = None,
+) -> Version:
+    """Publish a version that sets ``tiles``, one without points where it has none; Conflict if its parent is the newest
+    no more.
+
+    ``planes``: all that the store may not hold yet. ``decided``: tiles that do not change too. ``unvoted``: this
+    vehicle's votes are gone.
+    """
+    late = Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
+    try:
+        with store.database.writing() as connection:
+            if current_number(connection) != version.parent:
+                raise late
+            if version.target is not None:
+                version_of(connection, version.target)
+            seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
+            if version.kind != "publish":
+                version = replace(version, mark=seq)
+            connection.execute(schema.versions.insert().values(**asdict(version)))
+            add_blobs(connection, {digest: data for some in planes for digest, data in some.items()})
+            set_tiles(connection, version.number, tiles)
+            rows = [_decision_row(version.number, one, one.record) for one in decided if one.record is not None]
+            if rows:
+                insert_rows(connection, schema.decisions, rows)
+            if unvoted is not None:
+                end_votes(connection, unvoted, seq)
+    except IntegrityError as error:
+        raise late from error
+    return version
+
+
+def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
+    """In the order of the table's columns."""
+    made = record.packed_states, record.packed_tally, fused.vehicles, fused.added, fused.deleted
+    return number, *fused.index, *made, record.packed_odds, record.packed_standings
+
+
+Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
+"""Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""
+_WITHOUT_EFFECT = "held back", "copy", "key issued"
+"""Kinds of events that change no round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Round:
+    """The decision of every tile, as of one event."""
+
+    newest: Version
+    asked: Electorate
+    until_ns: int | None
+    """Time at which the next vote reaches the minimum age; None: there is no minimum, or all votes have reached it."""
+    decided: Mapping[TileIndex, Fused]
+    """Tiles that may differ from what they were when they were last fused: a publish decides these."""
+    beside: Mapping[TileIndex, Fused]
+    """All other tiles with votes, for what waits there; none unless they were asked for."""
+    every: bool
+    """Whether ``beside`` was asked for."""
+
+    @property
+    def changed(self) -> list[Fused]:
+        """Tiles that a publish would change."""
+        return [fused for fused in self.decided.values() if fused.hashes is not None]
+
+
+@dataclass(slots=True)
+class _Latest:
+    """The latest round of one store, and what its gate said."""
+
+    deciding: Lock = field(default_factory=Lock)
+    judging: Lock = field(default_factory=Lock)
+    round: Round | None = None
+    judged: tuple[Round, Sequence[str]] | None = None
+
+
+_latest: WeakKeyDictionary[Store, _Latest] = WeakKeyDictionary()
+_lock = Lock()
+
+
+def _latest_of(store: Store) -> _Latest:
+    with _lock:
+        return _latest.setdefault(store, _Latest())
+
+
+def round_at(
+    store: Store, now: int, settings: FuseSettings | None = None, executor: Executor | None = None, every: bool = False
+) -> Round:
+    """The round as of ``now``, by the store's clock. Of many threads that ask, one decides it.
+
+    ``settings`` take the place of the policy's ``fuse``, in simulations; such a round is not kept. ``every``: fuse all
+    tiles with votes, for what waits there.
+    """
+    if settings is not None:
+        return _decide(store, now, settings, executor, every, None)
+    latest = _latest_of(store)
+    with latest.deciding:
+        known = latest.round
+        if known is None or not _holds(store, known, now) or (every and not known.every):
+            known = latest.round = _decide(store, now, None, executor, every, known)
+        return known
+
+
+def _decide(
+    store: Store, now: int, settings: FuseSettings | None, executor: Executor | None, every: bool, last: Round | None
+) -> Round:
+    """Fuse every tile that the ``last`` round does not answer."""
+    with store.database.reading() as connection:
+        newest = version_of(connection)
+        mark = newest_seq(connection)
+        asked = electorate_now(connection, now, mark, settings)
+        dirty = _dirty(connection, newest, asked)
+        wanted = (
+            sorted({*dirty, *standing_tiles(connection, mark)})
+            if every and asked.settings.false_deletions < 1.0
+            else dirty
+        )
+        found = _still_true(connection, last, newest, asked)
+        missing = [index for index in wanted if index not in found]
+        hashes = tiles_of(connection, newest.number, missing)
+        until = next_ripe_ns(connection, asked)
+    made, url = newest.number + 1, address_of(store.database.url)
+    tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
+    found |= {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
+    decided = {index: found[index] for index in dirty}
+    beside = {index: found[index] for index in wanted if index not in decided}
+    return Round(newest, asked, until, decided, beside, every)
+
+
+def _holds(store: Store, known: Round, now: int) -> bool:
+    """Whether no event that can change the round has come since, and no vote has reached the minimum age."""
+    if known.until_ns is not None and now >= known.until_ns:
+        return False
+    e = schema.events.c
+    came = sa.select(e.seq).where(e.seq > known.asked.mark, e.kind.not_in(_WITHOUT_EFFECT)).limit(1)
+    with store.database.reading() as connection:
+        return connection.execute(came).first() is None
+
+
+def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
+    """Tiles that may come to something else than when they were last fused.
+
+    Where the newest version changed something, votes are spent that decided together with others. With another policy,
+    or after a version that was not fused, every tile may differ; with a minimum age votes ripen without any event.
+    """
+    policy = asked.policy
+    fused = newest.kind == "publish" and newest.policy == policy.model_dump(mode="json")
+    if not fused or policy.fuse.min_age_s > 0:
+        return standing_tiles(connection, asked.mark)
+    edited = tiles_set_between(connection, newest.number - 1, newest.number)
+    return sorted({*_touched(connection, asked.mark, newest.mark), *edited})
+
+
+def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:
+    """Tiles on which votes, reviews or damage were added or removed after the event ``since``."""
+    return {*standing_tiles(connection, mark, since), *tiles_hurt_or_mended(connection, since)}
+
+
+def _still_true(
+    connection: sa.Connection, last: Round | None, newest: Version, asked: Electorate
+) -> dict[TileIndex, Fused]:
+    """The tiles of the last round on which nothing has changed since."""
+    if last is None or last.newest.number != newest.number or last.asked.policy != asked.policy:
+        return {}
+    if asked.policy.fuse.min_age_s > 0:
+        return {}
+    touched = _touched(connection, asked.mark, last.asked.mark)
+    return {index: fused for index, fused in {**last.decided, **last.beside}.items() if index not in touched}
+
+
+def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
+    """The reasons of the policy, and of its gate, against the version that a round would make."""
+    changed, asked = found.changed, found.asked.policy.gate
+    held = hold_reasons(changed, found.asked.settings)
+    if gate is None or not asked.drive or not changed:
+        return held
+    latest = _latest_of(store)
+    with latest.judging:
+        if latest.judged is None or latest.judged[0] is not found:
+            old = store.point_map(found.newest.number)
+            edited = {
+                f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index)))
+                for f in changed
+            }
+            latest.judged = found, gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))
+        return [*held, *latest.judged[1]]
+
+
+def edited_tile(fused: Fused, before: Tile) -> Tile:
+    """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
+    hashes, planes = fused.hashes, fused.planes
+    assert hashes is not None
+    ground, free = before.ground_z, before.free
+    if hashes.ground in planes:
+        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
+    if hashes.free is not None and hashes.free in planes:
+        free = unpack_free_plane(planes[hashes.free], hashes.free)
+    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)
+
+
+def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
+    """The policy's reasons against publishing these tiles."""
+    reasons = []
+    for fused in changed:
+        name = f"tile {tile_key(fused.index)}"
+        if fused.points and fused.deleted > settings.max_deleted_share * fused.points:
+            share = fused.deleted / fused.points
+            reasons.append(f"deletes {share:.0%} of the points of {name}, more than {settings.max_deleted_share:.0%}")
+        if fused.freed > settings.max_freed_share * CELLS:
+            freed = fused.freed / CELLS
+            reasons.append(f"learns free space in {freed:.0%} of {name}, more than {settings.max_freed_share:.0%}")
+    for what, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
+        rows, cols = lattice_cells([(f, getattr(f, cells)) for f in changed])
+        areas = areas_m2(rows, cols)
+        largest = int(np.argmax(areas)) if len(areas) else 0
+        if len(areas) and areas[largest] > settings.max_change_m2:
+            about = f"{what} one connected thing of {areas[largest]:.0f} m2"
+            reasons.append(f"{about}, more than {settings.max_change_m2:.0f} m2")
+    return reasons
+
+
+def lattice_cells(found: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
+    """(rows, cols) on the lattice of flat cells of some tiles."""
+    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in found]
+    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in found]
+    nothing = np.empty(0, dtype=np.int64)
+    return np.concatenate([nothing, *rows]), np.concatenate([nothing, *cols])
+
+
+def areas_m2(rows: I64, cols: I64) -> np.ndarray:
+    """(k,) the area of each thing: cells that touch, corners included, whatever tile they are in."""
+    if not len(rows):
+        return np.empty(0)
+    keys = (rows << 32) + cols
+    order = np.argsort(keys)
+    ordered, pairs = keys[order], []
+    for step in (1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1):
+        near = np.searchsorted(ordered, keys + step)
+        near[near == len(keys)] = 0
+        touching = np.flatnonzero(ordered[near] == keys + step)
+        pairs.append(np.stack([touching, order[near[touching]]]))
+    a, b = np.concatenate(pairs, axis=1)
+    links = scipy.sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
+    labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    return np.bincount(labels) * CELL_SIZE**2

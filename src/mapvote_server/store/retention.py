@@ -1,0 +1,106 @@
+"""Retention: deletes planes and decisions of old versions, and ballots that can decide nothing more.
+
+The rows that record a version or a ballot stay. From the oldest kept version on, publish, rollback and replay work as
+before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.fusion.change_time import history_days
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote_server.store import schema
+from mapvote_server.store.database import MOST_ASKED
+from mapvote_server.store.policy import Policy, policy_in
+from mapvote_server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, version_of
+from mapvote_server.store.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Cleared:
+    """What was deleted, or would be."""
+
+    oldest: int
+    """The oldest version that is kept."""
+    versions: int
+    planes: int
+    decisions: int
+    ballots: int
+    """Votes of one drive on one tile."""
+    size: int
+    """Bytes of all these."""
+
+
+def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleared:
+    """Delete what the policy does not keep, in one transaction; with ``dry_run`` only count it."""
+    with store.database.reading() if dry_run else store.database.writing() as connection:
+        v, d, b, t = schema.versions, schema.decisions, schema.ballots, schema.ballot_tiles
+        keep, oldest = policy_in(connection).keep.versions, oldest_kept(connection)
+        if keep:  # the first of the last so many versions; one that was not cleared yet if none may go
+            oldest = max(oldest, current_number(connection) - keep + 1)
+        old_planes, old_ballots = _planes(connection, oldest), _ballots(connection, oldest)
+        length = (sa.func.length(d.c.states) + sa.func.length(d.c.tally)).label("size")
+        decided = sa.select(d.c.version, d.c.row, d.c.col, length).where(d.c.version < oldest)
+        old_decisions = list(connection.execute(decided).all())
+        gone = (v.c.number < oldest) & v.c.cleared_seq.is_(None)
+        versions = int(connection.execute(sa.select(sa.func.count()).where(gone)).scalar_one())
+        size = sum(row.size for row in (*old_planes, *old_ballots, *old_decisions))
+        found = Cleared(oldest, versions, len(old_planes), len(old_decisions), len(old_ballots), size)
+        if dry_run or not (versions or old_planes or old_ballots or old_decisions):
+            return found
+        detail = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
+        seq = log_event(connection, store.clock(), "cleared", by, detail)
+        connection.execute(v.update().where(gone).values(cleared_seq=seq))
+        _delete(connection, schema.decisions, ("version", "row", "col"), old_decisions)
+        _delete(connection, schema.ballot_tiles, ("row", "col", "ballot"), old_ballots)
+        _delete(connection, schema.blobs, ("hash",), old_planes)
+        # A ballot of which nothing is left takes no room of its vehicle's quota any more.
+        empty = (b.c.bytes > 0) & ~sa.exists().where(t.c.ballot == b.c.seq)
+        connection.execute(b.update().where(empty).values(bytes=0))
+    return found
+
+
+def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
+    """Planes that no version from ``oldest`` on shows."""
+    t, b, planes = schema.version_tiles, schema.blobs, schema.TILE_PLANES
+    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shows_in_kept(oldest)) for name in planes))
+    unused = sa.select(b.c.hash, sa.func.length(b.c.data).label("size")).where(b.c.hash.not_in(needed))
+    return list(connection.execute(unused).all())
+
+
+def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
+    """Votes on a tile that no version after ``oldest`` has counted or can count: withdrawn or replaced before it, or
+    older than every window of the policies since, counted from the newest vote on the tile that stood then and still
+    does."""
+    t, b, then = schema.ballot_tiles, schema.ballots, version_of(connection, oldest)
+    newest = (
+        sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns).label("end_ns"))
+        .join(b, b.c.seq == t.c.ballot)
+        .where(b.c.seq <= then.mark, b.c.gone_seq.is_(None))
+        .group_by(t.c.row, t.c.col)
+        .subquery()
+    )
+    v = schema.versions
+    made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
+    policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
+    window_ns = round(max(history_days(policy.fuse) for policy in policies) * DAY_NS)
+    past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
+    size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in schema.BALLOT_PLANES), start=sa.literal(0))
+    found = (
+        sa.select(t.c.row, t.c.col, t.c.ballot, size.label("size"))
+        .join(b, b.c.seq == t.c.ballot)
+        .join(newest, (newest.c.row == t.c.row) & (newest.c.col == t.c.col), isouter=True)
+    )
+    return list(connection.execute(found.where(past)).all())
+
+
+def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
+    columns = sa.tuple_(*(table.c[name] for name in key))
+    for start in range(0, len(rows), MOST_ASKED):
+        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + MOST_ASKED]]
+        connection.execute(table.delete().where(columns.in_(some)))

@@ -1,0 +1,391 @@
+"""The votes on a tile: which count, and their planes.
+
+A vote counts if its ballot stands at an event number (``mark``), lies in the window of the policy and is not spent in
+the cell. All queries take the mark, so that a past round can be fused again exactly. Unpacked votes are cached by the
+sum of their row: two rows of one sum say the same. The cache ends with the process.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import unpack_planes
+from mapvote.codec.tile_planes import unpack_cells
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import I64, Bool
+from mapvote.fusion.change_time import history_days
+from mapvote.fusion.decision_record import Why
+from mapvote.fusion.fuse import unspent
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
+from mapvote_server.errors import NotFound
+from mapvote_server.store import schema
+from mapvote_server.store.database import MOST_ASKED, Question, is_sound, remembered
+from mapvote_server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
+from mapvote_server.store.policy import Policy, policy_in
+from mapvote_server.store.queries import Version, log_event
+from mapvote_server.store.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Electorate:
+    """The votes that count: standing at ``mark``, received by ``received_by_ns``, not of vehicles ``without``."""
+
+    mark: int
+    policy: Policy
+    received_by_ns: int
+    without: Collection[str] = ()
+    set_aside: Collection[str] = ()
+    """Ballots that are damaged, by number or on one tile (:func:`mapvote_server.store.integrity.ballot_name`)."""
+
+    @property
+    def settings(self) -> FuseSettings:
+        """The quorum, and the window of votes."""
+        return self.policy.fuse
+
+    @classmethod
+    def of(cls, version: Version, without: Collection[str] = (), set_aside: Collection[str] = ()) -> Electorate:
+        """The votes that counted in a version, by the policy of that version."""
+        policy = Policy.model_validate(version.policy)
+        received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
+        return cls(version.mark, policy, received_by_ns, without, set_aside)
+
+    def leaving_out(self, damaged: Iterable[Damage]) -> Electorate:
+        """The same without ballots that turned out to be damaged."""
+        return replace(self, set_aside=frozenset({*self.set_aside, *(damage.name for damage in damaged)}))
+
+
+Read = TypeVar("Read")
+FOREVER = (1 << 63) - 1
+
+
+def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
+    b = schema.ballots
+    return (b.c.seq <= mark) & (b.c.gone_seq.is_(None) | (b.c.gone_seq > mark))
+
+
+# Asked for the tiles of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
+_B, _T = schema.ballots, schema.ballot_tiles
+_ROW, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "mark"))
+_COLS: sa.BindParameter[list[int]] = sa.bindparam("cols", expanding=True)
+_VOTES = (
+    sa.select(_T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
+    .add_columns(_B.c.digest, _T.c.base, _B.c.version, _B.c.settings_hash, _B.c.cast_by)
+    .join(_T, _T.c.ballot == _B.c.seq)
+    .order_by(_B.c.seq)
+)
+_VOTES_ON = _VOTES.where(_T.c.row == _ROW, _T.c.col.in_(_COLS), _stands_at(_MARK))
+_W, _C = schema.reviews, schema.review_cells
+_REVIEWS_ON = (
+    sa.select(_C.c.col, _W.c.seq, _W.c.verdict, _C.c.cells)
+    .join(_C, _C.c.review == _W.c.seq)
+    .where(_C.c.row == _ROW, _C.c.col.in_(_COLS), _W.c.verdict.in_(("held", "rejected")))
+    .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
+)
+
+
+_SINCE = sa.bindparam("since", type_=sa.BigInteger)
+_STANDING = Question(
+    sa.select(_T.c.row, _T.c.col).distinct().join(_B, _B.c.seq == _T.c.ballot).where(_stands_at(_MARK))
+)
+_TOUCHED = Question(
+    sa.union(  # each is answered by an index of its own
+        *(
+            sa.select(_T.c.row, _T.c.col).where(_T.c.ballot.in_(sa.select(_B.c.seq).where(one, _B.c.seq <= _MARK)))
+            for one in (_B.c.seq > _SINCE, _B.c.gone_seq > _SINCE)
+        ),
+        sa.select(_C.c.row, _C.c.col)
+        .join(_W, _W.c.seq == _C.c.review)
+        .where(_W.c.seq <= _MARK, (_W.c.seq > _SINCE) | (_W.c.gone_seq > _SINCE)),
+    )
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Polled:
+    """Standing votes, reviews and damage on some tiles, each read by one statement."""
+
+    standing: Mapping[TileIndex, Sequence[StoredVote]]
+    """Ballots, in the order in which they came."""
+    bars: Mapping[TileIndex, Sequence[tuple[int | None, Bool]]]
+    """(event, cells (256, 256)) of changes that reviewers rejected then, or hold: None."""
+    rows: Rows
+    """The stored planes of the votes that count there."""
+    read: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
+    """Votes by tile and ballot that were checked and unpacked: nothing is read twice for one round."""
+    fresh: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
+    """These in the cells in which they are not spent."""
+
+    def unspent(self, seq: int, vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None) -> TileVote:
+        """The vote of a ballot in the cells of ``tile`` in which it is not spent."""
+        key = *tile.index, seq
+        if key not in self.fresh:
+            self.fresh[key] = unspent(vote, tile, misread)
+        return self.fresh[key]
+
+
+def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
+    """All that :func:`judged_on` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
+    then."""
+    standing, bars = _standing_on(connection, row, cols, asked.mark), defaultdict[TileIndex, list[Any]](list)
+    reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
+    for col, seq, verdict, cells in reviewed:
+        bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
+    counting = [(c, vote) for c in cols for vote, why in _judged(standing[row, c], (row, c), asked) if not why]
+    return Polled(standing, bars, read_rows(connection, row, counting))
+
+
+def _standing_on(
+    connection: sa.Connection, row: int, cols: Sequence[int], mark: int
+) -> Mapping[TileIndex, Sequence[StoredVote]]:
+    found = defaultdict[TileIndex, list[StoredVote]](list)
+    for col, *stored in connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": mark}).all():
+        found[row, col].append(StoredVote(*stored))
+    return found
+
+
+def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> list[StoredVote]:
+    """The votes of some ballots on a tile, whether they stand or not, in the order of the ballots; of those that were
+    cleared away nothing."""
+    mine = _VOTES.where(_T.c.row == index[0], _T.c.col == index[1], _B.c.seq.in_(ballots))
+    return [StoredVote(*stored) for _, *stored in connection.execute(mine).all()]
+
+
+def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
+    """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review was added or
+    removed after it."""
+    asked = {"mark": mark} if since is None else {"mark": mark, "since": since}
+    rows = (_STANDING if since is None else _TOUCHED).ask(connection, **asked)
+    return sorted({(row.row, row.col) for row in rows})
+
+
+def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
+    """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
+    spent (:func:`mapvote.fusion.fuse.unspent`)."""
+    return _judged(_standing_on(connection, index[0], [index[1]], asked.mark)[index], index, asked)
+
+
+def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
+    found = [vote for vote in standing if vote.vehicle not in asked.without]
+    why = {vote.seq: _unready(vote, index, asked) for vote in found}
+    inside = {vote.seq for vote in newest_votes([vote for vote in found if not why[vote.seq]], asked.settings)}
+    return [(vote, why[vote.seq] or ("" if vote.seq in inside else "window")) for vote in found]
+
+
+def electorate_now(
+    connection: sa.Connection, now: int, mark: int = FOREVER, settings: FuseSettings | None = None
+) -> Electorate:
+    """The votes that count in a publish at ``now``, by the newest policy; ``settings`` replace its ``fuse`` if
+    given."""
+    policy = policy_in(connection)
+    if settings is not None:
+        policy = policy.model_copy(update={"fuse": settings})
+    received_by_ns = now - round(policy.fuse.min_age_s * 1e9)
+    return Electorate(mark, policy, received_by_ns, set_aside=ballots_aside(connection))
+
+
+def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
+    """Time at which the next standing ballot reaches the policy's minimum age; None if no ballot waits for it."""
+    age_ns = round(asked.settings.min_age_s * 1e9)
+    if age_ns == 0:
+        return None
+    received = _B.c.received_ns
+    young = sa.select(sa.func.min(received)).where(received > asked.received_by_ns, _stands_at(asked.mark))
+    first = connection.execute(young).scalar_one()
+    return None if first is None else int(first) + age_ns
+
+
+def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> Why:
+    cast = asked.policy.round
+    if asked.set_aside and not {str(vote.seq), ballot_name(vote.seq, *index)}.isdisjoint(asked.set_aside):
+        return "damaged"
+    if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
+        return "otherwise"
+    return "young" if vote.received_ns > asked.received_by_ns else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One standing vote on a tile, and what becomes of it before the votes are compared with each other."""
+
+    stored: StoredVote
+    why: Why
+    """Why it does not count on the tile; "" if it does."""
+    vote: TileVote | None = None
+    """In the cells where it counts; None if it does not."""
+    spent: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """(n,) flat cells of which it speaks, and which have changed since its vehicle drove."""
+    reviewed: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """(n,) flat cells of which it speaks, of a change that a reviewer held or rejected."""
+
+
+def judged_on(
+    connection: sa.Connection,
+    tile: Tile,
+    asked: Electorate,
+    misread: Mapping[int, Bool] | None = None,
+    polled: Polled | None = None,
+) -> list[Judged]:
+    """Every standing vote on ``tile`` as it is now, in the order of the ballots.
+
+    ``misread``: see :func:`mapvote.fusion.fuse.unspent`. ``polled``: what stands there, if it was asked before.
+    """
+    index = tile.index
+    polled = polled or poll(connection, index[0], [index[1]], asked)
+    standing = _judged(polled.standing[index], index, asked)
+    votes = iter(read_votes(connection, index, [vote for vote, why in standing if not why], polled))
+    found = []
+    for stored, why in standing:
+        if why:
+            found.append(Judged(stored, why))
+            continue
+        sent = next(votes)
+        fresh = polled.unspent(stored.seq, sent, tile, misread)
+        obedient = _obedient(fresh, stored.first_seq, polled.bars[index])
+        found.append(Judged(stored, "", obedient, _cells_lost(sent, fresh), _cells_lost(fresh, obedient)))
+    return found
+
+
+def _cells_lost(before: TileVote, after: TileVote) -> I64:
+    """(n,) flat cells that the vote ``before`` determines and ``after`` does not."""
+    if before is after:
+        return np.empty(0, dtype=np.int64)
+    if before.states is not None and after.states is not None:
+        return np.flatnonzero(before.states != after.states)
+    return np.flatnonzero(before.spoken() != after.spoken())
+
+
+def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
+    """The vote without the cells of changes that reviewers held, or rejected after its drive first arrived."""
+    for seq, cells in bars:
+        if seq is None or first_seq < seq:
+            vote = silenced(vote, np.flatnonzero(cells))
+    return vote
+
+
+def recent_votes(
+    connection: sa.Connection,
+    tile: Tile,
+    asked: Electorate,
+    misread: Mapping[int, Bool] | None = None,
+    polled: Polled | None = None,
+) -> list[TileVote]:
+    """The votes that count on ``tile``, in the cells where they are not spent, of every vehicle and of the last
+    :func:`history_days`: what has come and gone here, and since when?"""
+    index = tile.index
+    polled = polled or poll(connection, index[0], [index[1]], asked)
+    judged = _judged(polled.standing[index], index, asked)
+    ready = [vote for vote, why in judged if why in ("", "window")]
+    oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
+    chosen = [vote for vote in ready if vote.end_ns >= oldest]
+    votes = zip(chosen, read_votes(connection, index, chosen, polled), strict=True)
+    return [polled.unspent(stored.seq, vote, tile, misread) for stored, vote in votes]
+
+
+def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
+    """What ``read`` gives without the ballots that are set aside, and those that turn out to be damaged on the way."""
+    asked = replace(asked, set_aside=frozenset({*asked.set_aside, *ballots_aside(connection)}))
+    while True:
+        try:
+            return read(asked)
+        except DamagedBallots as error:
+            asked = asked.leaving_out(error.found)
+
+
+def ballots_aside(connection: sa.Connection) -> frozenset[str]:
+    """Ballots in quarantine, as an electorate leaves them out."""
+    return frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
+
+
+_PLANES_OF = sa.select(_T.c.row, _T.c.col, _T.c.ballot, *(_T.c[p] for p in schema.BALLOT_PLANES), _T.c.base, _T.c.sum)
+_PLANES_OF = _PLANES_OF.where(
+    _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
+    _T.c.col.in_(sa.bindparam("cols", expanding=True)),
+    _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
+)
+Rows = Mapping[tuple[int, int, int], Any]
+"""The stored planes of a vote, by tile and ballot."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVote:
+    """A standing ballot's row for one tile, planes not read yet."""
+
+    seq: int
+    first_seq: int
+    vehicle: str
+    drive: str
+    end_ns: int
+    received_ns: int
+    digest: str
+    base: str
+    version: int
+    """Version of the map that its vehicle used."""
+    settings_hash: str
+    cast_by: str
+
+
+def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
+    """The stored votes on tiles of a ``row``, each with its column."""
+    found: dict[tuple[int, int, int], Any] = {}
+    cols, ballots = sorted({col for col, _ in votes}), sorted({vote.seq for _, vote in votes})
+    for start in range(0, len(ballots), MOST_ASKED):
+        asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + MOST_ASKED]}
+        rows = connection.execute(_PLANES_OF, asked_of).all()
+        found |= {(stored.row, stored.col, stored.ballot): stored for stored in rows}
+    return found
+
+
+def read_votes(
+    connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote], polled: Polled | None = None
+) -> list[TileVote]:
+    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are.
+
+    ``polled``: what was read before.
+    """
+    known, read = ({}, {}) if polled is None else (polled.rows, polled.read)
+    new = {vote.seq: vote for vote in stored if (*index, vote.seq) not in read}
+    missing = [(index[1], vote) for vote in new.values() if (*index, vote.seq) not in known]
+    rows = {**known, **read_rows(connection, index[0], missing)} if missing else known
+    mine = [(vote, rows[*index, vote.seq]) for vote in new.values()]
+    # Whoever is remembered is read too, or what is decided would follow from what this process happened to read before
+    # the disk lost it.
+    damaged = [ballot_name(vote.seq, *index) for vote, row in mine if not is_sound(_T, row)]
+    if damaged:
+        raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
+    unpacked = remembered.get(row.sum for _, row in mine)
+    for vote, row in mine:
+        if row.sum not in unpacked:
+            unpacked[row.sum] = unpack_planes(row)
+            remembered.put(row.sum, unpacked[row.sum])
+        planes = unpacked[row.sum]
+        read[*index, vote.seq] = TileVote.of(planes, vote.vehicle, vote.end_ns, vote.digest, vote.version)
+    return [read[*index, vote.seq] for vote in stored]
+
+
+def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
+    """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
+
+    NotFound if there is none. What earlier versions made of them stays: see
+    :func:`mapvote_server.store.rollback.replay`.
+    """
+    b = schema.ballots
+    whose = f"{vehicle or '*'}/{drive or '*'}"
+    mine: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
+    if vehicle is not None:
+        mine &= b.c.vehicle == vehicle
+    if drive is not None:
+        mine &= b.c.drive == drive
+    with store.database.writing() as connection:
+        if connection.execute(sa.select(b.c.seq).where(mine)).first() is None:
+            raise NotFound(f"there is no standing ballot {whose}")
+        seq = log_event(connection, store.clock(), "withdraw", by, whose)
+        withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
+    return int(withdrawn)

@@ -1,0 +1,102 @@
+"""A long drive says the same, however its tiles were kept and judged."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from long_street import blocks_say_the_same, long_street
+from mapvote.config import VotingSettings
+from mapvote.core.grid import Grid, Lattice
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import U64, MapvoteError
+from mapvote.rules import packed_tiles
+from mapvote.rules.evidence import CROSSED, HIT, PASSED, PASSES
+from mapvote.rules.packed_tiles import PackedTiles, Shelf
+from mapvote.rules.surfaces import SurfaceVoter
+
+LATTICE = Lattice()
+
+
+def some_planes(seed: int, share: float) -> U64:
+    rng = np.random.default_rng(seed)
+    cells = rng.random((256, 256, 1)) < share
+    return np.asarray(np.where(cells, rng.integers(0, 2**64, (256, 256, 16), dtype=np.uint64), np.uint64(0)))
+
+
+def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
+    tiles = PackedTiles(LATTICE, 16)
+    shares = {(0, 0): 0.0, (0, 1): 0.01, (-1, 0): 1.0}
+    for seed, (tile, share) in enumerate(shares.items()):
+        tiles.near(tile)[:] = some_planes(seed, share)
+    far = Grid(LATTICE, 5000, 5000, 100, 100)
+    for _ in shares:
+        tiles.leave(far)
+    assert not tiles._open
+    assert set(tiles) == set(shares)
+    for seed, (tile, share) in enumerate(shares.items()):
+        np.testing.assert_array_equal(tiles[tile], some_planes(seed, share))
+        np.testing.assert_array_equal(tiles.near(tile), some_planes(seed, share))
+    tiles.leave(far)
+    assert tiles._spare
+    assert not tiles.near((5, 5)).any(), "whatever another tile left behind"
+
+
+def test_a_tile_is_left_only_when_the_view_is_far_from_it() -> None:
+    tiles = PackedTiles(LATTICE, 16)
+    tiles.near((0, 0))
+    for col in (100, 256, 256 + 63):
+        tiles.leave(Grid(LATTICE, 0, col, 100, 100))
+        assert list(tiles._open) == [(0, 0)]
+    tiles.leave(Grid(LATTICE, 0, 256 + 64, 100, 100))
+    assert not tiles._open
+
+
+def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
+    """Walls were crossed seven times or met, or half of both or neither, and things rose, at random."""
+    voter, rng = SurfaceVoter(VotingSettings(), point_map), np.random.default_rng(6)
+    for tile in point_map.tiles:
+        planes, mapped = voter.evidence.near(tile), point_map.tiles[tile].obstacle_words
+        fate = rng.random(mapped.shape)
+        planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
+        planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))
+        planes[..., HIT] = np.where((fate > 0.4) & (fate < 0.6), mapped, np.uint64(0))
+        rose = np.where(rng.random(mapped.shape) < 0.02, np.uint64(0b111110), np.uint64(0)) & ~mapped
+        planes[..., HIT + 1] |= rose
+        planes[..., PASSES] = rose & np.uint64(0b110)
+        planes[..., PASSED] = ~rose
+    return voter
+
+
+@pytest.mark.slow
+def test_blocks_of_tiles_say_what_all_of_them_say_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks_say_the_same(surfaces_after_a_drive(long_street()), monkeypatch)
+
+
+@given(st.lists(st.binary(max_size=40), max_size=20))
+def test_everything_is_found_where_it_was_put(things: list[bytes]) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(packed_tiles, "IN_MEMORY", 64)
+        full = Shelf()
+        places = [full.put(thing) for thing in things]
+        assert [full.read(place) for place in places] == things
+
+
+def test_a_short_drive_asks_the_disk_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", None)
+    full = Shelf()
+    assert full.read(full.put(bytes(1 << 20))) == bytes(1 << 20)
+
+
+def test_where_a_long_drive_cannot_be_kept_it_is_said_how_to_mend_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packed_tiles, "IN_MEMORY", 4)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(MapvoteError, match=r"nowhere: .*make room, or name another folder in TMPDIR"):
+        Shelf().put(b"longer than four")

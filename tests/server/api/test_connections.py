@@ -1,0 +1,168 @@
+"""Clients that keep a server waiting, on real sockets: each is cut off, and none keeps an honest one out."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from hand_made import make_map, make_tile
+from live_server import serving_here
+from mapvote_server.store.store import Store
+
+CONFIG = """
+[server]
+header_timeout_s = 1.0
+body_timeout_s = 8.0
+answer_timeout_s = 2.0
+connections = 12
+"""
+POINTS = 1_000_000
+PATIENT_S = 30.0
+"""Longer than any of the server's clocks, so that a busy machine fails nothing."""
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    home = tmp_path_factory.mktemp("connections")
+    points = np.random.default_rng(1).uniform(0.0, 76.0, (POINTS, 3)).astype(np.float32)
+    Store.create(f"sqlite:///{home / 's.db'}", make_map({(0, 0): make_tile(points)})).close()
+    with serving_here(home / "s.db", settings=CONFIG, log=home / "log") as address:
+        yield address
+
+
+@pytest.fixture
+def line(url: str) -> Iterator[socket.socket]:
+    with connected(url) as connection:
+        yield connection
+
+
+def connected(url: str) -> socket.socket:
+    host, _, port = url.removeprefix("http://").partition(":")
+    line = socket.socket()
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)  # so that what is not read waits at the server
+    line.settimeout(PATIENT_S)
+    line.connect((host, int(port)))
+    return line
+
+
+def until_cut(connection: socket.socket, every_s: float = PATIENT_S, piece: bytes = b"") -> bytes:
+    """Send ``piece`` again and again, whatever comes, until the server hangs up; what it said last."""
+    connection.settimeout(every_s)
+    said, deadline = b"", time.monotonic() + PATIENT_S
+    while time.monotonic() < deadline:
+        try:
+            data = connection.recv(1 << 16)
+            if not data:
+                return said
+            said += data
+        except TimeoutError:
+            pass
+        except ConnectionError:
+            return said
+        try:
+            connection.sendall(piece)
+        except ConnectionError:
+            return said
+    raise AssertionError("the server waits for ever")
+
+
+def test_a_connection_that_says_nothing_is_cut(line: socket.socket) -> None:
+    assert until_cut(line).startswith(b"HTTP/1.1 408 ")
+
+
+def test_headers_byte_by_byte_are_cut(line: socket.socket) -> None:
+    line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
+    assert until_cut(line, 0.2, b"a").startswith(b"HTTP/1.1 408 ")
+
+
+def test_a_lone_line_end_after_an_answer_does_not_hold_the_connection(line: socket.socket) -> None:
+    line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert line.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+    line.sendall(b"\r\n")
+    start = time.monotonic()
+    until_cut(line)
+    assert time.monotonic() - start < PATIENT_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["PUT /v1/ballots/a/d1", "POST /v1/publish"])
+def test_a_stalled_body_is_cut(line: socket.socket, target: str) -> None:
+    head = f"{target} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 100000\r\n\r\n{{"
+    line.sendall(head.encode())
+    assert until_cut(line, 0.2, b" ") == b""
+
+
+@pytest.mark.slow
+def test_a_client_that_never_reads_is_cut(url: str, line: socket.socket) -> None:
+    plane = httpx2.get(f"{url}/v1/map", timeout=300.0).json()["tiles"]["0,0"]["points"]
+    line.sendall(f"GET /v1/tiles/{plane} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 3)
+    time.sleep(6.0)
+    received = 0
+    with suppress(ConnectionError):
+        while data := line.recv(1 << 20):
+            received += len(data)
+    assert received < 2 * 12 * POINTS
+
+
+def test_requests_in_one_go_are_answered_one_after_another(line: socket.socket) -> None:
+    one = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"
+    line.sendall((one + b"\r\n") * 199 + one + b"Connection: close\r\n\r\n")
+    assert until_cut(line).count(b"HTTP/1.1 200 ") == 200
+
+
+@pytest.mark.parametrize("before", [b"", b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"])
+def test_a_head_of_more_than_32_kb_is_431_and_the_end_of_the_connection(line: socket.socket, before: bytes) -> None:
+    line.sendall(before)
+    assert not before or line.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+    line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
+    start = time.monotonic()
+    with suppress(ConnectionError):
+        line.sendall(b"a" * 40_000_000)  # thrown away as it comes, or cut
+    assert b"HTTP/1.1 431 " in until_cut(line)
+    assert time.monotonic() - start < PATIENT_S
+
+
+def test_a_head_just_below_32_kb_is_read(url: str) -> None:
+    assert httpx2.get(f"{url}/healthz", headers={"X-Long": "a" * 30_000}, timeout=300.0).status_code == 200
+
+
+@pytest.mark.parametrize("start", [b"a" * 20, b"1;" + b"a" * 20, b"0\r\nX-Trailer: "])
+def test_a_chunk_line_or_a_trailer_without_end_is_cut(line: socket.socket, start: bytes) -> None:
+    head = b"POST /v1/publish HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    line.sendall(head + start)
+    sent = 0
+    with suppress(ConnectionError):
+        for _ in range(10_000):
+            line.sendall(b"a" * 4000)
+            sent += 4000
+    assert sent < 20_000_000
+
+
+def test_more_connections_than_allowed_cost_the_longest_silent_one(url: str) -> None:
+    with ExitStack() as stack:
+        silent = [stack.enter_context(connected(url)) for _ in range(40)]
+        assert httpx2.get(f"{url}/healthz", timeout=PATIENT_S).status_code == 200
+        for connection in silent[:20]:
+            assert until_cut(connection) == b""
+
+
+def test_a_request_under_way_is_never_what_makes_room(url: str, line: socket.socket) -> None:
+    line.sendall(b"PUT /v1/ballots/a/d1 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n\r\nju")
+    with ExitStack() as stack:
+        for _ in range(40):
+            stack.enter_context(connected(url))
+        assert httpx2.get(f"{url}/healthz", timeout=PATIENT_S).status_code == 200
+        line.sendall(b"nk")
+        assert line.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
+
+
+def test_the_server_is_well_again_afterwards(url: str, tmp_path: Path) -> None:
+    for _ in range(20):
+        assert httpx2.get(f"{url}/v1/map", timeout=300.0).status_code == 200
