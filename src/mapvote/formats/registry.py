@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapvote.core.types import Drive
-from mapvote.formats.drives import datasets, rosbag, scan_folder
+from mapvote.formats.drives import bag_files, datasets, rosbag, scan_folder
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.maps import autoware, las, pcd, ply_e57
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
@@ -58,9 +58,10 @@ DRIVES: dict[str, DriveFormat | datasets.Dataset] = {
     "MulRan sequence": datasets.MULRAN,
     "Newer College experiment": datasets.NEWER_COLLEGE,
     "Oxford RobotCar traversal": DriveFormat(_holds(*datasets.OXFORD_LIDARS), datasets.open_oxford),
-    "ROS bag": DriveFormat(rosbag.is_rosbag, rosbag.open_rosbag),
+    "ROS bag": DriveFormat(bag_files.is_bag, rosbag.open_rosbag),
     "folder of PCD scans": DriveFormat(scan_folder.pcd_scans, scan_folder.open_pcd_scans),
     "folder of PLY, LAS, npy or bin scans": DriveFormat(scan_folder.cloud_scans, scan_folder.open_cloud_scans),
+    "ROS bag without metadata.yaml": DriveFormat(bag_files.is_bag_without_metadata, rosbag.open_rosbag),
 }
 """In the order in which they are tried."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,11 @@ import scipy
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
 from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame
 from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields, stamp_of
-from mapvote.formats.drives.trajectory import Trajectory, prior_of, sorted_trajectory
+from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
+from mapvote.formats.drives.trajectory import Trajectory, prior_of
 from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
 
@@ -35,7 +37,8 @@ _TF = "tf2_msgs/msg/TFMessage"
 
 
 def is_rosbag(path: Path) -> bool:
-    return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in (".bag", ".mcap", ".db3"))
+    """Whether a bag of any kind lies at ``path``."""
+    return is_bag(path) or is_bag_without_metadata(path)
 
 
 class Bag:
@@ -45,16 +48,19 @@ class Bag:
         reader = require("rosbags.highlevel", "ros", str(path))
         stores = require("rosbags.typesys", "ros", str(path))
         typestore = stores.get_typestore(stores.Stores.LATEST)
+        files = bag_files(path)
         try:
-            self.reader = reader.AnyReader([path], default_typestore=typestore)
+            self.reader = reader.AnyReader(files.paths, default_typestore=typestore)
             self.reader.open()
         except Exception as error:  # rosbags lets through what its storages raise
             raise MapvoteError(
                 f"{path}: not a readable bag ({first_line(error)}); was the recording stopped properly? Try: "
-                "ros2 bag reindex"
+                f"{mend_of(path)}"
             ) from error
         weakref.finalize(self, self.reader.close)
         self.path = path
+        self.mended = files.mended
+        """What is wrong with its files, and is read nevertheless."""
 
     def decode(self, connection: Any, data: bytes) -> Any:
         """A serialised message; MapvoteError if it is damaged."""
@@ -103,6 +109,8 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     or a choice to make.
     """
     bag = Bag(path)
+    for what in bag.mended:
+        log.warning("%s", what)
     topics = _choose_topics(bag, options.topic)
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other) for other in topics[1:])]
     sweeps = _sweeps(bag, topics)
@@ -114,7 +122,7 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         start, topic = message.received_ns, topics[message.topic]
         where = f"{path} {topic}, scan {i}"
         for connection, _, data in bag.raw(topic, start=start, stop=start + 1):
-            if bag.stamp_ns(data) in (message.stamp_ns, 0):
+            if bag.stamp_ns(data) == message.header_ns:
                 table = point_cloud_table(where, bag.decode(connection, data))
                 scan = scan_from_fields(where, i, message.stamp_ns, table, sensor=sensor, bad_points=bad_points)
                 return scan if message.topic == 0 else scan.seen_from(mounts[message.topic])
@@ -172,20 +180,15 @@ class _Message:
     stamp_ns: int
     topic: int
     received_ns: int
+    header_ns: int
+    """The stamp in its header, 0 where nobody stamped it."""
 
 
 def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution."""
-    found = [
-        _Message(bag.stamp_ns(data), k, time_ns)
-        for k, topic in enumerate(topics)
-        for _, time_ns, data in bag.raw(topic)
-    ]
+    found = [message for k, topic in enumerate(topics) for message in _messages_of(bag, topic, k)]
     if not found:
-        raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; copy the bag again")
-    if all(message.stamp_ns == 0 for message in found):
-        log.warning("%s: %s has no stamps in its headers; the times of receipt are used", bag.path, ", ".join(topics))
-        found = [replace(message, stamp_ns=message.received_ns) for message in found]
+        raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; {mend_of(bag.path)}")
     if len(topics) == 1:
         return [[message] for message in found]
     first_ns = np.array([message.stamp_ns for message in found if message.topic == 0])
@@ -200,31 +203,56 @@ def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
 
 
+def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
+    """The messages of the ``k``-th topic by their stamps; what is left out is counted and reported."""
+    headers, received = stamps_of(bag, topic).T
+    order = in_order_of_stamps(headers, received)
+    for what in order.told:
+        log.warning("%s: %s %s", bag.path, topic, what)
+    rows = zip(order.stamps_ns.tolist(), order.chosen.tolist(), strict=True)
+    return [_Message(stamp_ns, k, int(received[i]), int(headers[i])) for stamp_ns, i in rows]
+
+
+def stamps_of(bag: Bag, topic: str) -> I64:
+    """(n, 2) the stamp in the header and the time of receipt of every message, nanoseconds, as received."""
+    rows = [(bag.stamp_ns(data), received_ns) for _, received_ns, data in bag.raw(topic)]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
 def _trajectory(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     """T_map_base of a topic of poses, or of GNSS fixes in the frame of the map; fixes head where the vehicle drives."""
     if topic in bag.topics(*GNSS):
         return _fixes(bag, topic, frame)
-    times, poses = [], []
-    for _, message in bag.messages(topic):
+    times, received, poses = [], [], []
+    for received_ns, message in bag.messages(topic):
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         times.append(stamp_of(message))
+        received.append(received_ns)
         poses.append(_matrix(bag, topic, pose.position, pose.orientation))
     stacked = np.stack(poses) if poses else np.zeros((0, 4, 4))
-    return sorted_trajectory(np.array(times, dtype=np.int64), stacked, of_vehicle=True, frame=MapFrame())
+    order = _order_of_poses(bag, topic, times, received)
+    return Trajectory(order.stamps_ns, stacked[order.chosen], of_vehicle=True, frame=MapFrame())
+
+
+def _order_of_poses(bag: Bag, topic: str, times_ns: list[int], received_ns: list[int]) -> StampOrder:
+    order = in_order_of_stamps(np.array(times_ns, dtype=np.int64), np.array(received_ns, dtype=np.int64))
+    for what in order.told:
+        log.warning("%s: %s %s", bag.path, topic, what)
+    return order
 
 
 def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     rows = [
-        (stamp_of(m), m.longitude, m.latitude, m.altitude)
-        for _, m in bag.messages(topic)
+        (stamp_of(m), received_ns, m.longitude, m.latitude, m.altitude)
+        for received_ns, m in bag.messages(topic)
         if m.status.status >= 0 and np.isfinite([m.longitude, m.latitude]).all()
     ]
     if not rows:
         raise MapvoteError(f"{bag.path}: {topic} holds no valid fix; choose another topic, or --prior none")
-    place = np.nan_to_num(np.array([row[1:] for row in rows], dtype=np.float64))
-    T, known = poses_from_gnss(place, np.zeros((len(rows), 3)), frame)
-    times = np.array([row[0] for row in rows], dtype=np.int64)
-    return sorted_trajectory(times, yaw_from_track(T), of_vehicle=True, frame=known)
+    order = _order_of_poses(bag, topic, [row[0] for row in rows], [row[1] for row in rows])
+    place = np.nan_to_num(np.array([row[2:] for row in rows], dtype=np.float64))[order.chosen]
+    T, known = poses_from_gnss(place, np.zeros((len(place), 3)), frame)
+    return Trajectory(order.stamps_ns, yaw_from_track(T), of_vehicle=True, frame=known)
 
 
 def T_first_lidar(bag: Bag, first: str, other: str) -> F64:

@@ -1,0 +1,90 @@
+"""Recorded messages in the order of their stamps: of headers without stamps, out of order, doubled, of two passes.
+
+Receipt is not the order of measurement: drivers of several threads, a re-recording under ``use_sim_time`` or files
+joined in another order leave stamps that go back. What cannot be a time of this drive is left out and counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.core.types import I64
+
+
+@dataclass(frozen=True, slots=True)
+class StampRules:
+    """What stamps of one sensor on one drive may be."""
+
+    day_ns: int = 86_400 * 10**9
+    """No stamp is farther than this from the median stamp: before a clock is set, stamps are 0 or count from the boot
+    of the computer."""
+    set_back_ns: int = 10**9
+    """A stamp so much smaller than the one received before it begins another part of the recording."""
+    part: int = 10
+    """Messages: parts of fewer in the mean are disorder, and are sorted; longer ones that overlap are passes."""
+
+
+RULES = StampRules()
+
+
+@dataclass(frozen=True, slots=True)
+class StampOrder:
+    """Which messages are used, in their order."""
+
+    chosen: I64
+    """(m,) numbers of messages as they were received, by ascending stamp."""
+    stamps_ns: I64
+    """(m,) strictly ascending."""
+    told: list[str]
+    """What was mended or left out, in words, after "the topic"."""
+
+
+def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = RULES) -> StampOrder:
+    """The order of messages by the stamps of their headers (n,), given in the order of their receipt (n,)."""
+    told: list[str] = []
+    chosen = np.arange(len(stamps_ns))
+    stamps = stamps_ns
+    # Headers that nobody stamped: receipt is the only time there is.
+    if len(stamps) and (stamps == 0).all():
+        told.append("has no stamps in its headers; the times of receipt are used")
+        stamps = received_ns
+    # Stamps of a clock that was not set yet.
+    if len(stamps):
+        far = np.abs(stamps - np.int64(np.median(stamps))) > rules.day_ns
+        if far.any():
+            zero = int((stamps[far] == 0).sum())
+            cause = f"{zero} of them 0: use_sim_time before the first /clock" if zero else "a clock that was set later"
+            told.append(f"has {int(far.sum())} stamps of another day ({cause}); these messages are left out")
+            chosen = chosen[~far]
+    # A bag played in a loop, or two recordings joined: one pass is a drive.
+    passes = _passes(stamps[chosen], rules)
+    if len(passes) > 1:
+        longest = max(passes, key=len)
+        told.append(
+            f"has stamps that were set back {len(passes) - 1} times over the same time (a bag played in a loop, "
+            f"recordings joined): the longest part is read, {len(chosen) - len(longest)} messages are left out"
+        )
+        chosen = chosen[longest]
+    # What remains is sorted; of equal stamps the first is kept.
+    back = int((np.diff(stamps[chosen]) < 0).sum())
+    if back:
+        told.append(f"has stamps out of order in {back} places (use_sim_time, a driver of several threads): sorted")
+    chosen = chosen[np.argsort(stamps[chosen], kind="stable")]
+    equal = np.diff(stamps[chosen], prepend=stamps[chosen][:1] - 1) == 0
+    if equal.any():
+        told.append(f"has {int(equal.sum())} stamps that an earlier message has too; these messages are left out")
+    chosen = chosen[~equal]
+    return StampOrder(chosen, stamps[chosen], told)
+
+
+def _passes(stamps_ns: I64, rules: StampRules) -> list[I64]:
+    """The parts of a recording, as indices, if they are few and stamped over the same time; else one part."""
+    everything = np.arange(len(stamps_ns))
+    parts = np.split(everything, np.flatnonzero(np.diff(stamps_ns) < -rules.set_back_ns) + 1)
+    if len(parts) < 2 or len(everything) < rules.part * len(parts):
+        return [everything]
+    spans = sorted((int(stamps_ns[part].min()), int(stamps_ns[part].max())) for part in parts)
+    apart = all(first[1] < second[0] for first, second in zip(spans, spans[1:], strict=False))
+    return [everything] if apart else parts
