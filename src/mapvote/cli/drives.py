@@ -156,9 +156,8 @@ def vote(
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
     from mapvote.core.point_map import has_open_ground
-    from mapvote.formats import is_cloud, open_drive
+    from mapvote.formats import is_cloud, open_drive_on
     from mapvote.formats.atomic import write_whole
-    from mapvote.formats.geo.frame import frame_of
 
     if out is None and send is None:
         raise MapvoteError("vote: give --out BALLOT, --send URL, or both")
@@ -180,7 +179,7 @@ def vote(
         if is_cloud(drive_path):
             ballot, report = _ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
         else:
-            drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
+            drive = open_drive_on(point_map, drive_path, vehicle=vehicle, **drive_options)
             ballot, report = _drive_once(drive, point_map, settings, trust_prior)
     data = encode(ballot)
     if out is not None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mapvote.core.grid import Lattice, TileIndex
     from mapvote.core.point_map import PointMap
     from mapvote.doctor import Finding
+    from mapvote.doctor.diagnosis import Diagnosis
     from mapvote.formats.maps.autoware import Change
     from mapvote.fusion.fuse import Decision
 
@@ -82,12 +83,15 @@ def doctor(
     path: Annotated[
         str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot in any format; a store")
     ],
-    map_path: Annotated[
-        Path | None,
+    where: Annotated[
+        str | None,
         typer.Option(
-            "--map", metavar="MAP", help="also compare the drive or cloud with this map, and report where it is bent"
+            "--map",
+            metavar="MAP|STORE|URL",
+            help="also compare the drive or cloud with this map, and report where it is bent",
         ),
     ] = None,
+    key_file: KeyFile = None,
     png: Annotated[
         Path | None,
         typer.Option("--png", metavar="FILE", help="write a picture of a drive's scans, as read and as corrected"),
@@ -99,23 +103,39 @@ def doctor(
 
     mapvote doctor MY_DRIVE --map my_map
     """
-    from rich.console import Console
-
+    from mapvote.doctor import any_error
     from mapvote.doctor.diagnosis import Diagnosis, diagnose
     from mapvote.formats import read_map
 
     if is_url(path):
         raise MapvoteError(f"doctor: {path} is a server: mapvote check {path} looks at its store")
-    point_map = None
-    if map_path is not None:
-        with waiting(f"reading {map_path}"):
-            point_map = read_map(map_path)
-    if is_store(path):
-        with waiting("reading every byte"):
-            diagnosis = Diagnosis(stores().findings_of(path))
-    else:
-        with stages_that_vanish() as tell:
-            diagnosis = diagnose(Path(path), drive_options, point_map, tell)
+    with ExitStack() as open_map:
+        point_map = None
+        if where is not None:
+            with waiting(f"reading {where}"):
+                served = is_url(where) or is_store(where)
+                # What is wrong with a map in files is reported beside what is wrong with the drive.
+                point_map = open_map.enter_context(map_at(where, key_file)) if served else read_map(where)
+        if is_store(path):
+            with waiting("reading every byte"):
+                diagnosis = Diagnosis(stores().findings_of(path))
+        else:
+            with stages_that_vanish() as tell:
+                diagnosis = diagnose(Path(path), drive_options, point_map, tell)
+        if png is not None:
+            from mapvote.plots import draw_diagnosis
+
+            draw_diagnosis(diagnosis, point_map, png)
+    _tell_findings(path, diagnosis)
+    if png is not None:
+        print(f"{png}: the scans as read, and as mended")
+    if any_error(diagnosis.findings):
+        raise typer.Exit(1)
+
+
+def _tell_findings(path: str, diagnosis: Diagnosis) -> None:
+    from rich.console import Console
+
     console = Console(soft_wrap=True, highlight=False)
     for finding in diagnosis.findings:
         for line in _lines(finding):
@@ -123,13 +143,6 @@ def doctor(
     errors = sum(f.severity == "error" for f in diagnosis.findings)
     warnings = sum(f.severity == "warning" for f in diagnosis.findings)
     print(f"{path}: {errors} errors, {warnings} warnings" if errors or warnings else f"{path}: sound")
-    if png is not None:
-        from mapvote.plots import draw_diagnosis
-
-        draw_diagnosis(diagnosis, point_map, png)
-        print(f"{png}: the scans as read, and as mended")
-    if errors:
-        raise typer.Exit(1)
 
 
 def _lines(finding: Finding) -> list[str]:

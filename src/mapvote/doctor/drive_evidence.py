@@ -18,6 +18,7 @@ from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress
 from mapvote.doctor.scans import Looking, Looks
+from mapvote.formats.drives.options import source_of_times
 from mapvote.matching.ndt import fitness, likeliest, refine
 from mapvote.matching.ndt_map import NdtMap
 from mapvote.matching.prepare import thin_for_levels
@@ -223,7 +224,7 @@ class DriveEvidence:
     @cached_property
     def leaps(self) -> list[Finding]:
         """What is wrong with the scans' own motion; while there is anything, a prior cannot be compared with it."""
-        return list(_check_motion(self.every_run, self.drive.stamps_ns)) if self.can_be_registered else []
+        return list(_check_motion(self.every_run, self.drive)) if self.can_be_registered else []
 
     def _follow(self, start: int, scans: int = _SCANS) -> Run:
         """The run of at most ``scans`` scans that begins at readable scan ``start``."""
@@ -409,12 +410,13 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
         yield Finding("error" if tilt_deg > 8.0 else "warning", f"{what}roll {roll:.1f})", mend)
 
 
-def _check_motion(runs: Sequence[Run], stamps_ns: I64) -> Iterator[Finding]:
+def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
     """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
+    stamps_ns, times = drive.stamps_ns, source_of_times(drive.path)
     broken = [run for run in runs if run.usual_fit < _LEAST_FIT]
     leaps = np.concatenate([~_agree_with_time(run, stamps_ns) for run in runs])
     speed = [run.length_m / (1e-9 * float(np.diff(stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
-    mend = "are the files in order of time (names, times.txt), of one drive, and whole?"
+    mend = f"are the scans in order of time ({times}), of one drive, and whole?"
     if len(broken) > 0.5 * len(runs):
         fit = float(np.median([run.usual_fit for run in runs]))
         what = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity, any_error, usable
+from mapvote.formats.drives.options import source_of_times
 from mapvote.formats.drives.sensor_estimate import contradiction
 
 _SECTORS = 36
@@ -45,7 +46,7 @@ IN_MAP_FRAME = Finding(
 NO_PRIOR = Finding(
     "warning",
     "no prior: the vehicle must find itself in the map",
-    "write prior.txt (3 x 4 rows T_map_lidar), or be ready to give the first pose",
+    "give poses with --prior: a file (3 x 4 rows T_map_lidar, TUM, CSV) or a topic of a bag; or give the first pose",
 )
 _LOOK = np.dtype(
     [
@@ -212,12 +213,14 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
         large, small = median_s > 5.0, median_s < 0.01
         if (large and 0.02 <= median_s / factor <= 2.0) or (small and 0.02 <= median_s * factor <= 2.0):
             wrong = f"are {unit}, not seconds" if large else f"were divided by {factor:g}"
-            yield Finding("error", f"scans are {median_s:g} s apart: the times {wrong}", "convert times.txt")
+            what = f"scans are {median_s:g} s apart: the times {wrong}"
+            yield Finding("error", what, f"convert {source_of_times(drive.path)}")
             return
     sensor = drive.sensor
     if not 0.8 < median_s * sensor.rate_hz < 1.25:
         what = f"scans are {median_s:.3f} s apart, but a {sensor.name} turns at {sensor.rate_hz:g} Hz"
-        mend = "if scans were left out, all is well; else times or rate_hz (drive.toml) are wrong"
+        times = source_of_times(drive.path)
+        mend = f"if scans were left out, all is well; else {times} or rate_hz (--rate, drive.toml) are wrong"
         yield Finding("warning", what, mend)
     holes, longest = int((step_s > 1.8 * median_s).sum()), int(np.argmax(step_s))
     if holes:

@@ -25,13 +25,14 @@ from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudP
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
-from mapvote.formats.registry import DRIVES, MAPS, WRITERS
+from mapvote.formats.registry import DRIVES, MAPS, WRITERS, drive_format
 
 __all__ = [
     "DriveWriter",
     "export_map",
     "is_cloud",
     "open_drive",
+    "open_drive_on",
     "read_T_map_lidar",
     "read_map",
     "write_map",
@@ -55,10 +56,18 @@ def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
     Raises MapvoteError if there is no drive at ``path`` or it cannot be used as it is, saying why.
     """
     path = Path(path)
-    for layout in DRIVES.values():
-        if layout.recognised(path):
-            return layout.open(path, drive_options(path, **said))
+    layout = drive_format(path)
+    if layout is not None:
+        return layout.open(path, drive_options(path, **said))
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a drive is one of: {', '.join(DRIVES)}")
+
+
+def open_drive_on(point_map: PointMap | None, path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
+    """:func:`open_drive` of a drive that is compared with a map: latitudes and longitudes of its prior go into the
+    map's frame."""
+    if point_map is not None:
+        said["frame"] = frame_of(point_map.georeference)
+    return open_drive(path, **said)
 
 
 def read_map(path: Path | str, look: Look | None = None) -> PointMap:
@@ -92,7 +101,7 @@ def is_cloud(path: Path | str) -> bool:
     """Whether a map or cloud lies at ``path``, and no recorded drive."""
     path = Path(path)
     held = is_map_folder(path) or any(layout.recognised(path) for layout in MAPS.values())
-    return held and not any(layout.recognised(path) for layout in DRIVES.values())
+    return held and drive_format(path) is None
 
 
 def import_cloud(

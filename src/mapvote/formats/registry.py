@@ -65,6 +65,12 @@ DRIVES: dict[str, DriveFormat | datasets.Dataset] = {
 }
 """In the order in which they are tried."""
 
+
+def drive_format(path: Path) -> DriveFormat | datasets.Dataset | None:
+    """The layout of the drive at ``path``; None if no drive lies there."""
+    return next((layout for layout in DRIVES.values() if layout.recognised(path)), None)
+
+
 MAPS: dict[str, MapFormat] = {
     "Autoware tile folder": MapFormat(autoware.is_autoware, autoware.stream_autoware),
     "Autoware default folder": MapFormat(autoware.is_autoware_default, autoware.stream_autoware_default),

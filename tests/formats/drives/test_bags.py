@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import get_types_from_msg
@@ -104,9 +105,10 @@ def test_bags_that_leave_a_question_open(tmp_path: Path, caplog: pytest.LogCaptu
 def test_broken_bags_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MapvoteError, match=r"7190 bytes, but its header says 7200"):
         open_drive(write_bag(tmp_path / "cut", StoragePlugin.SQLITE3, cut=10))
-    (tmp_path / "cut" / "metadata.yaml").write_text("nonsense")
-    with pytest.raises(MapvoteError, match="not a readable bag"):
-        open_drive(tmp_path / "cut")
+    damaged = write_bag(tmp_path / "damaged", StoragePlugin.SQLITE3) / "damaged.db3"
+    damaged.write_bytes(damaged.read_bytes()[:9000])
+    with pytest.raises(MapvoteError, match=r"sqlite3 \S+damaged\.db3 \"\.recover\" \| sqlite3 recovered\.db3"):
+        open_drive(tmp_path / "damaged")
     for module in [m for m in sys.modules if m.partition(".")[0] == "rosbags"]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "rosbags", None)
@@ -193,6 +195,20 @@ def test_which_lidars_are_meant_and_where_they_sit_must_be_known(tmp_path: Path)
         open_drive(two_lidars(tmp_path / "bag"))
     with pytest.raises(MapvoteError, match=r"tf_static holds no transform from front .* to rear"):
         open_drive(two_lidars(tmp_path / "no_tf", static=False), topic=BOTH)
+
+
+@pytest.mark.parametrize("static", [True, False])
+def test_mounts_in_drive_toml_win_over_tf_static(tmp_path: Path, static: bool) -> None:
+    bag = two_lidars(tmp_path / "bag", static=static, late_ns=0)
+    mounts = {f"/{name}/points": T[:3].ravel().tolist() for name, T in T_BASE.items()}
+    (bag / "drive.toml").write_text(tomli_w.dumps({"mounts": mounts, "sensor": "hdl32e"}))
+    drive = open_drive(bag, topic=BOTH)
+    assert np.allclose(drive.T_base_lidar, T_BASE["front"])
+    hall = geometry.transform(T_BASE["front"], drive.read_scan(2).points.astype(np.float64))
+    assert cKDTree(HALL).query(hall)[0].max() < 1e-4
+    (bag / "drive.toml").write_text(tomli_w.dumps({"mounts": {name: [1.0, 2.0] for name in mounts}}))
+    with pytest.raises(MapvoteError, match=r"mounts: /front/points: T_base_lidar must be 12 numbers"):
+        open_drive(bag, topic=BOTH)
 
 
 def test_gnss_fixes_are_a_prior_in_the_maps_frame(tmp_path: Path) -> None:

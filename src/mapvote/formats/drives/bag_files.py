@@ -239,17 +239,21 @@ def _whole_records(file: Path) -> StorageFile:
         if stream.read(len(_MAGIC)) != _MAGIC:
             raise MapvoteError(f"{file}: no MCAP file, or its beginning is lost; copy it again")
         end = len(_MAGIC)
-        for opcode, start, end in _records(stream, file.stat().st_size):
+        size = file.stat().st_size
+        for opcode, start, stop in _records(stream, size):
             # The indexes of a chunk's messages follow it, one a channel.
-            if opcode == _MESSAGE_INDEX:
+            if opcode == _MESSAGE_INDEX and stop <= size:
                 offsets += stream.read(2) + struct.pack("<Q", start)
-                continue
-            # Another record: they are complete.
-            index += _chunk_index(chunk, offsets, start - chunk_end)
-            chunk, offsets = b"", b""
+            # Another record, even one that is cut off: they are complete.
+            elif opcode != _MESSAGE_INDEX:
+                index += _chunk_index(chunk, offsets, start - chunk_end)
+                chunk, offsets = b"", b""
+            if stop > size:
+                break
             if opcode == _CHUNK:
-                chunk = _chunk_head(stream, start, end)
-                chunk_start, chunk_end = start, end
+                chunk = _chunk_head(stream, start, stop)
+                chunk_start, chunk_end = start, stop
+            end = stop
     if end == len(_MAGIC):
         raise MapvoteError(f"{file}: cut off before its first whole record; nothing of it can be read")
     if index and chunk:  # an index that may be incomplete would hide messages
@@ -262,16 +266,17 @@ def _whole_records(file: Path) -> StorageFile:
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start, end) of every whole record of the data section; ``stream`` stands at the record's content."""
-    end = stream.tell()
-    while len(head := stream.read(_HEAD.size)) == _HEAD.size:
+    """(opcode, start, end) of the records of the data section, of which only the last may end beyond ``size``;
+    ``stream`` stands at the record's content."""
+    start = stream.tell()
+    while start < size and len(head := stream.read(_HEAD.size)) == _HEAD.size:
         opcode, length = _HEAD.unpack(head)
-        start = end
-        if start + _HEAD.size + length > size or opcode in (_DATA_END, _FOOTER) or not 0 < opcode < 0x80:
+        if opcode in (_DATA_END, _FOOTER) or not 0 < opcode < 0x80:
             return
         end = start + _HEAD.size + length
         yield opcode, start, end
         stream.seek(end)
+        start = end
 
 
 def _record(opcode: int, body: bytes) -> bytes:

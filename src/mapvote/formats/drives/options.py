@@ -17,6 +17,7 @@ from mapvote.config import did_you_mean
 from mapvote.core import geometry
 from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
@@ -63,6 +64,8 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Names of a .bin or .npy scan's columns, comma-separated."""
     dtype: str | None = None
     scans: str | None = None
+    mounts: dict[str, list[float]] = {}
+    """``T_base_lidar`` of each PointCloud2 topic of a bag, instead of /tf_static."""
     mount: str | None = None
     """``T_base_lidar`` as the command line gives it."""
     frame: MapFrame | None = None
@@ -72,10 +75,24 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
 _NOT_IN_FILE = ("scans", "mount", "frame")
 
 
+def beside(drive: Path) -> Path:
+    """The folder in which drive.toml, prior.txt and other files of a drive lie: its own, or that of its only file."""
+    return drive.parent if drive.is_file() else drive
+
+
+def source_of_times(drive: Path) -> str:
+    """Where the times of a drive's scans stand, as advice names it."""
+    for name in ("times.txt", "velodyne_points/timestamps.txt"):
+        if (drive / name).is_file():
+            return name
+    in_messages = not drive.is_dir() or is_bag(drive) or is_bag_without_metadata(drive)
+    return "the stamps of its messages" if in_messages else "the names of its scans"
+
+
 def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
-    """``folder``/drive.toml, if there is one, and over it what is ``said``. MapvoteError names an unknown key or a
-    wrong value."""
-    file = folder / "drive.toml"
+    """drive.toml in ``folder``, or beside a drive that is one file, and over it what is ``said``. MapvoteError names an
+    unknown key or a wrong value."""
+    file = beside(folder) / "drive.toml"
     try:
         table = tomllib.loads(read_text(file)) if file.is_file() else {}
     except tomllib.TOMLDecodeError as error:
@@ -199,7 +216,8 @@ def make_drive(
         i = int(late[0]) + 1
         raise MapvoteError(
             f"{where}: times are not sorted: scan {i} ({stamps_ns[i] / 1e9:.6f} s) does not come after scan {i - 1} "
-            f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or correct times.txt"
+            f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; "
+            f"sort the scans by time or correct {source_of_times(path)}"
         )
     chosen = parse_scans(options.scans, len(stamps_ns), where)
     rate_hz = options.rate_hz

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
-from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame
+from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, read_mount
 from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields, stamp_of
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Trajectory, prior_of
@@ -112,10 +112,11 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     for what in bag.mended:
         log.warning("%s", what)
     topics = _choose_topics(bag, options.topic)
-    mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other) for other in topics[1:])]
+    mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other, options.mounts) for other in topics[1:])]
+    own = _mount_in(options.mounts, topics[0], str(path))
     sweeps = _sweeps(bag, topics)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
-    T_prior, frame = _prior(bag, options, stamps_ns)
+    T_prior, frame = _prior(bag, options, stamps_ns, own)
     bad_points = BadPoints(str(path))
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
@@ -132,10 +133,18 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         scans = [read_message(i, message, sensor) for message in sweeps[i]]
         return scans[0] if len(scans) == 1 else Scan.sweep(int(stamps_ns[i]), scans)
 
-    return make_drive(path, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan, frame=frame)
+    return make_drive(
+        path,
+        options,
+        stamps_ns=stamps_ns,
+        T_map_lidar_prior=T_prior,
+        read_scan=read_scan,
+        frame=frame,
+        T_base_lidar=own,
+    )
 
 
-def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None, MapFrame]:
+def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64, mount: F64 | None) -> tuple[F64 | None, MapFrame]:
     """T_map_lidar of every scan (n, 4, 4) from a topic or a file, and the frame it is in."""
     topic, poses = options.prior, bag.topics(*POSES, *GNSS)
     if topic is not None and topic.startswith("/") and topic not in poses and not Path(topic).is_file():
@@ -145,7 +154,7 @@ def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64) -> tuple[F64 | None,
         return None if topic is None else _trajectory(bag, topic, map_frame(options))
 
     files = [bag.path] * len(stamps_ns)
-    return prior_of(bag.path, options, files, stamps_ns, own, topic if topic in poses else None)
+    return prior_of(bag.path, options, files, stamps_ns, own, topic if topic in poses else None, mount)
 
 
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
@@ -255,14 +264,22 @@ def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     return Trajectory(order.stamps_ns, yaw_from_track(T), of_vehicle=True, frame=known)
 
 
-def T_first_lidar(bag: Bag, first: str, other: str) -> F64:
-    """T_first_other (4, 4) between the frames of two PointCloud2 topics, by /tf_static; MapvoteError without."""
+def _mount_in(mounts: Mapping[str, list[float]], topic: str, where: str) -> F64 | None:
+    return read_mount(mounts[topic], f"{where}: mounts: {topic}") if topic in mounts else None
+
+
+def T_first_lidar(bag: Bag, first: str, other: str, mounts: Mapping[str, list[float]]) -> F64:
+    """T_first_other (4, 4) between two PointCloud2 topics, by ``mounts`` if both are in it, else by the frames of
+    /tf_static; MapvoteError without."""
+    T_base_first, T_base_other = (_mount_in(mounts, topic, str(bag.path)) for topic in (first, other))
+    if T_base_first is not None and T_base_other is not None:
+        return np.asarray(geometry.inverse(T_base_first) @ T_base_other)
     source, target = (frame_id(bag, topic) for topic in (first, other))
     reached = T_from(static_frames(bag), source)
     if target not in reached:
         raise MapvoteError(
-            f"{bag.path}: /tf_static holds no transform from {source} ({first}) to {target} ({other}); record it, or "
-            f"choose one LiDAR with --topic"
+            f"{bag.path}: /tf_static holds no transform from {source} ({first}) to {target} ({other}); record it, "
+            f"give both in drive.toml (mounts), or choose one LiDAR with --topic"
         )
     return reached[target]
 

@@ -23,7 +23,11 @@ class StampRules:
     set_back_ns: int = 10**9
     """A stamp so much smaller than the one received before it begins another part of the recording."""
     part: int = 10
-    """Messages: parts of fewer in the mean are disorder, and are sorted; longer ones that overlap are passes."""
+    """Messages: parts of fewer in the mean are disorder, and are sorted; longer ones may be passes."""
+    dense: float = 0.75
+    """A step between sorted stamps of less than this share of the recorded one lies between two passes."""
+    overlap: float = 0.1
+    """Share of such steps from which on there are two passes."""
 
 
 RULES = StampRules()
@@ -80,11 +84,15 @@ def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = RUL
 
 
 def _passes(stamps_ns: I64, rules: StampRules) -> list[I64]:
-    """The parts of a recording, as indices, if they are few and stamped over the same time; else one part."""
+    """The parts of a recording, as indices, if they are few and stamped over the same time; else one part.
+
+    One pass in disorder is as dense as it was recorded once it is sorted. Two passes are denser where they overlap.
+    """
     everything = np.arange(len(stamps_ns))
-    parts = np.split(everything, np.flatnonzero(np.diff(stamps_ns) < -rules.set_back_ns) + 1)
+    steps = np.diff(stamps_ns)
+    parts = np.split(everything, np.flatnonzero(steps < -rules.set_back_ns) + 1)
     if len(parts) < 2 or len(everything) < rules.part * len(parts):
         return [everything]
-    spans = sorted((int(stamps_ns[part].min()), int(stamps_ns[part].max())) for part in parts)
-    apart = all(first[1] < second[0] for first, second in zip(spans, spans[1:], strict=False))
-    return [everything] if apart else parts
+    recorded_ns = float(np.median(steps[steps > 0]))
+    sorted_ns = np.diff(np.unique(stamps_ns))
+    return parts if (sorted_ns < rules.dense * recorded_ns).mean() > rules.overlap else [everything]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
-from mapvote.formats.drives.options import DriveOptions, map_frame, mount_of
+from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
@@ -366,7 +366,8 @@ def prior_of(
     said = options.prior
     if said is not None and said.lower() == "none":
         return None, MapFrame()
-    places = (path / "prior.txt",) if said is None else () if said == own_name else (Path(said), path / said)
+    home = beside(path)
+    places = (home / "prior.txt",) if said is None else () if said == own_name else (Path(said), home / said)
     file = next((place for place in places if place.is_file()), None)
     if file is None and said not in (None, own_name):
         raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")

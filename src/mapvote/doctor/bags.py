@@ -1,0 +1,113 @@
+"""What is wrong with a bag: its files, topics, rates and clocks, and what joins the frames of poses and LiDARs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Unpack
+
+import numpy as np
+import scipy
+
+from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.doctor import Finding, Severity
+from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_options
+from mapvote.formats.drives.rosbag import (
+    CLOUD,
+    GNSS,
+    POSES,
+    Bag,
+    T_from,
+    frame_id,
+    stamps_of,
+    static_frames,
+)
+from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
+
+_LATE_S = 0.5
+"""Between the stamp in a header and the receipt: more is another clock."""
+
+_Orders = Mapping[str, StampOrder]
+_Times = Mapping[str, I64]
+"""Of each topic (messages, 2): the stamp in its header and the time of its receipt, nanoseconds."""
+
+
+def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
+    """Topics, rates, clocks and frames of the bag at ``path``; nothing of what its scans show."""
+    try:
+        bag = Bag(path)
+        times = {topic: stamps_of(bag, topic) for topic in bag.topics(CLOUD, *POSES, *GNSS)}
+        orders = {topic: in_order_of_stamps(*rows.T) for topic, rows in times.items()}
+        files = [Finding("warning", what) for what in bag.mended]
+        poses = _poses(bag, orders, drive_options(path, **said))
+        return [*files, *_topics(bag, times), *_clocks(bag, times, orders), *poses]
+    except MapvoteError as error:
+        return [Finding("error", str(error))]
+
+
+def _topics(bag: Bag, times: _Times) -> Iterator[Finding]:
+    others = []
+    for name, topic in sorted(bag.reader.topics.items()):
+        if topic.msgtype not in (CLOUD, *POSES, *GNSS):
+            others.append(f"{name} ({topic.msgcount})")
+            continue
+        seconds = float(np.ptp(times[name][:, 1])) * 1e-9 if len(times[name]) else 0.0
+        rate = f"{(len(times[name]) - 1) / seconds:.1f} Hz" if seconds > 0 else "no rate"
+        yield Finding("note", f"{name}: {topic.msgcount} messages of {topic.msgtype}, {rate}")
+        if topic.msgtype == CLOUD and topic.msgcount == 0:
+            yield Finding("warning", f"{name} holds no message", "did the driver run? Record it again")
+    if others:
+        yield Finding("note", f"other topics: {', '.join(others)}")
+
+
+def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
+    """Stamps of the headers: what is out of order, doubled or of another clock than the times of receipt."""
+    for topic, order in orders.items():
+        mend = "the drive is read so; record again with `use_sim_time` alike for all nodes, and one pass a bag"
+        yield from (Finding("warning", f"{topic} {what}", mend) for what in order.told)
+    for topic in bag.topics(CLOUD):
+        stamps, received = times[topic][orders[topic].chosen].T
+        if len(stamps) < 3 or not stamps.any():
+            continue
+        late_s = float(np.median(received - stamps)) * 1e-9
+        if abs(late_s) > _LATE_S:
+            what = f"{topic}: messages were received {late_s:.2f} s after their stamps (median)"
+            mend = "the sensor or a simulator (use_sim_time) keeps another clock: do the poses keep the same one?"
+            yield Finding("note", what, mend)
+
+
+def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding]:
+    """Which topics may serve as prior, whether they span the scans, and how far the LiDAR sits from what they track."""
+    clouds, poses = list(bag.topics(CLOUD)), list(bag.topics(*POSES, *GNSS))
+    if not clouds:
+        return
+    if not poses:
+        yield Finding("note", "no topic of poses or GNSS fixes: a prior must come from a file (--prior)")
+        return
+    if options.prior is None:
+        what = f"no prior is chosen, but there are poses: {', '.join(poses)}"
+        yield Finding("warning", what, f"--prior {poses[0]}")
+    lidar, scans, edges = frame_id(bag, clouds[0]), orders[clouds[0]].stamps_ns, static_frames(bag)
+    for topic in poses:
+        stamps = orders[topic].stamps_ns
+        outside = float(((scans < stamps.min()) | (scans > stamps.max())).mean()) if len(stamps) and len(scans) else 0.0
+        if outside > 0.05:
+            grave: Severity = "error" if outside > 0.9 else "warning"
+            mend = "do both keep one clock? Use times of one computer, or PTP"
+            what = f"{topic} has no pose at the time of {outside:.0%} of the scans"
+            yield Finding(grave, what, mend if outside > 0.9 else "leave these scans out with --scans")
+        tracked = frame_id(bag, topic, child=True)
+        if tracked and tracked != lidar:
+            what = f"{topic} tracks {tracked}, the scans are of {lidar}"
+            yield _mounted(what, T_from(edges, tracked).get(lidar), options)
+
+
+def _mounted(what: str, T: F64 | None, options: DriveOptions) -> Finding:
+    if T is None:
+        mend = "give it: --mount X,Y,Z,ROLL,PITCH,YAW (metres, degrees)"
+        return Finding("warning", f"{what}; nothing in /tf_static says where that sits on it", mend)
+    if options.mount or options.T_base_lidar or np.allclose(T, np.eye(4), atol=1e-3):
+        return Finding("note", f"{what}: /tf_static says where that sits on it")
+    rpy_deg = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+    mend = "--mount " + ",".join(f"{v:.3f}" for v in (*T[:3, 3], *rpy_deg))
+    return Finding("warning", f"{what}: /tf_static says where that sits on it, the prior does not know", mend)
