@@ -94,5 +94,5 @@ def _passes(stamps_ns: I64, rules: StampRules) -> list[I64]:
     if len(parts) < 2 or len(everything) < rules.part * len(parts):
         return [everything]
     recorded_ns = float(np.median(steps[steps > 0]))
-    sorted_ns = np.diff(np.unique(stamps_ns))
+    sorted_ns = np.diff(np.unique(stamps_ns)).astype(np.float64)
     return parts if (sorted_ns < rules.dense * recorded_ns).mean() > rules.overlap else [everything]
