@@ -1,8 +1,9 @@
 """Topics of ROS 2 over DDS, by Cyclone DDS (extra ``ros2``): bytes of messages in and out, and who sends what.
 
 Names are ROS 2's: topic /points is ``rt/points`` on the wire, type sensor_msgs/msg/PointCloud2 is
-``sensor_msgs::msg::dds_::PointCloud2_``. Topics of services are ``rq/..`` and ``rr/..``, and are named so. The domain
-is ROS_DOMAIN_ID; CYCLONEDDS_URI names interfaces and peers.
+``sensor_msgs::msg::dds_::PointCloud2_``. Topics of services are ``rq/..`` and ``rr/..``, and are named so. The
+variables of ROS 2 name domain and range (:mod:`mapvote.live.ros_environment`); CYCLONEDDS_URI names interfaces and
+peers.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import first_line, require
 from mapvote.live.messages import CLOUD, ODOMETRY, READ, from_cdr, typestore
+from mapvote.live.ros_environment import ros_environment
 
 _DEPTH = 64
 """Messages that a reader or a writer keeps: six seconds of clouds."""
@@ -51,19 +53,21 @@ class Network:
     """One participant in a DDS domain."""
 
     def __init__(self, domain: int | None = None) -> None:
-        """``domain`` defaults to ROS_DOMAIN_ID, else 0. MapvoteError without cyclonedds or without a network."""
+        """``domain`` defaults to ROS_DOMAIN_ID, else 0. MapvoteError without cyclonedds, without a network, or if a
+        variable of ROS 2 is wrong."""
+        environment = ros_environment(domain)
         self._core, self._pub, self._sub, self._topic, self._idl, builtin = (
             require(f"cyclonedds.{name}", "ros2", "ROS 2 topics")
             for name in ("core", "pub", "sub", "topic", "idl", "builtin")
         )
-        self.domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
+        self.domain = environment.domain
         try:
-            with _with_defaults():
+            with _with_defaults(environment.configuration):
                 self._participant = require("cyclonedds.domain", "ros2", "DDS").DomainParticipant(self.domain)
         except Exception as error:
             raise MapvoteError(
-                f"DDS domain {self.domain}: cannot be joined ({first_line(error)}); is the network interface up that "
-                "CYCLONEDDS_URI names?"
+                f"DDS domain {self.domain}: cannot be joined ({first_line(error)}). Is a network interface up, is it the "
+                "one that CYCLONEDDS_URI names, and is the XML there whole? (The line of Cyclone DDS above says more)"
             ) from error
         self._own = str(self._participant.guid)
         self._waitset = self._core.WaitSet(self._participant)
@@ -156,10 +160,11 @@ class Network:
 
 
 @contextmanager
-def _with_defaults() -> Iterator[None]:
-    """CYCLONEDDS_URI, which Cyclone DDS reads when a process joins a domain, with our defaults before the user's."""
+def _with_defaults(configuration: str) -> Iterator[None]:
+    """CYCLONEDDS_URI, which Cyclone DDS reads when a process joins a domain: our defaults, then ROS 2's
+    ``configuration``, then the user's. The last one counts."""
     theirs = os.environ.get("CYCLONEDDS_URI")
-    os.environ["CYCLONEDDS_URI"] = ",".join(filter(None, (_DEFAULTS, theirs)))
+    os.environ["CYCLONEDDS_URI"] = ",".join(filter(None, (_DEFAULTS, configuration, theirs)))
     try:
         yield
     finally:
