@@ -73,7 +73,7 @@ class Server:
         self.maps.append(map_from_points(points, map_id="m"))
 
     def manifest(self) -> SimpleNamespace:
-        return SimpleNamespace(version=len(self.maps))
+        return SimpleNamespace(version=len(self.maps), map_id="m")
 
     def fetch(self) -> PointMap:
         self.version = len(self.maps)

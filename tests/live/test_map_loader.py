@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from live.loopback_dds import until
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.autoware import lay_version
+from mapvote.formats.maps.autoware import check_followed, laid_version, lay_version
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.live.map_loader import (
     DIFFERENTIAL,
@@ -104,13 +106,81 @@ def test_a_tile_that_changed_has_another_id_and_the_old_one_is_dropped(loader: M
     assert np.frombuffer(new[0].pointcloud.data, "<f4")[2::3].tolist() == [2.0, 2.0]
 
 
-def test_a_folder_that_is_still_empty_answers_with_nothing_and_a_broken_table_is_said(tmp_path: Path) -> None:
-    loader = MapLoader(tmp_path)
-    assert not loader.refresh()
-    assert (asked(loader, "a"), loader.hash()) == (([], ["a"]), "")
-    (tmp_path / "pointcloud_map_metadata.yaml").write_text("x_resolution: much\n")
-    with pytest.raises(MapvoteError, match="not Autoware's metadata"):
-        loader.refresh()
+def test_a_broken_an_empty_and_a_foreign_table_are_said_and_the_tiles_before_stay(
+    loader: MapLoader, tmp_path: Path
+) -> None:
+    table, tiles = tmp_path / "map/pointcloud_map_metadata.yaml", list(loader.cells)
+    for broken in ("x_resolution: much\n", "", "x_resolution: 20.0\ny_resolution: 20.0\n", "{", "a: [1"):
+        table.write_text(broken)
+        with pytest.raises(MapvoteError, match="not Autoware's metadata"):
+            loader.refresh()
+        assert not loader.refresh(), "it is said once"
+        assert list(loader.cells) == tiles
+    lay(tmp_path / "theirs", points((0, 0)), 1)
+    (tmp_path / "theirs/.mapvote_versions.json").unlink()
+    with pytest.raises(MapvoteError, match="mapvote did not make; choose another folder"):
+        MapLoader(tmp_path / "theirs").refresh()
+
+
+HELD = ["0_0_ffffffff.pcd", "20_0_ffffffff.pcd", "/path/of/another/loader.pcd"]
+
+
+def test_no_answer_leaves_a_client_without_a_map(loader: MapLoader, tmp_path: Path) -> None:
+    new, removed = asked(MapLoader(tmp_path / "empty"), *HELD)
+    assert (new, removed) == ([], []), "no version is known"
+    assert asked(loader, *HELD, x=-5000.0) == ([], []), "this map has nothing there"
+    (tmp_path / "map/pointcloud_map.pcd" / next(iter(loader.cells))).unlink()
+    new, removed = asked(loader, *HELD)
+    assert (corner(new), removed) == ([(20, 0)], []), "a tile that replaces one of theirs cannot be read"
+    for tile in loader.cells:
+        (tmp_path / "map/pointcloud_map.pcd" / tile).write_bytes(b"VERSION 0.7")
+    assert asked(loader, *HELD) == ([], [])
+
+
+@given(held=st.sets(st.integers(0, 40)), x=st.floats(-100, 300), version=st.integers(1, 2))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+def test_a_client_that_holds_tiles_and_obeys_holds_tiles_of_the_area_or_all_that_it_had(
+    loader: MapLoader, tmp_path: Path, held: set[int], x: float, version: int
+) -> None:
+    """Ids of this version and of others, at any place."""
+    lay(tmp_path / "map", points((0, 0), (20, 0), (200, 200), z=float(version)), version)
+    loader.refresh()
+    ids = {f"{20 * k}_0_abcdef01.pcd" for k in held} | {name for k, name in enumerate(loader.cells) if k in held}
+    new, removed = asked(loader, *sorted(ids), x=x)
+    after = (ids - set(removed)) | {cell.cell_id for cell in new}
+    wanted = {cell.id for cell in loader.partial(x, 10.0, 15.0)}
+    assert after == (wanted or ids)
+
+
+def test_a_version_that_was_half_laid_is_laid_again_and_another_map_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "map"
+    cloud = Cloud(points((0, 0), (20, 0)), frame=MapFrame())
+    assert laid_version(folder) is None
+    lay_version(folder, cloud, 1, map_id="town")
+    table = (folder / "pointcloud_map_metadata.yaml").read_bytes()
+    lay_version(folder, Cloud(points((0, 0), z=3.0), frame=MapFrame()), 2, map_id="town")
+    assert laid_version(folder) == 2
+    (folder / "pointcloud_map_metadata.yaml").write_bytes(table)  # killed before the table was replaced
+    assert laid_version(folder) is None
+    lay_version(folder, cloud, 3, map_id="town")
+    next((folder / "pointcloud_map.pcd").glob("20_0_*.pcd")).unlink()
+    assert laid_version(folder) is None
+    lay_version(folder, cloud, 3, map_id="town")
+    assert laid_version(folder) == 3
+    with pytest.raises(MapvoteError, match="holds map town, but the server has map village"):
+        check_followed(folder, "village")
+
+
+def test_a_request_that_cannot_be_read_is_answered_by_its_number_with_no_tile(loader: MapLoader, domain: int) -> None:
+    pytest.importorskip("cyclonedds")
+    from mapvote.live.dds import Network
+    from mapvote.live.map_loader import LoaderService
+
+    service = LoaderService(Network(domain), loader)
+    whole = to_cdr(f"{PARTIAL}_Request", blank_message(f"{PARTIAL}_Request", guid=77, seq=5))
+    for cut, numbers in ((4 + 16, (77, 5)), (4 + 20, (77, 5)), (4 + 8, (77, 0)), (2, (0, 0))):
+        reply = from_cdr(f"{PARTIAL}_Response", service._reply(PARTIAL, memoryview(whole[:cut])))
+        assert ((reply.guid, reply.seq), len(reply.new_pointcloud_with_ids)) == (numbers, 0)
 
 
 def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
@@ -121,8 +191,9 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     from mapvote.live.dds import Network
     from mapvote.live.map_loader import LoaderService
 
+    loader = MapLoader(tmp_path / "map")
     service, network = LoaderService(Network(domain), loader), Network(domain)
-    service.show()
+    assert service.refresh()
 
     def client(kind: str, guid: int) -> Callable[..., Any]:
         requests = network.publish(f"rq{SERVICES[kind]}Request", f"{kind}_Request", depth=10)
@@ -148,7 +219,7 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     held = [cell.cell_id for cell in reply.new_pointcloud_with_ids]
     assert (len(held), list(reply.ids_to_remove)) == (2, [])
     lay(tmp_path / "map", points((0, 0), (20, 0), z=5.0), 2)
-    loader.refresh()
+    service.refresh()
     reply = ask(2, area=area, cached_ids=held)
     assert list(reply.ids_to_remove) == held
     assert {float(np.frombuffer(c.pointcloud.data, "<f4")[2]) for c in reply.new_pointcloud_with_ids} == {5.0}
@@ -166,4 +237,4 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     listed = [
         (c.metadata.min_x, c.metadata.min_y, c.metadata.max_x, c.metadata.max_y) for c in told[TABLE].metadata_list
     ]
-    assert sorted(listed) == [(0, 0, 20, 20), (20, 0, 40, 20), (200, 200, 220, 220)]
+    assert sorted(listed) == [(0, 0, 20, 20), (20, 0, 40, 20)], "of the newest version"

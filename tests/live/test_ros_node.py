@@ -35,6 +35,9 @@ class Node:
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
         return SimpleNamespace(publish=self.published.setdefault(topic, []).append)
 
+    def create_timer(self, period_s: float, callback: Any) -> Any:
+        return callback
+
     def create_service(self, kind: Any, name: str, callback: Any) -> None:
         self.services[name] = callback
 
@@ -72,6 +75,17 @@ def module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     found = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(found)
     return found
+
+
+def test_the_node_offers_no_service_before_a_version_is_in_its_folder(module: ModuleType, tmp_path: Path) -> None:
+    Node.parameters = {"folder": str(tmp_path), "server_url": "http://127.0.0.1:9", "period": 3600.0}
+    node = module.MapvoteMapLoader()
+    node.timer()
+    assert node.services == {}
+    lay(tmp_path, points((0, 0)), 1)
+    node.timer()
+    assert len(node.services) == 3
+    node.ended.set()
 
 
 def test_the_node_answers_from_the_folder_and_says_which_map_it_is(module: ModuleType, tmp_path: Path) -> None:

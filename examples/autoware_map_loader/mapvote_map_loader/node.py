@@ -55,9 +55,10 @@ class MapvoteMapLoader(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.hash = self.create_publisher(MapHash, "~/output/map_hash", latched)
         self.table = self.create_publisher(PointCloudMapMetaData, "~/output/pointcloud_map_metadata", latched)
-        for name, (kind, service) in SERVICES.items():
-            self.create_service(kind, name, self.answering(service))
+        self.offered = False
         self.refresh()
+        # The folder is looked at in the executor's thread, so that the services begin to exist there.
+        self.timer = self.create_timer(0.5, self.refresh)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self.follow, daemon=True)
         self.thread.start()
@@ -77,13 +78,18 @@ class MapvoteMapLoader(Node):
         return answer
 
     def refresh(self) -> None:
-        """Read the folder's table if it was replaced, and publish which map it is."""
+        """Read the folder's table if it was replaced, and publish which map it is. The services exist from the first
+        table on: a client that was answered before would drop its map."""
         try:
             if not self.loader.refresh():
                 return
         except MapvoteError as error:
-            self.get_logger().error(str(error))
+            self.get_logger().error(f"{error}; the tiles before are served")
             return
+        if not self.offered:
+            self.offered = True
+            for name, (kind, service) in SERVICES.items():
+                self.create_service(kind, name, self.answering(service))
         self.hash.publish(MapHash(pcd=self.loader.hash()))
         table = PointCloudMapMetaData()
         table.header.frame_id, table.header.stamp = "map", self.get_clock().now().to_msg()
@@ -99,7 +105,7 @@ class MapvoteMapLoader(Node):
             while not self.ended.wait(self.period):
                 try:
                     change = follow_once(client, self.loader.folder, self.projector, self.keep)
-                except MapvoteError as error:
+                except (MapvoteError, OSError) as error:
                     self.get_logger().warning(f"{error}; the map stays as it is")
                     continue
                 if change is not None:

@@ -316,15 +316,18 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
     """Write the server's newest version into ``folder``; None if it is there already.
 
     The frame is chosen once, with the first version, unless ``projector`` names one: a map that grows does not move.
+    MapvoteError if the folder holds another map.
     """
     from mapvote.formats import autoware_pieces
-    from mapvote.formats.maps.autoware import laid_version, lay_version
+    from mapvote.formats.maps.autoware import check_followed, laid_version, lay_version
 
-    if laid_version(folder) == client.manifest().version:
+    manifest = client.manifest()
+    check_followed(folder, manifest.map_id)
+    if laid_version(folder) == manifest.version:
         return None
     cloud = autoware_pieces(client.fetch(), folder, projector)
     assert client.version is not None
-    return lay_version(folder, cloud, client.version, keep=keep)
+    return lay_version(folder, cloud, client.version, keep=keep, map_id=manifest.map_id)
 
 
 _MOST_WAYPOINTS = 10

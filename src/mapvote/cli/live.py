@@ -236,34 +236,27 @@ def autoware(
 
     mapvote autoware https://maps.example.org map --key-file key
     """
+    import os
     import threading
 
     from mapvote.cli.files import follow_once
-    from mapvote.core.types import MapvoteError
+    from mapvote.formats.maps.autoware import check_followed
     from mapvote.live.dds import Network
+    from mapvote.live.following import Follower, serve_followed
     from mapvote.live.map_loader import LoaderService, MapLoader
 
+    def say(text: str) -> None:
+        print(f"{folder}: {text}", flush=True)
+
+    check_followed(folder)
+    implementation = os.environ.get("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    if implementation != "rmw_cyclonedds_cpp":
+        say(f"RMW_IMPLEMENTATION={implementation}: only nodes on rmw_cyclonedds_cpp get answers; see docs/autoware.md")
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
-
-    def follow() -> None:
-        with client_of(url, key_in(key_file)) as client:
-            while not stopped.is_set():
-                try:
-                    change = follow_once(client, folder, projector, keep)
-                    if change is not None:
-                        print(f"{folder}: version {change.version}, {change.written} new tiles", flush=True)
-                except MapvoteError as error:
-                    print(f"{error}; the map stays as it is", flush=True)
-                stopped.wait(every)
-
-    threading.Thread(target=follow, daemon=True).start()
-    loader = MapLoader(folder)
-    service = LoaderService(Network(domain), loader)
-    while not stopped.is_set():
-        if loader.refresh():
-            service.show()
-            print(f"serving {len(loader.cells)} tiles", flush=True)
-        service.serve(0.2)
+    service = LoaderService(Network(domain), MapLoader(folder))
+    with client_of(url, key_in(key_file)) as client:
+        follower = Follower(lambda: follow_once(client, folder, projector, keep), every, stopped, say)
+        serve_followed(service, follower, stopped, say)
     print(f"{service.answered} requests answered")

@@ -224,6 +224,12 @@ class Subscription:
         samples = [(info, _Sample(self._library, handle)) for info, handle in taken]
         return [(info.source_timestamp, np.asarray(sample).data) for info, sample in samples if info.valid_data]
 
+    def close(self) -> None:
+        """Read no more: writers lose this reader at once."""
+        entity = self._library.dds_delete(self._reader._ref)
+        if entity < 0:
+            raise MapvoteError(f"{self._topic}: DDS cannot close its reader (error {entity})")
+
     @property
     def writers(self) -> int:
         """How many send it now."""

@@ -1,9 +1,12 @@
-"""What Autoware's pointcloud_map_loader answers, from a folder that ``mapvote follow`` keeps; no ROS is needed here.
+"""What Autoware's pointcloud_map_loader answers, from a folder that is kept at the newest version; no ROS is needed.
 
 Autoware's own loader reads its table of tiles once, when it starts, and takes the path of a tile for its identity. But
 its clients take, keep and drop whatever ids the service answers. Here an id is a file's name, X_Y_HASH8.pcd, which
 changes with the content: so a client that asks again drops the old tile and takes the new one, without a restart.
 Read at autoware_core 2d693b8 (2026-08-20) and autoware_msgs 7025d8f (2026-04-27).
+
+A client obeys an answer, and asks again only 20 m later. So the services exist only while there is a table of tiles.
+A client drops a tile only for tiles that it has or gets with the same answer: no answer leaves it without a map.
 
 :class:`LoaderService` offers the services over DDS as rmw_cyclonedds (master of 2026-08) has them: a request topic and
 a reply topic for each. Before the members of a request, and of its reply, stand 16 bytes: the client's number (uint64)
@@ -14,17 +17,20 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import struct
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import yaml
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.maps.autoware import METADATA, TILES
+from mapvote.formats.extras import first_line
+from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
 from mapvote.formats.maps.cloud import joined
 from mapvote.formats.maps.pcd import stream_pcd
 from mapvote.live.dds import Network, Publication, Subscription
@@ -32,6 +38,11 @@ from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, 
 
 log = logging.getLogger("mapvote.live")
 _DEPTH = 10
+"""Requests and answers that wait in DDS at most, as ROS 2's services have it."""
+_TRIES = 5
+"""An answer is sent so often; each time a reliable reader has a second to take it."""
+_DELIVERY_S = 5.0
+"""How long the last answers may take to arrive before the service ends."""
 DIFFERENTIAL, PARTIAL, SELECTED = (
     f"autoware_map_msgs/srv/{name}"
     for name in ("GetDifferentialPointCloudMap", "GetPartialPointCloudMap", "GetSelectedPointCloudMap")
@@ -77,26 +88,26 @@ class MapLoader:
         """``folder`` as :func:`mapvote.formats.maps.autoware.lay_version` lays it; it may still be empty."""
         self.folder = folder
         self.cells: dict[str, Cell] = {}
-        self._read_ns = 0
+        self._read: tuple[int, int, int] | None = None
+        """Time of change, inode and size of the table that was read last."""
 
     def refresh(self) -> bool:
-        """Read the table of tiles if it was replaced; returns whether it was. MapvoteError if it is none."""
+        """Read the table of tiles if it was replaced; returns whether it was. MapvoteError if it is none, or lists no
+        tile: the tiles known before stay."""
         file = self.folder / METADATA
         try:
-            changed_ns = file.stat().st_mtime_ns
-            if changed_ns == self._read_ns:
+            state = file.stat()
+            seen = state.st_mtime_ns, state.st_ino, state.st_size
+            if seen == self._read:
                 return False
-            table = yaml.safe_load(file.read_text())
-            width, height = float(table.pop("x_resolution")), float(table.pop("y_resolution"))
-            cells = {
-                name: Cell(name, float(x), float(y), float(x) + width, float(y) + height)
-                for name, (x, y) in sorted(table.items())
-            }
+            self._read = seen  # a table that is none is said once, and read again once it was replaced
+            cells = _read_table(file)
+            check_followed(self.folder)
+            self.cells = cells
         except FileNotFoundError:
             return False
         except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise MapvoteError(f"{file}: not Autoware's metadata ({error})") from error
-        self.cells, self._read_ns = cells, changed_ns
+            raise MapvoteError(f"{file}: not Autoware's metadata ({first_line(error)})") from error
         return True
 
     def partial(self, x: float, y: float, radius_m: float) -> list[Cell]:
@@ -120,32 +131,38 @@ class MapLoader:
 
     def answer(self, service: str, request: Any) -> dict[str, Any]:
         """What a service of this type answers: the members of its response by name, clouds as messages of
-        :mod:`mapvote.live.messages`. ``request``: any object with the request's members.
+        :mod:`mapvote.live.messages`. ``request``: any object with the request's members. Raises nothing.
 
-        The differential one sends the tiles in the area that are not cached, and names the cached ones that are not in
-        it or not of this version."""
+        The differential one sends the tiles in the area that are not cached, and names the cached ones to remove: those
+        out of the area or not of this version. It names none if the client would have no tile in the area afterwards,
+        or if a tile that it lacks cannot be read."""
         if service == SELECTED:
             cells = self.selected(request.cell_ids)
         else:
             cells = self.partial(request.area.center_x, request.area.center_y, request.area.radius)
+        held: list[str] = list(request.cached_ids) if service == DIFFERENTIAL else []
+        lacking = [cell for cell in cells if cell.id not in set(held)]
+        tiles = [self._tile(cell) for cell in lacking]
         out: dict[str, Any] = {"header": header_of(0, MAP_FRAME)}
+        out["new_pointcloud_with_ids"] = [tile for tile in tiles if tile is not None]
         if service == DIFFERENTIAL:
-            wanted, held = {cell.id for cell in cells}, list(request.cached_ids)
-            cells = [cell for cell in cells if cell.id not in set(held)]
-            out["ids_to_remove"] = [name for name in held if name not in wanted]
-        out["new_pointcloud_with_ids"] = clouds = []
-        for cell in cells:
-            try:
-                cloud = joined(stream_pcd(self.folder / TILES / cell.id))
-            except MapvoteError as error:  # a version was replaced, and its tile deleted, while it was read
-                log.warning("%s", error)
-                continue
-            columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
-            if "intensity" in cloud.fields:
-                columns["intensity"] = cloud.fields["intensity"]
-            message = cloud_of({name: column.astype(np.float32) for name, column in columns.items()}, 0, MAP_FRAME)
-            clouds.append(cell.message(f"{_MSG}WithID", pointcloud=message))
+            wanted = {cell.id for cell in cells}
+            whole = bool(wanted) and None not in tiles
+            out["ids_to_remove"] = [name for name in held if name not in wanted] if whole else []
         return out
+
+    def _tile(self, cell: Cell) -> Any | None:
+        """The tile as a message; None, and a line in the log, if it cannot be read."""
+        try:
+            cloud = joined(stream_pcd(self.folder / TILES / cell.id))
+        except (MapvoteError, OSError) as error:  # a version was replaced, and its tile deleted, while it was read
+            log.warning("%s", error)
+            return None
+        columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
+        if "intensity" in cloud.fields:
+            columns["intensity"] = cloud.fields["intensity"]
+        message = cloud_of({name: column.astype(np.float32) for name, column in columns.items()}, 0, MAP_FRAME)
+        return cell.message(f"{_MSG}WithID", pointcloud=message)
 
     def table(self, time_ns: int) -> Any:
         """A PointCloudMapMetaData of all tiles."""
@@ -153,35 +170,100 @@ class MapLoader:
         return blank_message(TABLE, header=header_of(time_ns, MAP_FRAME), metadata_list=listed)
 
 
+def _read_table(file: Path) -> dict[str, Cell]:
+    """The tiles in Autoware's metadata, by id. Raises what yaml and the conversions raise if it is none."""
+    table = yaml.safe_load(file.read_text())
+    width = float(table.pop("x_resolution"))
+    height = float(table.pop("y_resolution"))
+    if not table:
+        raise ValueError("it lists no tile")
+    return {
+        name: Cell(name, float(x), float(y), float(x) + width, float(y) + height)
+        for name, (x, y) in sorted(table.items())
+    }
+
+
 class LoaderService:
-    """The services and topics of a map loader, on one network."""
+    """The services and topics of a map loader, on one network. They exist from the first table of tiles on."""
 
     def __init__(self, network: Network, loader: MapLoader) -> None:
-        self._network, self._loader, self.answered = network, loader, 0
+        self._network = network
+        self._loader = loader
+        self.answered = 0
         self._ends: list[tuple[str, Subscription, Publication]] = []
-        for kind, name in SERVICES.items():
-            requests = network.subscribe(f"rq{name}Request", f"{kind}_Request", reliable=True, depth=_DEPTH)
-            replies = network.publish(f"rr{name}Reply", f"{kind}_Response", depth=_DEPTH)
-            self._ends.append((kind, requests, replies))
-        self._hash = network.publish(HASH_TOPIC, HASH, transient_local=True, depth=1)
-        self._table = network.publish(TABLE_TOPIC, TABLE, transient_local=True, depth=1)
+        self._shown: list[tuple[Publication, str, Callable[[], Any]]] = []
 
-    def show(self) -> None:
-        """Publish which map this is: its hash and its table, for those who come later, too."""
-        self._hash.send(to_cdr(HASH, blank_message(HASH, pcd=self._loader.hash())))
-        self._table.send(to_cdr(TABLE, self._loader.table(time.time_ns())))
+    @property
+    def exists(self) -> bool:
+        """Whether the services are offered."""
+        return bool(self._ends)
+
+    @property
+    def tiles(self) -> int:
+        """How many tiles the table lists."""
+        return len(self._loader.cells)
+
+    def refresh(self) -> bool:
+        """Read the table if it was replaced, offer the services if it is the first one, and publish which map it is;
+        returns whether it was replaced. MapvoteError if the new table is none: the one before stays in use."""
+        if not self._loader.refresh():
+            return False
+        if not self._ends:
+            self._offer()
+        for publication, kind, message in self._shown:
+            self._send(publication, to_cdr(kind, message()))
+        return True
+
+    def _offer(self) -> None:
+        network, loader = self._network, self._loader
+        hashed = network.publish(HASH_TOPIC, HASH, transient_local=True, depth=1)
+        table = network.publish(TABLE_TOPIC, TABLE, transient_local=True, depth=1)
+        self._shown = [
+            (hashed, HASH, lambda: blank_message(HASH, pcd=loader.hash())),
+            (table, TABLE, lambda: loader.table(time.time_ns())),
+        ]
+        for kind, name in SERVICES.items():
+            # Replies first: a client that finds the reader of requests can be answered.
+            replies = network.publish(f"rr{name}Reply", f"{kind}_Response", depth=_DEPTH)
+            requests = network.subscribe(f"rq{name}Request", f"{kind}_Request", reliable=True, depth=_DEPTH)
+            self._ends.append((kind, requests, replies))
 
     def serve(self, seconds: float) -> None:
         """Answer the requests that arrived, or wait so long for one."""
         self._network.wait(seconds)
         for kind, requests, replies in self._ends:
             for _, data in requests.take():
-                try:
-                    request = from_cdr(f"{kind}_Request", data)
-                except MapvoteError as error:
-                    log.warning("%s", error)
-                    continue
-                answer = self._loader.answer(kind, request)
-                reply = blank_message(f"{kind}_Response", guid=request.guid, seq=request.seq, **answer)
-                replies.send(to_cdr(f"{kind}_Response", reply))
+                self._send(replies, self._reply(kind, data))
                 self.answered += 1
+
+    def close(self) -> None:
+        """Offer the services no more. Requests that arrived are answered first, and their answers delivered."""
+        self.serve(0.0)
+        for kind, requests, replies in self._ends:
+            requests.close()
+            if not replies.delivered(_DELIVERY_S):
+                log.warning("%s: a client did not take its answer in %.0f s", SERVICES[kind], _DELIVERY_S)
+        self._ends = []
+
+    def _reply(self, kind: str, data: memoryview) -> bytes:
+        """The response to a request, in CDR. A request that cannot be read is answered with nothing, by its number."""
+        try:
+            request = from_cdr(f"{kind}_Request", data)
+            answer = self._loader.answer(kind, request)
+        except MapvoteError as error:
+            log.warning("%s: answered with no tile", error)
+            numbers = (bytes(data[4:20]) + bytes(16))[:16]  # behind the four bytes of the encoding
+            guid, seq = struct.unpack("<Qq" if len(data) > 1 and data[1] & 1 else ">Qq", numbers)
+            request = SimpleNamespace(guid=guid, seq=seq)
+            answer = {"header": header_of(0, MAP_FRAME)}
+        reply = blank_message(f"{kind}_Response", guid=request.guid, seq=request.seq, **answer)
+        return to_cdr(f"{kind}_Response", reply)
+
+    def _send(self, publication: Publication, data: bytes) -> None:
+        """A message that a slow reader does not take is tried again: a client waits for its answer without an end."""
+        for tries in range(_TRIES):
+            try:
+                publication.send(data)
+                return
+            except MapvoteError as error:
+                log.warning("%s (%d of %d tries)", error, tries + 1, _TRIES)

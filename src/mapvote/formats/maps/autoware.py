@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -153,6 +153,12 @@ def _squares(where: str, cloud: Cloud | CloudPieces) -> Iterator[tuple[tuple[int
         yield at, Cloud(fields.pop("points"), fields=fields)
 
 
+def _corners(names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """The corner of each tile, from its name X_Y_HASH8.pcd."""
+    parts = {name: name.split("_") for name in names}
+    return {name: (int(x), int(y)) for name, (x, y, _) in parts.items()}
+
+
 def _metadata(corners: Mapping[str, tuple[int, int]]) -> str:
     """The text of pointcloud_map_metadata.yaml: the size of tiles, and the corner of each file."""
     lines = [f"x_resolution: {_SIDE_M:.1f}", f"y_resolution: {_SIDE_M:.1f}"]
@@ -164,6 +170,8 @@ class _Laid(msgspec.Struct):
 
     version: int
     tiles: list[str]
+    map_id: str = ""
+    """Of the map; "" where the caller did not name it."""
 
 
 _HISTORY = msgspec.json.Decoder(list[_Laid])
@@ -180,9 +188,29 @@ class Change:
 
 
 def laid_version(folder: Path) -> int | None:
-    """The version that the folder's metadata shows; None if the folder has none."""
+    """The version that the folder's metadata shows; None if it shows none, or lacks one of the version's tiles."""
     history = _history(folder)
-    return history[-1].version if history and (folder / METADATA).is_file() else None
+    if not history or not is_autoware(folder):
+        return None
+    newest, tiles = history[-1], folder / TILES
+    present = {file.name for file in tiles.iterdir()} if tiles.is_dir() else set()
+    shown = (folder / METADATA).read_bytes() == _metadata(_corners(newest.tiles)).encode()
+    return newest.version if shown and present.issuperset(newest.tiles) else None
+
+
+def check_followed(folder: Path, map_id: str = "") -> None:
+    """MapvoteError if the folder holds a map of somebody else, or another map than ``map_id``."""
+    if is_autoware(folder) and not (folder / HISTORY).is_file():
+        raise MapvoteError(
+            f"{folder}: holds an Autoware map that mapvote did not make; choose another folder, which may be new"
+        )
+    history = _history(folder)
+    held = history[-1].map_id if history else ""
+    if held and map_id and held != map_id:
+        raise MapvoteError(
+            f"{folder}: holds map {held}, but the server has map {map_id} now. A vehicle must not change maps on the "
+            "road: name another folder for the other map"
+        )
 
 
 def names_of(where: str, cloud: Cloud | CloudPieces) -> list[str]:
@@ -197,17 +225,15 @@ def lay_version(
     *,
     keep: int = 3,
     known: Collection[str] = (),
+    map_id: str = "",
 ) -> Change:
     """Show ``cloud`` (map metres, in a frame that Autoware supports) in ``folder``; only tiles that it lacks are
     written, and of those none that is ``known`` where the folder goes.
 
     Tiles of the ``keep`` versions before stay. At every moment the metadata there names only whole tiles. MapvoteError
-    if the folder holds a map of somebody else.
+    if the folder holds a map of somebody else, or another map than ``map_id``.
     """
-    if (folder / METADATA).is_file() and not (folder / HISTORY).is_file():
-        raise MapvoteError(
-            f"{folder}: holds an Autoware map that mapvote export --follow did not make; choose another folder"
-        )
+    check_followed(folder, map_id)
     if keep < 0:
         raise MapvoteError(f"--keep {keep}: a number of versions, 0 or more")
     tiles = folder / TILES
@@ -221,7 +247,8 @@ def lay_version(
             with whole_file(tiles / name) as partial:
                 save_pcd(partial, tile)
             written += 1
-    history = [laid for laid in _history(folder) if laid.version != version] + [_Laid(version, list(corners))]
+    earlier = [laid for laid in _history(folder) if laid.version != version]
+    history = [*earlier, _Laid(version, list(corners), map_id)]
     _write(folder / HISTORY, msgspec.json.encode(history[-keep - 1 :]))
     _write(folder / PROJECTOR, projector_of(cloud.frame).encode())
     _write(folder / METADATA, _metadata(corners).encode())
