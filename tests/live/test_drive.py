@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import pytest
@@ -77,3 +81,34 @@ def test_of_kills_with_and_without_a_server_no_ballot_is_lost_or_comes_twice(tmp
     result = subprocess.run([sys.executable, *map(str, [bench, *arguments])], capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "0 lost, 0 twice" in result.stdout
+
+
+@pytest.mark.slow
+def test_a_first_start_without_a_compiled_kernel_is_ready_when_it_is_and_never_silent_for_20_s(
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd is played: what the service says to it, with the times."""
+    record(tmp_path / "bag")
+    write_map(map_from_points(street(1)), tmp_path / "map")
+    (tmp_path / "ballots").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    drive = f"drive --map {tmp_path}/map --sensor hdl32e --vehicle car --idle 15 --out {tmp_path}/ballots"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(120.0)
+        command = [sys.executable, "-m", "mapvote", *drive.split(), "--domain", str(domain)]
+        environment = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+        play = [sys.executable, "-m", "mapvote", "play", str(tmp_path / "bag"), "--domain", str(domain)]
+        player = subprocess.Popen([*play, "--rate", "0.5", "--wait", "600"])
+        came = list[tuple[float, str]]()
+        while not came or came[-1][1] != "STOPPING=1":
+            text = systemd.recv(100).decode()
+            came.append((time.monotonic(), text))
+        said, _ = process.communicate(timeout=60)
+        player.wait(60)
+    order = [text for text, _ in groupby(text for _, text in came)]
+    assert order == ["EXTEND_TIMEOUT_USEC=30000000", "READY=1", "WATCHDOG=1", "STOPPING=1"]
+    assert max(b - a for (a, _), (b, _) in pairwise(came)) < 20.0
+    assert "1 ballots, 40 of 40 scans voted" in said

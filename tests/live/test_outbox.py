@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from live.loopback_dds import until
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, check_path, decode, encode, pack_path, unpack_path
 from mapvote.core.grid import CELL_SIZE
@@ -193,6 +195,30 @@ def test_a_full_disk_is_said_once_and_nothing_is_lost_that_it_takes_later(
     assert set(said(tmp_path / "out")) == {"day-001", "day-002", "day-003"}
     assert sum("No space left" in text for text in said_of) == 1
     assert sum("takes ballots again" in text for text in said_of) == 1
+
+
+def test_a_disk_that_takes_small_files_and_deletes_but_no_ballot_is_not_said_to_take_ballots(tmp_path: Path) -> None:
+    """A real refusal of the system: no file of this process may grow beyond 64 bytes."""
+    said_of = list[str]()
+    (tmp_path / "out").mkdir()
+    box = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, retry_s=0.02)
+    assert box.begin("day") == 1
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
+    try:
+        for n in range(1, 5):
+            box.keep(f"day-{n:03d}", ballot(f"day-{n:03d}", 5))
+            leave(box, n)
+        box.discard("day-004")
+        until(lambda: box.report.failed_writes > 12)
+        assert len(said_of) == 5, said_of
+        assert sum("File too large" in text for text in said_of) == 1
+        assert sum("scans voted" in text for text in said_of) == 4
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    box.close()
+    assert set(said(tmp_path / "out")) == {f"day-{n:03d}" for n in range(1, 5)}
+    assert [text for text in said_of if "again" in text] == [f"{tmp_path}/state/car: the disk takes ballots again"]
 
 
 def test_while_the_server_is_away_ballots_wait_in_the_spool_and_the_scan_loop_does_not(tmp_path: Path) -> None:

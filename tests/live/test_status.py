@@ -15,6 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from rich.console import Console
@@ -138,6 +139,9 @@ def test_systemd_hears_that_the_service_is_ready_and_alive(tmp_path: Path, monke
         systemd.settimeout(5)
         monkeypatch.setenv("NOTIFY_SOCKET", address)
         beat = Heartbeat()
+        beat()
+        assert systemd.recv(100) == b"EXTEND_TIMEOUT_USEC=30000000", "no beat before it is ready: it asks for time"
+        beat.ready()
         assert systemd.recv(100) == b"READY=1"
         beat()
         beat()
@@ -145,6 +149,11 @@ def test_systemd_hears_that_the_service_is_ready_and_alive(tmp_path: Path, monke
         systemd.setblocking(False)
         with pytest.raises(BlockingIOError):  # once a second
             systemd.recv(100)
+        systemd.settimeout(5)
+        beat._next_s = 0.0
+        numba.njit(lambda x: x + 1.0)(3.0)
+        assert systemd.recv(100) == b"WATCHDOG=1", "the loop stands still because a kernel is compiled"
+    beat()  # nobody listens any more
     monkeypatch.delenv("NOTIFY_SOCKET")
     Heartbeat()()
 

@@ -148,11 +148,12 @@ def drive(
         return stopped[-1]
 
     with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
+        warm_vehicle(plan.settings)
+        heartbeat.ready()
         chosen = choose_topics(network, points.split(",") if points else [], odometry, idle or 1e9, ended)
         if chosen is None:
             return
         names = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
-        warm_vehicle(plan.settings)
         print(f"listening to {' and '.join(names)}", flush=True)
         topics, ros = Subscriptions(network, chosen, model), RosStatus(network, vehicle)
         board = StatusBoard(maps, outbox)
@@ -163,6 +164,7 @@ def drive(
             if not watch:
                 board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
             live = run(plan, topics, maps, outbox, ended, [board, ros.poses])
+        heartbeat.stopping()
     print(f"{vehicle}: {_result(live)}")
 
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -60,6 +61,24 @@ def _private_folder() -> str:
 
 choose_kernel_cache()
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_rewrites": True}
+
+
+class _Progress(event.Listener):  # type: ignore[misc]
+    """Hears each step of numba's compiler."""
+
+    def __init__(self, call: Callable[[], object]) -> None:
+        self._call = call
+
+    def on_start(self, event: Any) -> None:
+        self._call()
+
+    def on_end(self, event: Any) -> None:
+        self._call()
+
+
+def call_while_compiling(call: Callable[[], object]) -> None:
+    """Call ``call`` at each step of the compiler from now on: some times a second while a kernel is compiled."""
+    event.register("numba:run_pass", _Progress(call))
 
 
 class _Index(IndexDataCacheFile):  # type: ignore[misc]

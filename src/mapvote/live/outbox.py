@@ -42,6 +42,7 @@ _HELD = 64
 """Closed ballots that are held in memory while the disk takes none: with cuts of 10 minutes half a day."""
 _QUEUED = 256
 """Pieces of work that wait for the disk: tiles of the open ballot are not added to more. It is half an hour of road."""
+_LAST = "the name of the last ballot"
 _NUMBERED = re.compile(r"(.+)-(\d{3,})")
 
 
@@ -145,7 +146,10 @@ class Outbox:
         self._journals: dict[str, Journal] = {}
         self._unwritten: dict[str, bytes] = {}
         """Closed ballots that the disk did not take yet, by drive."""
-        self._trouble = ""
+        self._last = ""
+        """The ballot that was begun last."""
+        self._failing = set[str]()
+        """Kinds of work that the disk refused last."""
         self._broken: BaseException | None = None
         self._to_send, self._ended, self._begun = threading.Event(), threading.Event(), False
         self._writer = threading.Thread(target=self._guarded, args=(self._write,), name="outbox", daemon=True)
@@ -208,7 +212,8 @@ class Outbox:
         return self._state / f"{drive}.{kind}"
 
     def _begin_ballot(self, drive: str) -> None:
-        with self._disk_may_fail(), whole_file(self._state / ".last") as part:
+        self._last = drive
+        with self._disk_may_fail(_LAST), whole_file(self._state / ".last") as part:
             part.write_text(drive)
 
     def _recover(self, drive: str) -> None:
@@ -237,7 +242,7 @@ class Outbox:
             (work or self._put_down_all)()
 
     def _append(self, drive: str, part: Ballot) -> None:
-        with self._disk_may_fail():
+        with self._disk_may_fail(f"the journal {drive}"):
             self._journals.setdefault(drive, Journal(self._path(drive, "journal"))).append(encode(part))
 
     def _close(self, drive: str, written: Callable[[], Ballot], following: str | None) -> None:
@@ -256,16 +261,20 @@ class Outbox:
             oldest = next(iter(self._unwritten))
             del self._unwritten[oldest]
             self.report.lost_ballots += 1
+            self._failing.discard(f"the ballot {oldest}")
             self._say(f"{oldest}: is lost; the disk has taken no ballot for too long")
         self._put_down_all()
 
     def _put_down_all(self) -> None:
         """Write the closed ballots that are not on disk, and pass on those that are."""
+        if _LAST in self._failing:
+            self._begin_ballot(self._last)
         for drive, data in list(self._unwritten.items()):
-            with self._disk_may_fail():
+            with self._disk_may_fail(f"the ballot {drive}"):
                 self._put_down(drive, data)
                 del self._unwritten[drive]
                 self.report.closed += 1
+                self._is_over(f"the journal {drive}")
             if drive not in self._unwritten:
                 self._end_journal(drive)
         self._pass_on()
@@ -275,14 +284,14 @@ class Outbox:
             part.write_bytes(data)
 
     def _end_journal(self, drive: str) -> None:
-        with self._disk_may_fail():
+        with self._disk_may_fail("the end of a journal"):
             self._journals.pop(drive, None)
             self._path(drive, "journal").unlink(missing_ok=True)
 
     def _pass_on(self) -> None:
         """Move whole ballots to the folder and the spool. Each is in a file at every moment; twice is harmless."""
         for whole in sorted(self._state.glob("*.ballot")):
-            with self._disk_may_fail():
+            with self._disk_may_fail(f"the way of {whole.stem}"):
                 data = whole.read_bytes()
                 if self._folder is not None:
                     with whole_file(self._folder / f"{self.vehicle}~{whole.stem}.ballot") as part:
@@ -309,16 +318,21 @@ class Outbox:
             self.report.spooled = self._client.waiting(self.vehicle)
 
     @contextmanager
-    def _disk_may_fail(self) -> Iterator[None]:
-        """Reports once that the disk cannot be written, and once that it can be again."""
+    def _disk_may_fail(self, work: str) -> Iterator[None]:
+        """Reports once that the disk cannot be written, and once that it can be again: when each kind of ``work`` that
+        failed has succeeded. That a small file can be written, or a file be deleted, says nothing of a ballot."""
         try:
             yield
         except (MapvoteError, OSError) as error:
             self.report.failed_writes += 1
-            if not self._trouble:
+            if not self._failing:
                 self._say(f"{error}. The drive goes on. Closed ballots wait in memory; a crash now loses the open one")
-            self._trouble = str(error)
+            self._failing.add(work)
         else:
-            if self._trouble:
-                self._say(f"{self._state}: the disk takes ballots again")
-            self._trouble = ""
+            self._is_over(work)
+
+    def _is_over(self, work: str) -> None:
+        """This kind of work has succeeded, or is not needed any more."""
+        if self._failing == {work}:
+            self._say(f"{self._state}: the disk takes ballots again")
+        self._failing.discard(work)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from mapvote.core.geometry import inverse
+from mapvote.core.kernel import call_while_compiling
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import require
 from mapvote.live.dds import Network, Publication
@@ -30,6 +33,8 @@ _OK, _WARN, _ERROR = 0, 1, 2
 _MINUTE_S, _SILENT_S = 60.0, 2.0
 _RECENT = 600
 """Scans of a minute."""
+_BEAT_S, _EXTENDED_S, _START_S = 1.0, 30.0, 900.0
+"""Between two beats; the time that systemd grants a start from each of them on; how long a start may take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,22 +251,45 @@ def serve_metrics(board: StatusBoard, port: int) -> int:
 
 
 class Heartbeat:
-    """Reports to systemd (sd_notify(3)) that the service is ready, and once a second that its loop is alive. Without
-    systemd it does nothing."""
+    """Reports to systemd (sd_notify(3)) that the service is ready, and that its loop is alive. Without systemd it does
+    nothing.
+
+    Before the service is ready, systemd is asked for more time to start, for a quarter of an hour at most. Later a beat
+    goes out each second, from the loop, and from the compiler if a kernel is compiled on the road: so a first start is
+    not taken for one that hangs, and one that hangs is.
+    """
 
     def __init__(self) -> None:
         self._next_s = 0.0
+        self._address = os.environ.get("NOTIFY_SOCKET", "")
+        self._ready = threading.Event()
+        if self._address:
+            call_while_compiling(self)
+            threading.Thread(target=self._start, name="heartbeat", daemon=True).start()
+
+    def ready(self) -> None:
+        """The service can do its work from now on."""
+        self._ready.set()
         self._notify("READY=1")
+
+    def stopping(self) -> None:
+        """The service was told to stop, and writes what it has."""
+        self._notify("STOPPING=1")
 
     def __call__(self) -> None:
         """Called once a round."""
-        if time.monotonic() >= self._next_s:
-            self._next_s = time.monotonic() + 1.0
+        if self._ready.is_set() and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _BEAT_S
             self._notify("WATCHDOG=1")
 
+    def _start(self) -> None:
+        end = time.monotonic() + _START_S
+        while not self._ready.wait(_BEAT_S) and time.monotonic() < end:
+            self._notify(f"EXTEND_TIMEOUT_USEC={int(1e6 * _EXTENDED_S)}")
+
     def _notify(self, text: str) -> None:
-        address = os.environ.get("NOTIFY_SOCKET")
-        if address:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
-                out.connect("\0" + address[1:] if address.startswith("@") else address)
-                out.sendall(text.encode())
+        if not self._address:
+            return
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:  # no drive ends by it
+            out.connect("\0" + self._address[1:] if self._address.startswith("@") else self._address)
+            out.sendall(text.encode())
