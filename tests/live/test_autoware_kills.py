@@ -50,11 +50,11 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def new_version(store: Store) -> None:
     """Publish that the walls are gone, or roll that back."""
-    if store.newest().version % 2 == 1:
-        vote_gone(store, drive=f"d{store.newest().version}")
-        assert publish(store).published
+    if store.current() % 2 == 1:
+        vote_gone(store, drive=f"d{store.current()}")
+        assert publish(store, override=True).published
     else:
-        rollback(store, store.newest().version - 1)
+        rollback(store, store.current() - 1)
 
 
 def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_before_is_served(
@@ -80,8 +80,8 @@ def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_befor
             new_version(store)  # a rollback
             until(lambda: client.ask(3.0, 3.0, 150.0, 20.0) and client.held == first)
     with loader(AWAY, tmp_path / "map", domain) as process:
-        until(lambda: client.sees_a_service)
-        assert client.ask(3.0, 3.0, 150.0, 20.0)
+        # Until DDS notices that the killed service is gone, a request may still go to it.
+        until(lambda: client.ask(3.0, 3.0, 150.0, 2.0))
         assert client.held == first
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 0
@@ -121,6 +121,7 @@ def test_of_50_starts_and_kills_none_empties_a_client(tmp_path: Path, store: Sto
     assert answered > 20, "the kills were to meet services that answer"
 
 
+@pytest.mark.slow
 def test_a_service_that_is_stopped_answers_what_had_arrived(tmp_path: Path, store: Store, domain: int) -> None:
     """Stopped at any moment: each request that found a service gets its answer."""
     from live.foreign_client import ForeignClient
@@ -129,7 +130,7 @@ def test_a_service_that_is_stopped_answers_what_had_arrived(tmp_path: Path, stor
     with serving(tmp_path / "fleet.db", log=tmp_path / "serve.log") as (url, _):
         for k in range(4):
             with loader(url, tmp_path / "map", domain) as process:
-                until(lambda: client.sees_a_service)
+                until(lambda: client.ask(3.0, 3.0, 150.0, 1.0))
                 stopper = threading.Timer(0.15 + 0.05 * k, process.send_signal, (signal.SIGTERM,))
                 stopper.start()
                 while process.poll() is None and client.sees_a_service:

@@ -48,6 +48,18 @@ def test_only_types_of_ros_2_have_a_ros_2_name() -> None:
     assert ros_type("HelloWorld") is None
 
 
+def test_what_no_reader_acknowledges_in_time_is_not_delivered(domain: int) -> None:
+    sender, receiver = Network(domain), Network(domain)
+    out = sender.publish("/points", CLOUD)
+    incoming = receiver.subscribe("/points", CLOUD, reliable=True, depth=1)
+    until(lambda: out.readers and incoming.writers)
+    out.send(cloud())
+    assert not out.delivered(0.0)
+    assert out.delivered(30.0)
+    incoming.close()
+    until(lambda: not out.readers)
+
+
 def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(domain: int) -> None:
     sender, receiver = Network(domain), Network(domain)
     out = sender.publish("/points", CLOUD)

@@ -226,9 +226,7 @@ class Subscription:
 
     def close(self) -> None:
         """Read no more: writers lose this reader at once."""
-        entity = self._library.dds_delete(self._reader._ref)
-        if entity < 0:
-            raise MapvoteError(f"{self._topic}: DDS cannot close its reader (error {entity})")
+        self._library.dds_delete(self._reader._ref)
 
     @property
     def writers(self) -> int:
@@ -256,7 +254,8 @@ class Publication:
 
     def delivered(self, seconds: float) -> bool:
         """Wait so long at most until every reliable reader has everything; returns whether it has."""
-        return bool(self._writer.wait_for_acks(int(seconds * 1e9)))
+        # The package's own wait_for_acks ends in an AttributeError if the time is over.
+        return bool(self._writer._wait_for_acks(self._writer._ref, int(seconds * 1e9)) == 0)
 
 
 def ros_type(type_name: str) -> str | None:
