@@ -4,86 +4,60 @@ It obeys as Autoware's NDT does: it takes each tile that comes and drops each id
 """
 
 import time
-from dataclasses import dataclass
+from typing import Any
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct, types
+from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
-    sec: types.int32
-    nanosec: types.uint32
+def _struct(package: str, name: str, /, **members: Any) -> Any:
+    """A message type as an IDL compiler would make it."""
+    return make_idl_struct(name, f"{package}.dds_.{name}_", members)
 
 
-@dataclass
-class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    stamp: Time
-    frame_id: str
+_U8 = types.sequence[types.uint8]
+Time = _struct("builtin_interfaces.msg", "Time", sec=types.int32, nanosec=types.uint32)
+Header = _struct("std_msgs.msg", "Header", stamp=Time, frame_id=str)
+PointField = _struct(
+    "sensor_msgs.msg", "PointField", name=str, offset=types.uint32, datatype=types.uint8, count=types.uint32
+)
+PointCloud2 = _struct(
+    "sensor_msgs.msg",
+    "PointCloud2",
+    header=Header,
+    height=types.uint32,
+    width=types.uint32,
+    fields=types.sequence[PointField],
+    is_bigendian=bool,
+    point_step=types.uint32,
+    row_step=types.uint32,
+    data=_U8,
+    is_dense=bool,
+)
+_CORNERS = dict.fromkeys(("min_x", "min_y", "max_x", "max_y"), types.float32)
+Square = _struct("autoware_map_msgs.msg", "PointCloudMapCellMetaData", **_CORNERS)
+MapTile = _struct(
+    "autoware_map_msgs.msg", "PointCloudMapCellWithID", cell_id=str, pointcloud=PointCloud2, metadata=Square
+)
+Area = _struct("autoware_map_msgs.msg", "AreaInfo", **dict.fromkeys(("center_x", "center_y", "radius"), types.float32))
+_NUMBERS = {"guid": types.uint64, "seq": types.int64}
+_SERVICE = "GetDifferentialPointCloudMap"
+Request = _struct("autoware_map_msgs.srv", f"{_SERVICE}_Request", **_NUMBERS, area=Area, cached_ids=types.sequence[str])
+Reply = _struct(
+    "autoware_map_msgs.srv",
+    f"{_SERVICE}_Response",
+    **_NUMBERS,
+    header=Header,
+    new_pointcloud_with_ids=types.sequence[MapTile],
+    ids_to_remove=types.sequence[str],
+)
 
 
-@dataclass
-class PointField(IdlStruct, typename="sensor_msgs.msg.dds_.PointField_"):
-    name: str
-    offset: types.uint32
-    datatype: types.uint8
-    count: types.uint32
-
-
-@dataclass
-class PointCloud2(IdlStruct, typename="sensor_msgs.msg.dds_.PointCloud2_"):
-    header: Header
-    height: types.uint32
-    width: types.uint32
-    fields: types.sequence[PointField]
-    is_bigendian: bool
-    point_step: types.uint32
-    row_step: types.uint32
-    data: types.sequence[types.uint8]
-    is_dense: bool
-
-
-@dataclass
-class Square(IdlStruct, typename="autoware_map_msgs.msg.dds_.PointCloudMapCellMetaData_"):
-    min_x: types.float32
-    min_y: types.float32
-    max_x: types.float32
-    max_y: types.float32
-
-
-@dataclass
-class MapTile(IdlStruct, typename="autoware_map_msgs.msg.dds_.PointCloudMapCellWithID_"):
-    cell_id: str
-    pointcloud: PointCloud2
-    metadata: Square
-
-
-@dataclass
-class Area(IdlStruct, typename="autoware_map_msgs.msg.dds_.AreaInfo_"):
-    center_x: types.float32
-    center_y: types.float32
-    radius: types.float32
-
-
-@dataclass
-class Request(IdlStruct, typename="autoware_map_msgs.srv.dds_.GetDifferentialPointCloudMap_Request_"):
-    guid: types.uint64
-    seq: types.int64
-    area: Area
-    cached_ids: types.sequence[str]
-
-
-@dataclass
-class Reply(IdlStruct, typename="autoware_map_msgs.srv.dds_.GetDifferentialPointCloudMap_Response_"):
-    guid: types.uint64
-    seq: types.int64
-    header: Header
-    new_pointcloud_with_ids: types.sequence[MapTile]
-    ids_to_remove: types.sequence[str]
+_GUID = 0xABCD_0123_4567
 
 
 class ForeignClient:
@@ -109,11 +83,13 @@ class ForeignClient:
     def ask(self, x: float, y: float, radius_m: float, patience_s: float) -> bool:
         """Ask for the tiles around a place and obey the answer; returns whether one came in time."""
         self._number += 1
-        self._writer.write(Request(0xABCD_0123_4567, self._number, Area(x, y, radius_m), sorted(self.held)))
+        area = Area(center_x=x, center_y=y, radius=radius_m)
+        request = Request(guid=_GUID, seq=self._number, area=area, cached_ids=sorted(self.held))
+        self._writer.write(request)
         end = time.monotonic() + patience_s
         while time.monotonic() < end:
             for reply in self._reader.take(10):
-                if not reply.sample_info.valid_data or (reply.guid, reply.seq) != (0xABCD_0123_4567, self._number):
+                if not reply.sample_info.valid_data or (reply.guid, reply.seq) != (_GUID, self._number):
                     continue
                 self.held -= set(reply.ids_to_remove)
                 self.held |= {tile.cell_id for tile in reply.new_pointcloud_with_ids if tile.pointcloud.width}

@@ -68,17 +68,16 @@ def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_befor
         assert not client.sees_a_service
         assert not client.ask(3.0, 3.0, 150.0, 0.5)
     assert client.held == set(OLD)
-    with serving(tmp_path / "fleet.db", log=tmp_path / "serve.log") as (url, _):
-        with loader(url, tmp_path / "map", domain):
-            until(lambda: client.sees_a_service)
-            assert client.ask(3.0, 3.0, 150.0, 20.0)
-            first = set(client.held)
-            assert first
-            assert not first & set(OLD)
-            new_version(store)
-            until(lambda: client.ask(3.0, 3.0, 150.0, 20.0) and client.held != first)
-            new_version(store)  # a rollback
-            until(lambda: client.ask(3.0, 3.0, 150.0, 20.0) and client.held == first)
+    server = serving(tmp_path / "fleet.db", log=tmp_path / "serve.log")
+    with server as (url, _), loader(url, tmp_path / "map", domain):
+        until(lambda: client.ask(3.0, 3.0, 150.0, 2.0))
+        first = set(client.held)
+        assert first
+        assert not first & set(OLD)
+        new_version(store)
+        until(lambda: client.ask(3.0, 3.0, 150.0, 20.0) and client.held != first)
+        new_version(store)  # a rollback
+        until(lambda: client.ask(3.0, 3.0, 150.0, 20.0) and client.held == first)
     with loader(AWAY, tmp_path / "map", domain) as process:
         # Until DDS notices that the killed service is gone, a request may still go to it.
         until(lambda: client.ask(3.0, 3.0, 150.0, 2.0))

@@ -60,7 +60,9 @@ def test_each_range_of_discovery_is_what_rmw_cyclonedds_makes_of_it() -> None:
 
 def test_middleware_that_is_not_read_is_said(caplog: pytest.LogCaptureFixture) -> None:
     ros_environment(variables={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ROS_DISCOVERY_SERVER": "10.0.0.1:11811"})
-    assert [record.args and record.args[0] for record in caplog.records] == ["10.0.0.1:11811", "rmw_zenoh_cpp"]
+    first, second = caplog.messages
+    assert "10.0.0.1:11811" in first
+    assert "rmw_zenoh_cpp" in second
     assert all(record.levelno == logging.WARNING for record in caplog.records)
 
 

@@ -1,4 +1,4 @@
-"""A map loader that follows a server: one thread keeps the folder at the newest version, the caller answers requests."""
+"""A map loader that follows a server: a thread keeps the folder at the newest version, the caller answers requests."""
 
 from __future__ import annotations
 

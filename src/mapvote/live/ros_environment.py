@@ -71,8 +71,9 @@ def _check_cyclone_uri(text: str) -> None:
     if "<" in text:
         return
     for uri in filter(None, map(str.strip, text.split(","))):
-        if not Path(uri.removeprefix("file://")).is_file():
-            raise MapvoteError(f"CYCLONEDDS_URI={text}: there is no file {uri.removeprefix('file://')}; mend or unset it")
+        name = uri.removeprefix("file://")
+        if not Path(name).is_file():
+            raise MapvoteError(f"CYCLONEDDS_URI={text}: there is no file {name}; mend or unset it")
 
 
 def _discovery(variables: Mapping[str, str]) -> str:
