@@ -17,9 +17,9 @@ import pytest
 from hand_made import two_walls
 from live.loopback_dds import until
 from live_server import mapvote, serving
-from mapvote.server.store.publish import publish
-from mapvote.server.store.rollback import rollback
-from mapvote.server.store.store import Store
+from mapvote_server.store.publish import publish
+from mapvote_server.store.rollback import rollback
+from mapvote_server.store.store import Store
 from stores import vote_gone
 
 pytest.importorskip("cyclonedds")
