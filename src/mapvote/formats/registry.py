@@ -75,7 +75,7 @@ MAPS: dict[str, MapFormat] = {
     "Autoware tile folder": MapFormat(autoware.is_autoware, autoware.stream_autoware),
     "Autoware default folder": MapFormat(autoware.is_autoware_default, autoware.stream_autoware_default),
     "PCD file": MapFormat(_file(".pcd"), pcd.stream_pcd),
-    "folder of PCD tiles X_Y.pcd": MapFormat(pcd.is_pcd_tiles, pcd.stream_pcd_tiles),
+    "folder of PCD tiles": MapFormat(pcd.is_pcd_tiles, pcd.stream_pcd_tiles),
     "LAS or LAZ file": MapFormat(_file(".las", ".laz"), las.stream_las),
     "PLY file": MapFormat(_file(".ply"), ply_e57.stream_ply),
     "E57 file": MapFormat(_file(".e57"), ply_e57.stream_e57),

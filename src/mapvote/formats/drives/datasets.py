@@ -33,14 +33,13 @@ from mapvote.formats.drives.scan_folder import (
     read_bytes,
     read_times_ns,
     scan_files,
-    stamp_in_name_ns,
 )
+from mapvote.formats.drives.scan_names import numbers_of, stamp_in_name_ns
 from mapvote.formats.drives.trajectory import (
     Trajectory,
     exact_ns,
     motions_of_rpy,
     needed,
-    number_of,
     of_scans,
     read_calib,
     read_columns,
@@ -119,7 +118,7 @@ def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajector
     if "image_00" not in calib or calib["image_00"].size != 12 or velo.size != 12:
         raise MapvoteError(f"{folder}: calib_cam_to_pose.txt (image_00) and calib_cam_to_velo.txt need 12 numbers each")
     T_imu_camera, T_lidar_camera = rigid_motions(np.stack([calib["image_00"], velo]), str(folder))
-    numbers = np.array([number_of(f) for f in files])
+    numbers = numbers_of(files)
     first = np.searchsorted(numbers, rows[:, 0])
     known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
     if not known.any():

@@ -10,7 +10,6 @@ store the points in the map frame then: they are taken back into the sensor's fr
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -29,23 +28,24 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive
 from mapvote.formats.drives.point_fields import BadPoints, log, scan_from_fields
-from mapvote.formats.drives.trajectory import Trajectory, check_rigid, number_of, of_scans, prior_of
+from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
+from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans, prior_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import Cloud, joined, table_of, xyz
 from mapvote.formats.maps.las import stream_las
-from mapvote.formats.maps.pcd import read_pcd_table, read_viewpoint
+from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
 from mapvote.formats.maps.ply_e57 import stream_ply
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
-    """The files ``folder``/*``suffix`` in the order of the last number in their names; MapvoteError if none."""
+    """The files ``folder``/*``suffix`` in the natural order of their names; MapvoteError if none."""
     files = [f for f in folder.glob(f"*{suffix}") if not f.name.startswith(".")]
     if not files:
         raise MapvoteError(f"{folder}: no scans (*{suffix}) here; a drive needs at least one")
-    return sorted(files, key=lambda f: (number_of(f), f.name))
+    return in_natural_order(files)
 
 
 def read_times_ns(file: Path) -> I64:
@@ -70,31 +70,19 @@ def read_times_ns(file: Path) -> I64:
 
 
 def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
-    """(n,) stamps: from times.txt, else evenly at the rate given, else from names like 1317042145.964.pcd.
+    """(n,) stamps: from times.txt, else evenly at the rate given, else from names such as 1317042145.964.pcd.
 
     MapvoteError if there is none of them.
     """
     table = folder / "times.txt"
     if table.is_file():
         return options.start_ns + of_scans(read_times_ns(table), files, table)
-    if options.rate_hz is None and all(number_of(f) > 1e8 for f in files):
-        return np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
+    stamps_ns = None if options.rate_hz is not None else stamps_of_names_ns(files)
+    if stamps_ns is not None:
+        return stamps_ns
     if options.rate_hz is None:
         raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
     return options.start_ns + np.round(np.arange(len(files)) * (1e9 / options.rate_hz)).astype(np.int64)
-
-
-def stamp_in_name_ns(file: Path) -> int:
-    """A file named by its time since 1970: seconds, or a whole number of milli-, micro- or nanoseconds.
-
-    MapvoteError if there is no number in its name.
-    """
-    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    if not numbers:
-        raise MapvoteError(f"{file}: its name holds no time; a scan is named by its stamp")
-    number = Decimal(numbers[-1])
-    power = next(p for p in (0, 3, 6, 9) if number < Decimal(10) ** (10 + p) or p == 9)
-    return int(number * 10 ** (9 - power))
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,8 +263,8 @@ def _read_npy(file: Path, columns: str | None) -> NDArray[np.void]:
 
 
 def pcd_scans(path: Path) -> Path | None:
-    """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive."""
-    if not path.is_dir() or is_autoware(path):
+    """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive, but a map."""
+    if not path.is_dir() or is_autoware(path) or is_pcd_tiles(path):
         return None
     return next((folder for folder in (path / "pcd", path) if any(folder.glob("*.pcd"))), None)
 

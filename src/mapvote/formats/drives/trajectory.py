@@ -6,7 +6,6 @@ the others each line belongs to a scan. So a drive gets its prior.
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
+from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
@@ -329,12 +329,6 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def number_of(file: Path) -> float:
-    """The last number in a file's name, e.g. 12 of 000012.bin or 1316.5 of cloud_1316.5.pcd; -1 without one."""
-    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return float(numbers[-1]) if numbers else -1.0
-
-
 def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any]:
     """Of the lines (m, ..) of ``table`` one for each scan: in order, or by the number in the scan's name.
 
@@ -343,9 +337,9 @@ def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any
     n = len(lines)
     if n == len(files):
         return lines
-    numbers = np.array([number_of(f) for f in files])
-    if n > len(files) and len(set(numbers)) == len(files) and numbers.min() >= 0 and numbers.max() < n:
-        return lines[numbers.astype(np.int64)]
+    numbers = numbers_of(files)
+    if n > len(files) and len(set(numbers.tolist())) == len(files) and numbers.min() >= 0 and numbers.max() < n:
+        return lines[numbers]
     raise MapvoteError(
         f"{table}: {n} lines for {len(files)} scans ({files[0].name} to {files[-1].name}); it must have one line "
         f"a scan, in order"

@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from collections.abc import Iterator
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,14 +26,50 @@ _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
 _MOST_EXPANDED = 300
 """LZF writes at most 264 bytes for each 3."""
-_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}\.pcd")
+_GRID_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}")
+"""X_Y: nobody names scans so."""
+_PLACE_TILE = re.compile(r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?", re.IGNORECASE)
+"""By metres of UTM or Gauss-Krueger (412340_5423980), or with a word before them (map_0_0): scans may be named so, too,
+which their points tell."""
+_COMPARED, _COMPARED_POINTS = 6, 20_000
+"""Tiles whose boxes are compared with the next one's, and the points of each that are read."""
+_MOST_COMMON = 0.2
+"""Share of the smaller box of two tiles in turn that may lie in the other one's. Scans of a drive share most."""
 
 
 def is_pcd_tiles(path: Path) -> bool:
-    """A folder whose PCD files are all called X_Y.pcd, in whatever tiling; with stamps or poses it is a drive."""
-    names = [file.name for file in path.glob("*.pcd")] if path.is_dir() else []
+    """A folder whose PCD files are tiles of a map, in whatever tiling; with stamps or poses it is a drive.
+
+    X_Y.pcd are tiles by their names; with coordinates of six or seven digits, or with a word before them, they are if
+    their points lie side by side.
+    """
+    names = [file.stem for file in path.glob("*.pcd")] if path.is_dir() else []
     recorded = any((path / name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
-    return bool(names) and not recorded and all(_TILE.fullmatch(name) for name in names)
+    if not names or recorded:
+        return False
+    if all(_GRID_TILE.fullmatch(name) for name in names):
+        return True
+    return all(_PLACE_TILE.fullmatch(name) for name in names) and _lie_side_by_side(sorted(path.glob("*.pcd")))
+
+
+def _lie_side_by_side(files: list[Path]) -> bool:
+    """Whether the first points of files in turn lie in boxes that hardly overlap, seen from above. False if the files
+    cannot be read: a reader says why."""
+    boxes = []
+    for file in files[: _COMPARED + 1]:
+        try:
+            points = next(stream_pcd(file)).points[:_COMPARED_POINTS, :2]
+        except (MapvoteError, StopIteration):
+            return False
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points):
+            boxes.append((points.min(axis=0), points.max(axis=0)))
+    common = []
+    for (low_a, high_a), (low_b, high_b) in pairwise(boxes):
+        both = np.maximum(np.minimum(high_a, high_b) - np.maximum(low_a, low_b), 0.0).prod()
+        smaller = min((high_a - low_a).prod(), (high_b - low_b).prod())
+        common.append(float(both / max(smaller, 1e-9)))
+    return bool(common) and float(np.median(common)) < _MOST_COMMON
 
 
 def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
