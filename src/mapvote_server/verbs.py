@@ -272,7 +272,11 @@ def explain(
         answer = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
     print(f"cell {answer['row']}, {answer['col']}: {answer['thing'] or 'empty'}")
     for decision in answer["decisions"]:
-        print(f"version {decision['version']} decided {decision['state']}")
+        edit, trimmed = decision.get("edit"), ""
+        if edit is not None:
+            went = "deleted" if edit["state"] == "changed_empty" else "added"
+            trimmed = f"; points {went} by {edit['votes']} of {edit['votes'] + edit['against']} vehicles"
+        print(f"version {decision['version']} decided {decision['state']}{trimmed}")
     if answer.get("probability") is not None:
         print(f"probability that the last decision is right: {answer['probability']:.2f}")
     for v in answer["votes"]:
@@ -281,7 +285,10 @@ def explain(
         counted = ", ".join(str(number) for number in v["counted_in"])
         before = f"counted in version {counted}" if counted else "counted in no version"
         now = "counts now" if v["counts"] else f"does not count now: {v['why']}"
-        print(f"{v['vehicle']}: {v['state']}{sure}. Drive {v['drive']} ended {ended}, with version {v['version']}")
+        gone = f", {v['marks']} of its voxels gone" if v["marks"] and v["state"] == "unchanged_occupied" else ""
+        print(
+            f"{v['vehicle']}: {v['state']}{gone}{sure}. Drive {v['drive']} ended {ended}, with version {v['version']}"
+        )
         print(f"    {before}; {now}")
 
 

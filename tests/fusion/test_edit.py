@@ -112,7 +112,7 @@ def says(masks: Sequence[int], states: Sequence[int], cell: Cell = CELL) -> list
 
 def gone(tile: Tile, votes: list[TileVote], decided: int = UO, cell: Cell = CELL) -> int:
     """The voxels of a cell that go, of those that the tile has points in."""
-    words = words_gone(votes, states_plane({cell: decided}), 2, tile)
+    words, _ = words_gone(votes, states_plane({cell: decided}), 2, tile)
     return 0 if words is None else int(words[cell] & tile.obstacle_words[cell])
 
 
@@ -163,7 +163,7 @@ def test_a_voxel_that_stays_protects_what_touches_it_in_the_next_cell(
         TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(masks if i else {})))
         for i in range(3)
     ]
-    words = words_gone(votes, states_plane(states), 2, tile)
+    words, _ = words_gone(votes, states_plane(states), 2, tile)
     assert words is not None
     assert words[CELL] == (0 if stays else 0b1010)
 
@@ -177,7 +177,7 @@ def test_without_ground_any_mark_empties_the_column_so_that_nothing_of_it_protec
         TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(marks if i else {})))
         for i in range(3)
     ]
-    words = words_gone(votes, states_plane(states), 2, bare)
+    words, _ = words_gone(votes, states_plane(states), 2, bare)
     assert words is not None
     assert words[CELL] & bare.obstacle_words[CELL]
 

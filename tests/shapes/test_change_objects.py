@@ -14,7 +14,8 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.decision_record import Record, pack_tally
+from mapvote.fusion.decision_record import Record, pack_edit_votes, pack_tally
+from mapvote.fusion.edit import EditVotes
 from mapvote.shapes.change_objects import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.shapes.geojson import to_geojson
 
@@ -126,6 +127,21 @@ def test_votes_and_stamps_come_from_the_drives_that_said_so() -> None:
     assert (still.id, still.votes_min, still.versions) == (built.id, 2, [7])
 
 
+def test_a_cell_edited_though_the_version_states_no_change_has_the_votes_of_the_edit() -> None:
+    """Points that noise carried over: the version calls the cell empty, and the points come with the wall."""
+    before, after = street(), street(cell_points(0, 0, 2, 1, (2.0,)))
+    states = np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8)
+    states[0, 0] = CellState.CHANGED_OCCUPIED
+    states[0, 1] = CellState.UNCHANGED_EMPTY
+    tally = np.zeros((TILE_CELLS, TILE_CELLS, 5), dtype=np.int32)
+    tally[0, 0, CellState.CHANGED_OCCUPIED] = 3 * VOTE_UNIT
+    came, one, two = np.array([CellState.CHANGED_OCCUPIED], np.uint8), np.array([1], np.int32), np.array([2], np.int32)
+    edits = EditVotes(np.array([1]), came, two, one)
+    record = Record(7, pack_plane(states), pack_tally(tally), None, b"", pack_edit_votes(edits))
+    (built,) = compare(before, after, {(0, 0): [(record, [])]})
+    assert (built.votes_min, built.votes_median, built.against_median, built.trimmed) == (2, 2.5, 0.5, 0)
+
+
 def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> None:
     before = street()
     after = street(cell_points(0, 0, 3, 3, (2.0,)), cell_points(3, 3, 1, 1, (2.0,)))
@@ -164,6 +180,7 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
         "last_seen": None,
         "versions": [],
         "box": [[0.3, -0.6], [1.5, 0.6]],
+        "trimmed": 0,
         "near": [],
     }
 

@@ -206,8 +206,13 @@ def counted(cells: NDArray[np.intp], marked: Sequence[Words]) -> I32:
     """(n, 64) how many of ``marked`` set each bit of the flat ``cells`` (n,), few, ascending, all they name."""
     counts = np.zeros((len(cells), 64), dtype=np.int32)
     for mine in marked:
-        counts[np.searchsorted(cells, mine.cells)] += ((mine.words[:, None] >> _BITS) & np.uint64(1)).astype(np.int32)
+        counts[np.searchsorted(cells, mine.cells)] += bits_of(mine.words)
     return counts
+
+
+def bits_of(words: U64) -> Bool:
+    """(n, 64) bits of words (n,); the inverse of :func:`words_of`."""
+    return np.asarray((words[:, None] >> _BITS) & np.uint64(1)).astype(np.bool_)
 
 
 def words_of(bits: Bool) -> U64:

@@ -19,6 +19,7 @@ from mapvote.codec.planes import compress, raw_plane, unpack_bytes, unpack_plane
 from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.loss_budget import unpack_agreed
 
 _BYTE_MAX = 255
@@ -98,6 +99,7 @@ class Record:
     packed_tally: bytes
     packed_odds: bytes | None
     packed_standings: bytes
+    packed_edits: bytes | None = None
 
     @cached_property
     def states(self) -> U8:
@@ -113,6 +115,11 @@ class Record:
     def odds(self) -> Odds:
         """Log-odds of the changed cells by the vehicles that voted for them."""
         return unpack_agreed(self.packed_odds, self.states)
+
+    @cached_property
+    def edit_votes(self) -> EditVotes:
+        """Votes behind what came and went in cells of which the states state no such change."""
+        return EditVotes.none() if self.packed_edits is None else unpack_edit_votes(self.packed_edits)
 
     @cached_property
     def standings(self) -> Sequence[Standing]:
@@ -137,3 +144,27 @@ def unpack_tally_plane(data: bytes) -> I32:
     dtype, unit = {N_STATES * CELLS: ("|u1", VOTE_UNIT), 2 * N_STATES * CELLS: ("<u2", 1)}.get(len(raw), ("<i4", 1))
     planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
     return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32) * unit
+
+
+_EDIT_FIELDS = ("cells", "<u2"), ("states", "|u1"), ("votes", "<u2"), ("against", "<u2")
+
+
+def pack_edit_votes(edits: EditVotes) -> bytes | None:
+    """Edit votes as a zstd frame, field by field; None if there are none."""
+    if not len(edits.cells):
+        return None
+    return compress(b"".join(getattr(edits, name).astype(dtype).tobytes() for name, dtype in _EDIT_FIELDS), 1)
+
+
+def unpack_edit_votes(data: bytes) -> EditVotes:
+    """The inverse of :func:`pack_edit_votes`; MapvoteError if it is damaged."""
+    sizes = [np.dtype(dtype).itemsize for _, dtype in _EDIT_FIELDS]
+    raw = unpack_bytes(data, sum(sizes) * CELLS, "decision: edits")
+    n, left = divmod(len(raw), sum(sizes))
+    if left:
+        raise MapvoteError(f"decision: edits are damaged ({len(raw)} bytes)")
+    starts = np.cumsum([0, *sizes[:-1]]) * n
+    cells, states, votes, against = (
+        np.frombuffer(raw, dtype, n, int(start)) for (_, dtype), start in zip(_EDIT_FIELDS, starts, strict=True)
+    )
+    return EditVotes(cells.astype(np.int64), states, votes.astype(np.int32), against.astype(np.int32))

@@ -9,17 +9,46 @@ among them who have the whole cell empty.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.planes import Words, counted, nothing_reached, words_of
+from mapvote.codec.planes import Words, bits_of, counted, nothing_reached, words_of
 from mapvote.core.columns import EVERY_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
+
+
+@dataclass(frozen=True, slots=True)
+class EditVotes:
+    """The votes behind points that come or go in cells of which the decision states no such change: voxels that are
+    trimmed from a cell that stands, and points that noise carried into the next cell."""
+
+    cells: I64
+    """(n,) flat cells, ascending."""
+    states: U8
+    """(n,) CHANGED_EMPTY where points go, CHANGED_OCCUPIED where they come."""
+    votes: I32
+    """(n,) vehicles that voted for it: the fewest for any voxel that went."""
+    against: I32
+    """(n,) vehicles that determined the cell and did not."""
+
+    @classmethod
+    def none(cls) -> EditVotes:
+        """Every edit follows the states."""
+        cells, votes = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
+        return cls(cells, np.empty(0, dtype=np.uint8), votes, votes)
+
+    def and_of(self, other: EditVotes) -> EditVotes:
+        """These and the ``other`` ones, of other cells."""
+        cells = np.concatenate([self.cells, other.cells])
+        order = np.argsort(cells)
+        rest = [np.concatenate([getattr(self, n), getattr(other, n)])[order] for n in ("states", "votes", "against")]
+        return EditVotes(cells[order], *rest)
 
 
 def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
@@ -129,8 +158,9 @@ def _before(points: F32, intensity: U8, one: int, other: int) -> bool:
     return intensity[one] < intensity[other]
 
 
-def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> U64 | None:
-    """(256, 256) delete mask of ``tile``, None if there is nothing to delete; ``states`` (256, 256) as decided.
+def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> tuple[U64 | None, EditVotes]:
+    """((256, 256) delete mask of ``tile``, None if there is nothing to delete; the votes for what is trimmed from cells
+    that stand); ``states`` (256, 256) as decided.
 
     In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied
     see :func:`_remnants`.
@@ -149,12 +179,23 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
     # A mask in one stage only names what would be deleted.
     emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
     if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
-        return gone
+        return gone, EditVotes.none()
     gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
     stays = tile.obstacle_words & ~_deleted(gone, tile)
-    remnants = _remnants(left, emptied_by, votes, stays, quorum, tile.base)
+    remnants, marks, determined = _remnants(left, emptied_by, votes, stays, quorum, tile.base)
     gone.reshape(-1)[remnants.cells] |= remnants.words
-    return gone
+    return gone, _trimmed(remnants, marks, determined, tile)
+
+
+def _trimmed(remnants: Words, marks: I32, determined: I64, tile: Tile) -> EditVotes:
+    """The votes for the ``remnants`` that hold points: ``marks`` (n, 64) vehicles by voxel, ``determined`` (n,)."""
+    held = remnants.words & tile.obstacle_words.reshape(-1)[remnants.cells]
+    # A column without known ground goes by any mark.
+    voxels = bits_of(held if tile.has_ground else np.where(held == 0, held, remnants.words))
+    some = np.flatnonzero(voxels.any(axis=1))
+    votes = np.where(voxels, marks, np.iinfo(np.int32).max).min(axis=1)[some].astype(np.int32)
+    against = (determined[some] - votes).astype(np.int32)
+    return EditVotes(remnants.cells[some], np.full(len(some), CellState.CHANGED_EMPTY, np.uint8), votes, against)
 
 
 def _deleted(gone: U64, tile: Tile) -> U64:
@@ -169,8 +210,9 @@ def _remnants(
     stays: U64,
     quorum: int,
     base: I32,
-) -> Words:
-    """The voxels that leave cells that stand.
+) -> tuple[Words, I32, I64]:
+    """(the voxels that leave cells that stand; (n, 64) vehicles that call each voxel left, or gone with the cell; (n,)
+    vehicles that determined each cell).
 
     A voxel that ``quorum`` vehicles, and more than half of those that determined the cell, call ``left`` of something
     goes if it touches (26) nothing that ``stays``. A voxel that more than two thirds, two at least, call left or gone
@@ -180,12 +222,12 @@ def _remnants(
     cells = np.unique(np.concatenate([found.cells for found in (*left, *emptied_by)]))
     halves = counted(cells, left)
     marks = halves + counted(cells, emptied_by)
-    determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
-    most = words_of((halves >= quorum) & (2 * halves > determined))
-    nearly_all = words_of((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))
+    determined = np.asarray(np.sum([vote.determined(cells) for vote in votes], axis=0, dtype=np.int64))
+    most = words_of((halves >= quorum) & (2 * halves > determined[:, None]))
+    nearly_all = words_of((marks >= max(quorum, 2)) & (3 * marks > 2 * determined[:, None]))
     stays = stays.copy()
     stays.reshape(-1)[cells] &= ~(most | nearly_all)
-    return Words(cells, nearly_all | (most & ~_touched(cells, stays, base)))
+    return Words(cells, nearly_all | (most & ~_touched(cells, stays, base))), marks, determined
 
 
 def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:

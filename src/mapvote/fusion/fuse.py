@@ -24,11 +24,11 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, with_changed
 from mapvote.core.tile import Memory, Tile
-from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, remembered, temporary
 from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, originals, without
-from mapvote.fusion.edit import add_points, delete_points, words_gone
+from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
 from mapvote.fusion.tile_vote import TileVote, newest_votes, offered, one_each, silenced
@@ -67,6 +67,8 @@ class Decision:
     """The agreed confidence of the voters for each changed cell, see :func:`agreed_odds`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
+    edit_votes: EditVotes = field(default_factory=EditVotes.none)
+    """Votes behind what comes and goes in cells of which ``states`` state no such change; none before the edit."""
     added: int = 0
     """Points added to the tile."""
     deleted: int = 0
@@ -125,14 +127,15 @@ def fuse_tile(
     it. The rest as in :func:`decide_tile`.
     """
     decided = decide_tile(tile, drives, rule, settings, history)
-    edited, added, deleted = _edit(tile, decided.votes, decided.edits, decided.quorum)
+    gone, edit_votes = deletions(tile, decided)
+    edited, added, deleted = _edit(tile, decided.votes, decided.edits, decided.quorum, gone)
     if edited is not tile:
         changed = np.flatnonzero(differing(tile, edited))
         memory = (tile.memory or Memory.none()).with_changed(changed, version)
         runs = None if decided.past is None else (decided.past, settings.min_votes)
         edited = edited.but(memory=remembered(memory, tile, edited, decided.votes, decided.edits, runs))
     decided = replace(decided, votes=(), denied=None, passing=None, past=None, added=added, deleted=deleted)
-    return decided, edited
+    return replace(decided, edit_votes=edit_votes), edited
 
 
 def decide_tile(
@@ -180,10 +183,22 @@ def _originals_of(
     return without(copies, votes) if same else originals(votes, settings)[0]
 
 
-def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:
-    """(the tile as decided, points added, points deleted)."""
+def deletions(tile: Tile, decided: Decision) -> tuple[U64 | None, EditVotes]:
+    """((256, 256) the voxels that a decision deletes from the tile, None if none; its edit votes)."""
+    gone, trimmed = words_gone(decided.votes, decided.edits, decided.quorum, tile)
+    cells = np.flatnonzero(decided.states != decided.edits)
+    if not len(cells):
+        return gone, trimmed
+    states = decided.edits.reshape(-1)[cells]
+    tally = decided.tally[cells // TILE_CELLS, cells % TILE_CELLS].astype(np.int32) // VOTE_UNIT
+    votes = tally[np.arange(len(cells)), states]
+    against = tally[:, : CellState.UNDETERMINED].sum(axis=1, dtype=np.int32) - votes
+    return gone, trimmed.and_of(EditVotes(cells, states, votes, against))
+
+
+def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int, gone: U64 | None) -> tuple[Tile, int, int]:
+    """(the tile as decided without the voxels ``gone`` (256, 256), points added, points deleted)."""
     edited, deleted = tile, 0
-    gone = words_gone(votes, states, quorum, tile)
     if gone is not None:
         edited, deleted = delete_points(edited, gone)
     added = 0

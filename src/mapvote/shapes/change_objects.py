@@ -15,7 +15,7 @@ import numpy as np
 from mapvote.codec.ballot import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, I8, I32, I64, U8, CellState
+from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.decision_record import Record
@@ -64,6 +64,8 @@ class ChangedCells:
     """The last version that decided this change; 0 where none is known."""
     odds: I8
     """Confidence of the votes for it in that version; UNSAID where no vote states one."""
+    stands: Bool
+    """Whether the cell is decided to stand: only some of its voxels went."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,10 @@ class ChangeObject:
     versions: list[int]
     """The versions that made it, ascending; empty where no decision is known."""
     probability: float | None
-    """Mean over its cells that each of them did change (fusion/loss_budget.py); None where no decision is known."""
+    """Mean over its cells that each of them did change (fusion/loss_budget.py); None where no decision is known, or
+    where all its cells stand."""
+    trimmed: int
+    """Number of its cells that stand and lost only some voxels, beside what stays."""
 
     @property
     def area_m2(self) -> float:
@@ -201,7 +206,8 @@ def _object(
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
-    voted = mine[versions > 0] if made_in else mine  # remnants in cells that stand have no votes
+    voted = mine[versions > 0] if made_in else mine
+    judged = voted[~cells.stands[voted]]
     seen_first, seen_last = int(cells.first_ns[mine].min()), int(cells.last_ns[mine].max())
     columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
     return ChangeObject(
@@ -222,7 +228,8 @@ def _object(
         first_seen_ns=None if seen_first == _NEVER else seen_first,
         last_seen_ns=None if seen_last == _UNTIL else seen_last,
         versions=made_in,
-        probability=float(probability[voted].mean()) if made_in else None,
+        probability=float(probability[judged].mean()) if made_in and len(judged) else None,
+        trimmed=int(cells.stands[mine].sum()),
     )
 
 
@@ -231,18 +238,31 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
     n = len(flat)
     votes, against, versions = (np.zeros(n, dtype=np.int64) for _ in range(3))
     odds, first, last = np.full(n, UNSAID, dtype=np.int8), np.full(n, _NEVER), np.full(n, _UNTIL)
+    stands = np.zeros(n, dtype=np.bool_)
     for decision, drives in decided:
-        agrees = decision.states.reshape(-1)[flat] == states
-        tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
+        said = decision.states.reshape(-1)[flat]
+        tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat] // VOTE_UNIT
         counted = tally[np.arange(n), states]
         others = tally[:, : CellState.UNDETERMINED].sum(axis=1) - counted
-        votes = np.where(agrees, counted // VOTE_UNIT, votes)
-        against = np.where(agrees, others // VOTE_UNIT, against)
+        # Cells that the version edited though it states no change of them have votes of their own.
+        edits = decision.edit_votes
+        _, row, edit = np.intersect1d(flat, edits.cells, assume_unique=True, return_indices=True)
+        own = edits.states[edit] == states[row]
+        row = row[own]
+        edit = edit[own]
+        counted[row] = edits.votes[edit]
+        others[row] = edits.against[edit]
+        agrees = said == states
+        agrees[row] = True
+        # What that version says of the cell replaces what earlier ones said.
+        votes = np.where(agrees, counted, votes)
+        against = np.where(agrees, others, against)
         versions = np.where(agrees, decision.version, versions)
+        stands = np.where(agrees, said == CellState.UNCHANGED_OCCUPIED, stands)
         odds = np.where(agrees, decision.odds.at(flat), odds)
         for end_ns, drive in drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)
     counts = {"votes": votes.astype(np.int32), "against": against.astype(np.int32), "versions": versions}
-    return counts | {"first_ns": first, "last_ns": last, "odds": odds}
+    return counts | {"first_ns": first, "last_ns": last, "odds": odds, "stands": stands}

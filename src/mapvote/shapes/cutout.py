@@ -69,7 +69,7 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
 def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
     """The cutout of a feature of :func:`mapvote.shapes.geojson.to_geojson`."""
     p = feature["properties"]
-    kind = "Built" if p["kind"] == "built" else "Demolished"
+    kind = "Built" if p["kind"] == "built" else "Trimmed beside what stands" if _only_trimmed(p) else "Demolished"
     facts = (
         f"{p['area_m2']:.1f} m², {p['height_m']:.1f} m high, {p['points']} points; "
         f"{p['votes_median']:g} votes for it, {p['against_median']:g} against"
@@ -77,6 +77,10 @@ def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: 
     (x0, y0), (x1, y1) = p["box"]
     name = f"{kind} at {0.5 * (x0 + x1):.0f}, {0.5 * (y0 + y1):.0f}"
     return cut_out(name, facts, (x0, y0, x1, y1), p["height_m"], tiles, lattice)
+
+
+def _only_trimmed(facts: Mapping[str, Any]) -> bool:
+    return bool(facts["trimmed"] == facts["cells"])
 
 
 def fragment(cutouts: Sequence[Cutout]) -> str:

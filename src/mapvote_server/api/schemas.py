@@ -221,6 +221,7 @@ class ChangeFacts(Answer):
     against_median: float
     share_for: float | None
     probability: float | None = Field(description="mean over its cells that each of them changed")
+    trimmed: int = Field(description="of its cells those that stand and lost only some voxels, beside what stays")
     first_seen: str | None
     last_seen: str | None
     versions: list[int]

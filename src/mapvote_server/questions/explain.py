@@ -21,7 +21,8 @@ from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, Mapvo
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
 from mapvote.fusion.decision_record import REASONS, Record, Standing, Why
-from mapvote.fusion.fuse import Decision, decide_tile, rule_of
+from mapvote.fusion.edit import EditVotes
+from mapvote.fusion.fuse import Decision, decide_tile, deletions, rule_of
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.shapes.geojson import utc
@@ -67,11 +68,25 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True)
+class Edit:
+    """Voxels trimmed from a cell that stands, or points that noise carried in from the next cell."""
+
+    state: str
+    """changed_empty: points go; changed_occupied: points come."""
+    votes: int
+    """Vehicles that voted for it: the fewest for any voxel that went."""
+    against: int
+    """Vehicles that determined the cell and did not."""
+
+
+@dataclass(frozen=True, slots=True)
 class CellDecision:
     """The decision of one version about a cell."""
 
     version: int
     state: str
+    edit: Edit | None = None
+    """The points that it edited though it states no such change; None if there are none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +165,7 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         shown = pseudonyms(store, {vote.vehicle for vote in votes})
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions else None
-    by_version = [CellDecision(record.version, state) for record, state in decisions]
+    by_version = [CellDecision(record.version, state, _edit_of(record, cell)) for record, state in decisions]
     return CellStory(row, col, votes, by_version, probability, _thing(now))
 
 
@@ -274,6 +289,21 @@ def _state_in(record: Record, cell: tuple[int, int]) -> str:
         return UNREADABLE
 
 
+def _edit_of(record: Record, cell: tuple[int, int]) -> Edit | None:
+    """None of a record that is damaged."""
+    try:
+        return _edit_in(record.edit_votes, cell)
+    except MapvoteError:
+        return None
+
+
+def _edit_in(edits: EditVotes, cell: tuple[int, int]) -> Edit | None:
+    at = np.flatnonzero(edits.cells == cell[0] * TILE_CELLS + cell[1])
+    if not len(at):
+        return None
+    return Edit(state_name(int(edits.states[at[0]])), int(edits.votes[at[0]]), int(edits.against[at[0]]))
+
+
 def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     """Probability that the cell changed as the record states, without the changes in cells of other tiles. None if the
     record states no change or cannot be read any more."""
@@ -319,6 +349,12 @@ def _waits(now: _Now) -> list[str]:
         text.append("waits: the last vehicle that looked says otherwise")
     if found.edits[cell] != found.states[cell]:
         text.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
+    trim = _edit_in(deletions(now.tile, found)[1], cell) if found.edits[cell] == CellState.UNCHANGED_OCCUPIED else None
+    if trim is not None:
+        text.append(
+            f"trimmed: the cell stands, and {trim.votes} of {trim.votes + trim.against} vehicles say that voxels of it "
+            "are gone; a publish deletes these"
+        )
     likely = found.pending.at(cell)
     if likely is not None:
         text.append(

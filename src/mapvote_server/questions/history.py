@@ -12,6 +12,7 @@ from itertools import islice
 from threading import Lock
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
@@ -19,8 +20,8 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import NO_VOTE, U8, MapvoteError
-from mapvote.fusion.decision_record import Standing, cells_in
+from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.fusion.decision_record import Record, cells_in
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.shapes.change_objects import Decided, change_objects, changed_cells
 from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
@@ -169,16 +170,21 @@ def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) ->
     records = records_of(connection, index, after=old, upto=new)
     counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
     sound = sound_votes(connection, index, counted)
-    return [(record, _drives(record.standings, sound)) for record in records]
+    return [(record, _drives(record, sound)) for record in records]
 
 
-def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
-    """(end_ns, states) of the ballots that counted, in the cells where they did."""
+def _drives(record: Record, sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
+    """(end_ns, states) of the ballots that counted, in the cells where they did. A cell that the version trimmed is
+    CHANGED_EMPTY where the ballot marks voxels of it as gone."""
     found = []
-    for standing in standings:
+    for standing in record.standings:
         _, vote = sound.get(standing.ballot, (None, None))
         if not standing.why and vote is not None and vote.states is not None:
             states = vote.states.copy()
+            if vote.gone is not None:
+                trimmed = np.intersect1d(vote.gone.cells, record.edit_votes.cells, assume_unique=True)
+                at = states.reshape(-1)[trimmed] == CellState.UNCHANGED_OCCUPIED
+                states.reshape(-1)[trimmed[at]] = CellState.CHANGED_EMPTY
             for cells in (standing.spent, standing.reviewed):
                 states.reshape(-1)[cells_in(cells)] = NO_VOTE
             found.append((vote.end_ns, states))

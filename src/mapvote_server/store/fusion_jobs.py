@@ -24,7 +24,7 @@ from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
 from mapvote.fusion.change_time import emptied_and_filled
-from mapvote.fusion.decision_record import Record, Standing, pack_standings, pack_tally, packed_cells
+from mapvote.fusion.decision_record import Record, Standing, pack_edit_votes, pack_standings, pack_tally, packed_cells
 from mapvote.fusion.distrust import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
@@ -152,6 +152,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
             pack_tally(decision.tally),
             pack_agreed(decision.odds, decision.states),
             pack_standings(standings_of(judged, decision.copies, decision.heard)),
+            pack_edit_votes(decision.edit_votes),
         ),
         vehicles=decision.vehicles,
         points=len(tile.points),

@@ -189,7 +189,7 @@ def write_version(
 def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
     """In the order of the table's columns."""
     made = record.packed_states, record.packed_tally, fused.vehicles, fused.added, fused.deleted
-    return number, *fused.index, *made, record.packed_odds, record.packed_standings
+    return number, *fused.index, *made, record.packed_odds, record.packed_standings, record.packed_edits
 
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]

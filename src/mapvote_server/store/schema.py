@@ -171,11 +171,13 @@ decisions = sa.Table(
     sa.Column("deleted", sa.Integer, nullable=False),
     sa.Column("odds", sa.LargeBinary),
     sa.Column("standings", sa.LargeBinary, nullable=False),
+    sa.Column("edits", sa.LargeBinary),
     sum_but("version", "row", "col", "vehicles", "added", "deleted"),
 )
 """The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: log-odds of the changed
 cells by the vehicles that voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: no vehicle sent
-any. ``standings``: which ballots counted, and why the others did not."""
+any. ``standings``: which ballots counted, and why the others did not. ``edits``: the votes behind points that came or
+went in cells of which ``states`` state no such change; null: there are none."""
 
 reviews = sa.Table(
     "reviews",

@@ -1,7 +1,7 @@
 // The desk: what a publish would change now, judged one by one; publishing and going back, the difference shown first.
 
 import * as api from "./api.js";
-import { drawable, sides } from "./details.js";
+import { drawable, nameOf, sides } from "./details.js";
 import { $, address, dot, element, notice, state } from "./page.js";
 
 const SAID = { accepted: "accepted", held: "held", rejected: "rejected" };
@@ -39,7 +39,7 @@ const row = (f) => {
   const p = f.properties, v = p.verdict;
   const button = element("button", { onclick: () => choose(f, true) }, [
     dot(p.kind),
-    p.kind === "built" ? "Built" : "Demolished",
+    nameOf(p),
     element("span", { className: "number" }, [`${p.area_m2.toFixed(1)} m\u00b2`]),
     element("span", { className: "number" }, [v ? `${SAID[v.verdict]} by ${v.by}` : `${p.votes_median} of ${p.votes_median + p.against_median} votes`]),
   ]);

@@ -24,6 +24,12 @@ export function drawable(feature) {
   return { id: feature.id, kind, size, height, polygons, box };
 }
 
+// How a change is named: one that only took voxels from cells that stand is none of a whole thing.
+export function nameOf(p) {
+  if (p.kind === "built") return "Built";
+  return p.trimmed === p.cells ? "Trimmed beside what stands" : "Demolished";
+}
+
 export function showChange(id) {
   const feature = state.features.find((f) => f.id === id);
   if (!feature) return;
@@ -33,7 +39,7 @@ export function showChange(id) {
   asking = null;
   mark(id);
   state.view.select(id);
-  details(p.kind === "built" ? "Built" : "Demolished", p.kind, [
+  details(nameOf(p), p.kind, [
     facts([
       ["area", `${p.area_m2.toFixed(2)} m\u00b2 (${p.cells} cells)`],
       ["height", `${p.height_m.toFixed(1)} m above ground`],
@@ -92,8 +98,9 @@ export async function showCell([x, y]) {
       ...(v.left_out_of ?? []).slice(-2).map(({ version, why }) => element("div", { className: "why" }, [`not counted in version ${version}: ${why}`])),
       !v.counts && element("div", { className: "why" }, [`does not count now: ${v.why || "no reason given"}`]),
     ]);
-  const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
-  if (answer.thing?.startsWith("pending:")) decided.push(`${answer.thing}.`);
+  const edited = ({ state, votes, against }) => `; points ${state === "changed_empty" ? "deleted" : "added"} by ${votes} of ${votes + against} vehicles`;
+  const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}${d.edit ? edited(d.edit) : ""}.`);
+  if (/^(pending|trimmed):/.test(answer.thing)) decided.push(`${answer.thing}.`);
   details(title, null, [
     ...decided.map((text) => element("p", {}, [text])),
     answer.votes.length

@@ -1,6 +1,6 @@
 // The changes between two versions: what is large first, what is small folded away.
 
-import { drawable, showChange, visit } from "./details.js";
+import { drawable, nameOf, showChange, visit } from "./details.js";
 import { $, address, dot, element, state } from "./page.js";
 
 const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
@@ -41,7 +41,7 @@ const row = (f) =>
   element("li", { id: `item-${f.id}` }, [
     element("button", { onclick: () => (showChange(f.id), visit(f)) }, [
       dot(f.properties.kind),
-      f.properties.kind === "built" ? "Built" : "Demolished",
+      nameOf(f.properties),
       element("span", { className: "number" }, [`${f.properties.area_m2.toFixed(1)} m\u00b2`]),
       element("span", { className: "number" }, [`${f.properties.height_m.toFixed(1)} m high`]),
     ]),
