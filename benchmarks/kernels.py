@@ -235,6 +235,7 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
     from mapvote import warmup
     from mapvote.__main__ import main
     from mapvote.config import Settings
+    from mapvote.core.rule import SURFACES
     from mapvote.fusion.change_time import lately_changed
     from mapvote.fusion.fuse import count
     from mapvote.fusion.tile_vote import TileVote
@@ -251,7 +252,7 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
         """Five say that a wall stands, three who come later that it is gone."""
         says = [np.full((256, 256), 0 if i < 5 else 3, np.uint8) for i in range(8)]
         drives = [TileVote(f"v{i}", i, f"{i}", states=states) for i, states in enumerate(says)]
-        lately_changed(says[0], drives, count(drives, "columns", 2)[1], 2)
+        lately_changed(says[0], drives, count(drives, SURFACES, 2)[1], 2)
 
     def evaluate() -> None:
         words = ["evaluate", "corner", "--seed", "2", "--case", "1,2,3,4,5,surfaces,evidence", "--readings"]

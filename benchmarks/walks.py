@@ -33,6 +33,7 @@ from hand_made import make_ballot, unpack_all
 from mapvote.codec.ballot import encode, pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import map_from_points
+from mapvote.core.rule import SURFACES
 from mapvote.core.types import CellState
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.formats.drives.scan_folder import DriveWriter
@@ -111,7 +112,7 @@ def tile(walk: Walk) -> None:
     ballots = [make_ballot(point_map, {(0, 0): said(rng)}, f"v{i}", "d", end_ns=10**18 + i) for i in range(3)]
     votes = [replace(vote, vehicle=one.vehicle, digest=one.vehicle) for one in ballots for vote in unpack_all(one)]
     with counted(walk):
-        decision, _ = fuse_tile(point_map.tiles[0, 0], votes, "columns", POLICY, 2, lambda: votes)
+        decision, _ = fuse_tile(point_map.tiles[0, 0], votes, SURFACES, POLICY, 2, lambda: votes)
     assert (decision.states == CellState.CHANGED_EMPTY).any(), "nothing was decided"
 
 

@@ -11,10 +11,11 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from mapvote.core.rule import rule_named, rule_names
 from mapvote.core.types import MapvoteError
 
 METHOD_VERSION = 9
@@ -24,6 +25,16 @@ METHOD_VERSION = 9
 def cache_folder() -> Path:
     """What can be made or fetched again lies here: $XDG_CACHE_HOME/mapvote, else ~/.cache/mapvote."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapvote"
+
+
+def _known_rule(method: str) -> str:
+    if method not in rule_names():
+        raise ValueError(f"no vote rule has this name; known are {', '.join(rule_names())}")
+    return method
+
+
+RuleName = Annotated[str, AfterValidator(_known_rule)]
+"""The name of an installed vote rule (core/rule.py)."""
 
 
 class Section(BaseModel):
@@ -60,9 +71,9 @@ class MappingSettings(Section):
 
 
 class VotingSettings(Section):
-    """Surfaces, or the paper's rule, and which of its cases (paper III, V): docs/method.md."""
+    """The vote rule, and which of the paper's cases (paper III, V): docs/method.md."""
 
-    method: Literal["paper", "surfaces"] = Field(default="surfaces", description="rule by which vehicles vote")
+    method: RuleName = Field(default="surfaces", description="the vote rule: surfaces, paper, or that of a plug-in")
     weighted: bool = Field(default=True, description="several votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its vote counts")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
@@ -256,10 +267,12 @@ class Settings(Section):
     def digest(self) -> str:
         """SHA-256 of what a vehicle votes by: ballots of one round must agree on it, whatever a server's limits are.
 
-        Settings and METHOD_VERSION: two programs that would vote otherwise on the same drive never share a round.
+        Settings, METHOD_VERSION and the rule's own version: two programs that would vote otherwise on the same drive
+        never share a round.
         """
         settings = self.model_dump_json(include={"ndt", "moving", "voting", "paper"})
-        return hashlib.sha256(f"{METHOD_VERSION} {settings}".encode()).hexdigest()
+        version = f"{METHOD_VERSION} {rule_named(self.voting.method).version}".strip()
+        return hashlib.sha256(f"{version} {settings}".encode()).hexdigest()
 
 
 CASES: dict[str, dict[str, bool]] = {
@@ -334,14 +347,14 @@ def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
 
 
 def choose_case(settings: Settings, case: str) -> Settings:
-    """``settings`` with the vote of one of the paper's cases, "1" to "5", or of "surfaces".
+    """``settings`` with the vote of one of the paper's cases, "1" to "5", or of the rule of that name.
 
     MapvoteError for another.
     """
-    if case == "surfaces":
-        chosen: dict[str, object] = {"method": case}
-    elif case in CASES:
-        chosen = {"method": "paper", **CASES[case]}
+    if case in CASES:
+        chosen: dict[str, object] = {"method": "paper", **CASES[case]}
+    elif case in rule_names():
+        chosen = {"method": case}
     else:
-        raise MapvoteError(f"no case {case!r}; choose surfaces or one of {', '.join(CASES)}")
+        raise MapvoteError(f"no case {case!r}; choose one of {', '.join([*rule_names(), *CASES])}")
     return settings.model_copy(update={"voting": settings.voting.model_copy(update=chosen)})

@@ -24,14 +24,14 @@ from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
 from mapvote.matching.localiser import Localise, Localiser
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.rules.paper import PaperVoter
-from mapvote.rules.voter import NewPoints, TileVotes, Voter, points_in
+from mapvote.rules.voter import NewPoints, TileVotes, make_voter, points_in
 
 NOTHING = np.uint64(0)
 
@@ -57,13 +57,14 @@ class Vehicle:
     ) -> None:
         self.name, self.point_map, self.drive_id = name, point_map, drive_id
         self.settings = settings or Settings()
+        self._rule = rule_named(self.settings.voting.method)
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
         self._localise = localise or Localiser(point_map, self.settings, sensor)
         self._frontend = Frontend(
             self._localise,
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
-            with_sight=self.settings.voting.method == "paper",
+            with_sight=self._rule.needs_sight,
             sensor=sensor,
         )
         self.sensor = sensor
@@ -71,10 +72,10 @@ class Vehicle:
 
     def _count_anew(self) -> None:
         """No scan has voted yet."""
-        self._voter = make_voter(self.settings, self.sensor, self.point_map)
+        self._voter = make_voter(self._rule, self.settings, self.sensor, self.point_map)
         self._new_points = NewPoints(
             self.point_map.lattice,
-            beyond=self.settings.voting.method != "paper",
+            beyond=self._rule.takes_points_beyond,
             intensity=self.point_map.has_intensity,
         )
 
@@ -182,15 +183,6 @@ class RoadDriven:
         age_s = 1e-9 * (self._last_ns - report.stamps_ns[0])
         stood_s = 1e-9 * (self._last_ns - self._moved_ns) if self._moved else 0.0
         return self._length_m >= cuts.length_m or age_s >= cuts.time_s or stood_s >= cuts.stop_s
-
-
-def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
-    """The voter that ``voting.method`` names."""
-    if settings.voting.method == "surfaces":
-        from mapvote.rules.surfaces import SurfaceVoter  # brings half of scipy, which the paper's rule does without
-
-        return SurfaceVoter(settings.voting, point_map)
-    return PaperVoter(settings.voting, settings.paper, sensor, point_map)
 
 
 def write_ballot(

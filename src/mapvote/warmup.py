@@ -21,6 +21,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.process_memory import seldom_collecting
+from mapvote.core.rule import RULES
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan, read_only
 from mapvote.core.voxels import VoxelCloud
@@ -84,7 +85,7 @@ def compile_for_votes() -> None:
         drive = _drive(_street(demolished=True), turning=True)
         assert drive.T_map_lidar_prior is not None
         given = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-        by_case = [choose_case(Settings(), case) for case in ("surfaces", "5")]
+        by_case = [choose_case(Settings(), rule) for rule in RULES]
         ballots = [vote_drive(drive, point_map, settings, localise=given)[0] for settings in by_case]
         _fuse(point_map, ballots, Settings())
         vote_drive(drive, point_map, Settings())

@@ -76,7 +76,7 @@ def test_rays_of_a_trajectory_make_free_what_they_pass_and_nothing_behind_a_wall
 
 def test_the_papers_rule_counts_scans_and_a_cloud_has_none() -> None:
     court = map_from_points(made_court())
-    with pytest.raises(MapvoteError, match="surfaces only"):
+    with pytest.raises(MapvoteError, match="counts scans, and a cloud has none: use surfaces"):
         vote_of_session("r", "s", court, court, choose_case(Settings(), "5"), end_ns=1)
 
 

@@ -11,10 +11,11 @@ import pytest
 
 from hand_made import make_tile, states_plane, two_walls, wall
 from mapvote.config import FuseSettings
+from mapvote.core.rule import PAPER, SURFACES, Rule
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import CellState
 from mapvote.fusion.change_time import DAY_S, history_days, remembered, temporary
-from mapvote.fusion.fuse import Rule, fuse_tile, unspent
+from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
@@ -24,7 +25,7 @@ SIX, TWICE = [UO] * 6, ["a", "b", "c", "d", "e", "f", "a", "b"]
 
 def decided(
     said: Sequence[int], min_votes: int = 2, ends_s: list[int] | None = None, whose: list[str] | None = None,
-    rule: Rule = "columns", cell: tuple[int, int] = CELL, live: bool = False,
+    rule: Rule = SURFACES, cell: tuple[int, int] = CELL, live: bool = False,
 ) -> int:  # fmt: skip
     """What is decided of a cell if vehicles pass one after the other and say this; ``live``: as a server does."""
     votes = [
@@ -50,7 +51,7 @@ def decided(
         ("likewise of what is new", [*[UE] * 6, CO, CO, CO], {}, CO),
         ("one more than the quorum must say so", [*SIX, CE, CE, CE], {"min_votes": 3}, UO),
         ("one more than the quorum says so", [*SIX, CE, CE, CE, CE], {"min_votes": 3}, CE),
-        ("by the paper's rule the majority decides, whoever came last", [*SIX, CE, CE, CE], {"rule": "paper"}, UO),
+        ("by the paper's rule the majority decides, whoever came last", [*SIX, CE, CE, CE], {"rule": PAPER}, UO),
         ("who is not sure breaks nothing", [*SIX, CE, UN, CE, UN, CE], {}, CE),
         ("at the same moment there is no before", [*[UO] * 4, CE, CE, CE], {"ends_s": [1, 1, 1, 5, 5, 5, 5]}, UO),
         ("two vehicles, three drives", [*SIX, CE, CE, CE], {"whose": [*TWICE, "b"]}, UO),
@@ -151,7 +152,7 @@ def fused(tile: Tile, day: float, state: int, version: int, history: list[TileVo
     points = wall([CELL], [0.75]) if state == CO else None
     votes = [replace(drive(day, {CELL: state}, vehicle), new_points=points) for vehicle in "ab"]
     history += votes
-    return fuse_tile(tile, votes, "columns", SETTINGS, version, lambda: history)[1]
+    return fuse_tile(tile, votes, SURFACES, SETTINGS, version, lambda: history)[1]
 
 
 def test_a_skip_that_comes_and_goes_enters_the_map_once_and_then_only_after_a_month() -> None:
@@ -197,7 +198,7 @@ def entered_after(
         oldest = seen[-1].end_ns - history_days(settings) * DAY_NS
         seen = [vote for vote in seen if vote.end_ns >= oldest]
         votes, past = ([unspent(vote, tile) for vote in some] for some in (newest_votes(seen, settings), seen))
-        after = fuse_tile(tile, votes, "paper", settings, version + 1, partial(list, past))[1]
+        after = fuse_tile(tile, votes, PAPER, settings, version + 1, partial(list, past))[1]
         if after is not tile:
             tile, version = after, version + 1
             arrived = [cell for cell, things in histories.items() if day >= things[-1][0] and tile.obstacle_words[cell]]

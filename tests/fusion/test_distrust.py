@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hand_made import SHAPE, make_tile, states_plane, wall
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
+from mapvote.core.rule import SURFACES
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion import distrust
@@ -52,7 +53,7 @@ def named(planes: list[U8]) -> list[TileVote]:
 
 
 def not_heard(votes: list[TileVote], **policy: float) -> set[str]:
-    heard = hear(votes, "columns", FuseSettings(**policy))[0]  # type: ignore[arg-type]
+    heard = hear(votes, SURFACES, FuseSettings(**policy))[0]  # type: ignore[arg-type]
     return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
 
 
@@ -66,7 +67,7 @@ def test_k_that_invert_everything_are_not_heard_among_k_plus_1_that_do_not(k: in
 def test_a_liar_cannot_second_the_error_of_one_honest_vehicle() -> None:
     planes = [honest(i) for i in range(2)] + [OPPOSITE[honest(2)]]
     tile, policy = Tile.empty(Lattice().tile((0, 0))), FuseSettings(min_votes=2)
-    decided, without = (fuse_tile(tile, named(some), "columns", policy)[0].states for some in (planes, planes[:2]))
+    decided, without = (fuse_tile(tile, named(some), SURFACES, policy)[0].states for some in (planes, planes[:2]))
     assert np.array_equal(decided, without)
 
 
@@ -113,11 +114,11 @@ def test_who_opposes_most_of_what_a_majority_agrees_on_contradicts(
 def test_who_denies_every_change_is_not_heard_and_the_quorum_is_what_it_would_be_without(k: int) -> None:
     planes = [news_of(honest(i, 0.01)) for i in range(k + 1)] + [honest(50 + i, 0.01) for i in range(k)]
     votes, policy = named(planes), FuseSettings(min_votes=k + 1)
-    heard, states, _, quorum = hear(votes, "columns", policy)
+    heard, states, _, quorum = hear(votes, SURFACES, policy)
     assert [vote.vehicle for vote in heard] == [f"v{i}" for i in range(k + 1)]
     assert quorum == 2, "one less for each, but nobody is believed alone"
-    assert np.array_equal(states, count(votes[: k + 1], "columns", 2)[0])
-    assert len(hear(votes, "columns", policy.model_copy(update={"max_denial": 1.0}))[0]) == 2 * k + 1
+    assert np.array_equal(states, count(votes[: k + 1], SURFACES, 2)[0])
+    assert len(hear(votes, SURFACES, policy.model_copy(update={"max_denial": 1.0}))[0]) == 2 * k + 1
 
 
 def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
@@ -126,7 +127,7 @@ def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
     for plane in planes[1:]:
         plane[:, 64:] = NO_VOTE
     lies = [np.where(honest(9) == UO, CE, CO).astype(np.uint8)] * 3
-    heard, _, _, quorum = hear(named([*planes, *lies]), "columns", FuseSettings(min_votes=4))
+    heard, _, _, quorum = hear(named([*planes, *lies]), SURFACES, FuseSettings(min_votes=4))
     assert {f"v{i}" for i in range(4)} <= {vote.vehicle for vote in heard}
     assert quorum == max(2, 4 - (7 - len(heard)))
 
@@ -142,13 +143,13 @@ def test_what_waits_for_the_last_who_looked_still_waits_when_all_else_is_publish
     votes = [TileVote(f"v{i}", i * 10**9, f"v{i}", states=saw_it, new_points=offered, version=1) for i in (1, 2)]
     votes.append(TileVote("v3", 3 * 10**9, "v3", states=passed, version=1))
     policy = FuseSettings(min_votes=2, min_difference=0.0)
-    decision, published = fuse_tile(before, votes, "columns", policy, 2, lambda: votes)
+    decision, published = fuse_tile(before, votes, SURFACES, policy, 2, lambda: votes)
     assert (decision.deleted, decision.added) == (300, 0)
     left = [unspent(vote, published) for vote in votes]
-    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published
+    assert fuse_tile(published, left, SURFACES, policy, 3, lambda: left)[1] is published
     again = [*votes, TileVote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
     left = [unspent(vote, published) for vote in again]
-    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published, "drives are folded"
+    assert fuse_tile(published, left, SURFACES, policy, 3, lambda: left)[1] is published, "drives are folded"
 
 
 def test_who_left_cells_undetermined_denied_nothing_there_and_was_not_asked() -> None:
@@ -295,7 +296,7 @@ def test_the_order_of_ballots_does_not_decide_which_of_copies_is_heard(order: li
     votes = by_name({f"v{i}": drive_along(i) for i in range(4)} | {"x": moved(drive_along(0), by // 2, by % 2)})
     votes.append(TileVote("y", 9, "ballot of y", states=drive_along(3)))
     tile = Tile.empty(Lattice().tile((0, 0)))
-    one, other = (decide_tile(tile, given, "columns", POLICY) for given in (votes, [votes[i] for i in order]))
+    one, other = (decide_tile(tile, given, SURFACES, POLICY) for given in (votes, [votes[i] for i in order]))
     assert one.copies == other.copies
     assert {copy.vehicle for copy in one.copies} == {"x", "y"}
     assert np.array_equal(one.states, other.states)
@@ -305,7 +306,7 @@ def test_the_history_is_without_copies_whether_it_holds_the_same_drives_or_more(
     votes = by_name({f"v{i}": drive_along(i) for i in range(3)} | {"copy": drive_along(0)})
     tile = Tile.empty(Lattice().tile((0, 0)))
     for history in (votes, [*votes, *by_name({"w": drive_along(4), "x": drive_along(4)})]):
-        heard = decide_tile(tile, votes, "columns", POLICY, partial(list, history))
+        heard = decide_tile(tile, votes, SURFACES, POLICY, partial(list, history))
         assert heard.past is not None
         assert [v.digest for v in heard.past()] == [v.digest for v in originals(history, POLICY)[0]]
 
@@ -314,7 +315,7 @@ def test_the_history_is_without_copies_whether_it_holds_the_same_drives_or_more(
 def test_the_quorum_falls_by_those_who_lie_for_sure(k: int) -> None:
     """k send the first vehicle's ballot: of the k + 1 that are alike one is honest, and may be one not heard."""
     votes = by_name({f"v{i}": drive_along(i) for i in range(k + 1)} | {f"x{i}": drive_along(0) for i in range(k)})
-    heard = decide_tile(Tile.empty(Lattice().tile((0, 0))), votes, "columns", FuseSettings(min_votes=k + 1))
+    heard = decide_tile(Tile.empty(Lattice().tile((0, 0))), votes, SURFACES, FuseSettings(min_votes=k + 1))
     assert (len(heard.votes), heard.quorum) == (k + 1, 2)
 
 

@@ -19,11 +19,12 @@ from mapvote.codec.planes import Words
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap
+from mapvote.core.rule import PAPER, SURFACES, Rule
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.formats import read_map, write_map
-from mapvote.fusion.fuse import Rule, count, differing, fuse_tile, states_over, unspent, update_map
+from mapvote.fusion.fuse import count, differing, fuse_tile, states_over, unspent, update_map
 from mapvote.fusion.tile_vote import TileVote
 
 LATTICE = Lattice()
@@ -41,7 +42,7 @@ def marks(word: int) -> Words:
     return Words.of(words_plane({CELL: word}))
 
 
-def fuse(tile: Tile, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = "columns") -> tuple[U8, Tile]:
+def fuse(tile: Tile, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = SURFACES) -> tuple[U8, Tile]:
     decision, edited = fuse_tile(tile, votes, rule, policy)
     return decision.states, edited
 
@@ -50,7 +51,7 @@ def test_server_row_of_table_1() -> None:
     """Vehicles 1 and 2 say changed-occupied, 3 says undetermined: changed-occupied (paper IV, Table I)."""
     says = [OCCUPIED, OCCUPIED, CellState.UNDETERMINED]
     votes = [vote(f"v{i}", states_plane({CELL: s})) for i, s in enumerate(says)]
-    assert count(votes, "paper", 1)[0][CELL] == OCCUPIED
+    assert count(votes, PAPER, 1)[0][CELL] == OCCUPIED
 
 
 def test_ground_is_never_deleted_and_everything_else_is_bit_identical() -> None:
@@ -100,7 +101,7 @@ def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_poin
 def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
     """The state of one cell, in the plainest words (paper IV): what the kernels must agree with."""
     tally = [votes.count(state) for state in range(5)]
-    contenders = tally[:4] if rule == "columns" else tally
+    contenders = tally[:4] if rule == SURFACES else tally
     best = max(contenders)
     if best == 0:
         return CellState.UNDETERMINED if tally[4] else NO_VOTE
@@ -108,7 +109,7 @@ def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
         return CellState.UNDETERMINED
     state = contenders.index(best)
     if state in (OCCUPIED, EMPTY):
-        no_majority = rule == "columns" and 2 * best <= sum(contenders)
+        no_majority = rule == SURFACES and 2 * best <= sum(contenders)
         if no_majority or best < min_votes:
             return CellState.UNDETERMINED
     return state
@@ -117,7 +118,7 @@ def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
 @given(
     seed=st.integers(0, 2**32 - 1),
     voters=st.sampled_from([1, 2, 3, 5, 9, 40]),
-    rule=st.sampled_from(["paper", "columns"]),
+    rule=st.sampled_from([PAPER, SURFACES]),
     min_votes=st.integers(1, 4),
 )
 @settings(max_examples=40, deadline=None)
@@ -136,14 +137,14 @@ def test_the_kernels_decide_as_the_plain_rule_does(seed: int, voters: int, rule:
 
 def test_more_votes_than_sixteen_bits_hold_are_counted() -> None:
     """4,096 vehicles times VOTE_UNIT is 65,536: one more than uint16 can say."""
-    states, tally = count([vote(str(i), states_plane({CELL: EMPTY})) for i in range(4096)], "columns", 4096)
+    states, tally = count([vote(str(i), states_plane({CELL: EMPTY})) for i in range(4096)], SURFACES, 4096)
     assert (states[CELL], tally[CELL].tolist()) == (EMPTY, [0, 0, 0, 4096 * VOTE_UNIT, 0])
 
 
 @given(
     seed=st.integers(0, 2**32 - 1),
     voters=st.integers(1, 6),
-    rule=st.sampled_from(["paper", "columns"]),
+    rule=st.sampled_from([PAPER, SURFACES]),
     min_votes=st.integers(1, 3),
 )
 @settings(max_examples=25, deadline=None)
@@ -172,14 +173,14 @@ def test_one_loud_liar_takes_no_wall_down_because_others_once_looked_through_it(
     honest[CELL] = [30 * VOTE_UNIT, 0, 0, VOTE_UNIT, 0]
     votes = [TileVote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([liar, honest, honest, honest])]
     tile = make_tile(wall([CELL], [0.45]))
-    assert fuse(tile, votes, SURE, "paper")[1] is tile
+    assert fuse(tile, votes, SURE, PAPER)[1] is tile
     second = TileVote("w", 0, "w", tally=liar)
-    assert fuse(tile, [*votes, second], SURE, "paper")[0][CELL] == EMPTY
+    assert fuse(tile, [*votes, second], SURE, PAPER)[0][CELL] == EMPTY
 
 
 def test_states_over_a_window_of_tiles() -> None:
-    decision, _ = fuse_tile(Tile.empty(LATTICE.tile((2, 3))), [vote("a", states_plane({CELL: EMPTY}))], "columns", KEEP)
-    far, _ = fuse_tile(Tile.empty(LATTICE.tile((3, 5))), [vote("a", states_plane({CELL: OCCUPIED}))], "columns", KEEP)
+    decision, _ = fuse_tile(Tile.empty(LATTICE.tile((2, 3))), [vote("a", states_plane({CELL: EMPTY}))], SURFACES, KEEP)
+    far, _ = fuse_tile(Tile.empty(LATTICE.tile((3, 5))), [vote("a", states_plane({CELL: OCCUPIED}))], SURFACES, KEEP)
     states, grid = states_over(LATTICE, {(2, 3): decision, (3, 5): far})
     assert states.shape == (512, 768)
     assert (grid.x0, grid.y0) == pytest.approx((3 * 76.8, 2 * 76.8))
@@ -315,8 +316,8 @@ def test_untouched_tiles_are_the_same_objects_and_the_same_ballot_twice_is_one_v
     ("ballots", "message"),
     [
         (lambda m: [], "no ballots"),
-        (lambda m: [gone(m), gone(m, "v2", method="paper")], "never mixes methods"),
-        (lambda m: [gone(m), gone(m, "v2", settings_hash="t")], "never mixes methods"),
+        (lambda m: [gone(m), gone(m, "v2", method="paper")], "All ballots of a round use one method"),
+        (lambda m: [gone(m), gone(m, "v2", settings_hash="t")], "All ballots of a round use one method"),
         (lambda m: [gone(m, map_id="elsewhere")], "not on 'test-map'"),
         (lambda m: [gone(m, base={(0, 0): "0" * 64})], "another version of tile 0,0"),
         (lambda m: [gone(m), gone(m, end_ns=5_000_000_000)], "given twice"),

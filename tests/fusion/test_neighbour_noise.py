@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from mapvote.codec.ballot import Odds
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
+from mapvote.core.rule import SURFACES
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
@@ -179,9 +180,9 @@ def test_what_spilled_is_told_as_empty_and_goes_with_its_wall_as_was_voted() -> 
     votes = [
         TileVote(name, 0, name, states=states, odds=Odds(changed, np.full(len(changed), 12, np.int8))) for name in "ab"
     ]
-    decision, edited = fuse_tile(tile, votes, "columns", FuseSettings())
+    decision, edited = fuse_tile(tile, votes, SURFACES, FuseSettings())
     told = {int(cell) for cell in changed if decision.states.reshape(-1)[cell] == CellState.UNCHANGED_EMPTY}
     assert all_but_the_ends(told, cells_of(beyond))
     assert len(edited.points) == 0
     unsaid = [TileVote(vote.vehicle, 0, vote.digest, states=states) for vote in votes]
-    assert (fuse_tile(tile, unsaid, "columns", FuseSettings())[0].states == states).all(), "of surfaces' ballots alone"
+    assert (fuse_tile(tile, unsaid, SURFACES, FuseSettings())[0].states == states).all(), "of surfaces' ballots alone"

@@ -13,6 +13,7 @@ from hand_made import make_tile, states_plane, wall, words_plane
 from histories import held_by, say
 from mapvote.codec.planes import Words
 from mapvote.config import FuseSettings
+from mapvote.core.rule import SURFACES
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
@@ -69,7 +70,7 @@ def test_every_cell_of_every_version_is_as_the_rules_have_it(seed: int) -> None:
         lately = [unspent(vote, tile) for vote in votes if vote.end_ns >= oldest]
         drives = [unspent(vote, tile) for vote in newest_votes(votes, settings)]
         rng.shuffle(drives)
-        tile = fuse_tile(tile, drives, "columns", settings, newest + 1, partial(list, lately))[1]
+        tile = fuse_tile(tile, drives, SURFACES, settings, newest + 1, partial(list, lately))[1]
         before = versions[newest]
         cells, knows = fuse(before, casts, settings, now_s, newest + 1, lambda *_: True, lambda *_: True)
         assert {cell: held_by(tile, cell) for cell in cells} == cells

@@ -87,9 +87,9 @@ def _tell(report: BuildReport, out: Path) -> None:
     if report.two_levels is not None:
         x, y, apart = report.two_levels
         print(
-            f"warning: two levels were driven above each other, {apart:.1f} m apart at ({x:.1f}, {y:.1f}). A cell has "
-            "one ground: it keeps the road whose path is nearer, below both the lower one; who drives the other cannot "
-            "vote there. (Less than a metre apart it is one road, mapped twice: the drives' heights do not agree.)"
+            f"warning: two roads lie above each other, {apart:.1f} m apart at ({x:.1f}, {y:.1f}). Each cell stores one "
+            "ground level. Vehicles on the other level cannot vote there. If this is one road, less than a metre "
+            "apart, the drives disagree about its height."
         )
     print(f"{out}: {report.points} points")
     print(f"{out}: {_frame(report)}")

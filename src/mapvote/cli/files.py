@@ -364,6 +364,7 @@ def update(
     from mapvote.codec.ballot import decode
     from mapvote.config import load_with_sources
     from mapvote.core.grid import CELL_SIZE
+    from mapvote.core.rule import rule_named
     from mapvote.formats import write_map
     from mapvote.formats.atomic import whole_file
     from mapvote.fusion.fuse import states_over, update_map
@@ -382,10 +383,10 @@ def update(
         raise MapvoteError(f"--false-deletions {false_deletions:g}: give a probability above 0, such as 0.01; 1: none")
     loaded, sources = load_with_sources(config)
     settings = loaded.fuse
-    paper = bool(ballots) and ballots[0].method == "paper" and "fuse.min_votes" not in sources
+    own_quorum = rule_named(ballots[0].method).min_votes if ballots and "fuse.min_votes" not in sources else None
     settings = settings.model_copy(
         update={
-            "min_votes": min_votes or (1 if paper else settings.min_votes),
+            "min_votes": min_votes or own_quorum or settings.min_votes,
             "false_deletions": settings.false_deletions if false_deletions is None else false_deletions,
         }
     )

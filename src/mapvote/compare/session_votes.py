@@ -24,6 +24,7 @@ from mapvote.core.geometry import poses_at, rows_from, transform
 from mapvote.core.grid import Grid, Lattice, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
+from mapvote.core.rule import rule_named
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState, MapvoteError
 from mapvote.core.voting import one_hot
 from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
@@ -68,10 +69,9 @@ def vote_of_session(
     ``end_ns``: when the session ended. MapvoteError if the rule is the paper's, if the cloud cannot be registered, or
     if map or cloud has no ground.
     """
-    if settings.voting.method != "surfaces":
-        raise MapvoteError(
-            "a cloud votes by the rule of surfaces only: the paper's rule counts scans, a cloud has none"
-        )
+    if not rule_named(settings.voting.method).takes_clouds:
+        mend = "use surfaces"
+        raise MapvoteError(f"the rule {settings.voting.method!r} counts scans, and a cloud has none: {mend}")
     registered = register_maps(point_map, cloud)
     session_map = map_from_points(registered.points, lattice=point_map.lattice)
     if trajectory is None and cloud.driven:

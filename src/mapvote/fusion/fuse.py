@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, with_changed
+from mapvote.core.rule import Rule, rule_named
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
@@ -33,8 +34,6 @@ from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_bud
 from mapvote.fusion.neighbour_noise import without_spilled
 from mapvote.fusion.tile_vote import TileVote, newest_votes, offered, one_each, silenced
 
-Rule = Literal["paper", "columns"]
-"""How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""
 History = Callable[[], Sequence[TileVote]]
 """Gives the votes of a tile over a longer time."""
 
@@ -80,24 +79,15 @@ class Decision:
         return len(self.heard)
 
 
-def rule_of(method: str) -> Rule:
-    """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
-    if method == "paper":
-        return "paper"
-    if method in ("columns", "surfaces"):  # they differ in how a vehicle decided: none casts columns any more
-        return "columns"
-    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper', 'columns' and 'surfaces'")
-
-
 def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
     """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (docs/decisions/voting.md).
 
-    ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
-    needs a majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is
+    Where ``rule.undetermined_competes`` a plain majority decides; else undetermined abstains, and a change needs a
+    majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is
     undetermined; in one stage a vehicle backs what its own tally alone would decide. The tally is (256, 256, 5) in
     VOTE_UNITs, class by class in memory, uint8 or uint16 where no sum can exceed that.
     """
-    abstain = rule == "columns"
+    abstain = not rule.undetermined_competes
     quorum = min_votes if min_votes > 1 else 0
     if any(vote.tally is not None for vote in votes):
         tally, backers = (np.zeros((N_STATES, CELLS), dtype=np.int32) for _ in range(2))
@@ -156,7 +146,7 @@ def decide_tile(
     if any(vote.states is None for vote in votes):
         return Decision(states, tally, states, quorum, names, votes, past=past)
     spoken = [drive for drive in drives if drive.vehicle in names]
-    states = lately_changed(states, spoken, tally, quorum) if rule == "columns" else states
+    states = states if rule.undetermined_competes else lately_changed(states, spoken, tally, quorum)
     denied = passing = None
     if past is not None:
         denied = denied_last(states, tile.memory, spoken)
@@ -374,8 +364,8 @@ def _rule_of_all(ballots: Mapping[str, Ballot], point_map: PointMap) -> Rule:
         name = f"ballot {ballot.vehicle}/{ballot.drive}"
         if (ballot.method, ballot.stage, ballot.settings_hash) != (first.method, first.stage, first.settings_hash):
             raise MapvoteError(
-                f"{name} was cast by {_method(ballot)}, {first.vehicle}/{first.drive} by {_method(first)}: "
-                "one round never mixes methods; vote again with the same settings"
+                f"{name} uses {_method(ballot)}; {first.vehicle}/{first.drive} uses {_method(first)}. "
+                "All ballots of a round use one method and one configuration: vote again with the same settings"
             )
         if ballot.map_id != point_map.map_id:
             raise MapvoteError(f"{name} is a vote on map {ballot.map_id!r}, not on {point_map.map_id!r}")
@@ -387,7 +377,7 @@ def _rule_of_all(ballots: Mapping[str, Ballot], point_map: PointMap) -> Rule:
                     f"{name} voted on another version of tile {tile_key(tile.tile)} than this map holds: "
                     "use the map it was cast against, or vote again with this one"
                 )
-    return rule_of(first.method)
+    return rule_named(first.method)
 
 
 def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool:

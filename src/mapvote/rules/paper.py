@@ -17,17 +17,17 @@ from typing import get_args
 import numpy as np
 from pydantic import ValidationError
 
-from mapvote.config import PaperSettings, VotingSettings
+from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.columns import EVERY_BIT, below_top, span_of
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, window_around
+from mapvote.core.grid import CELL_SIZE, Grid, TileIndex, window_around
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError, Reference
-from mapvote.core.voting import VOTE_UNIT, cast, plurality, weight_table
+from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError, Reference
+from mapvote.core.voting import VOTE_UNIT, plurality, weight_table
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
-from mapvote.rules.voter import TileVotes
+from mapvote.rules.voter import Tally, TileVotes
 
 MOST_POINTS = 15
 """Points are counted up to this number, where Eq. (1) has reached its bound."""
@@ -208,23 +208,9 @@ def classify_paper(words: U16, mapped: Bool, voting: VotingSettings, paper: Pape
     return states[mapped.astype(np.intp), words], weights[words]
 
 
-class Tally:
-    """Votes per cell and class over a drive: :func:`mapvote.core.voting.cast` on the tiles that a window touches."""
-
-    def __init__(self, lattice: Lattice) -> None:
-        self.lattice = lattice
-        self.tiles: dict[TileIndex, I32] = {}
-        """(256, 256, 5) int32 in VOTE_UNITs."""
-
-    def cast(self, grid: Grid, states: U8, weights: I32) -> None:
-        """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
-        for tile in grid.tiles():
-            window = self.lattice.tile(tile)
-            common = window.intersection(grid)
-            if tile not in self.tiles:
-                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
-            inner, outer = common.slices_in(window), common.slices_in(grid)
-            cast(self.tiles[tile][inner], states[outer], weights[outer])
+def paper_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> PaperVoter:
+    """The voter of ``PAPER`` (core/rule.py)."""
+    return PaperVoter(settings.voting, settings.paper, sensor, point_map)
 
 
 class PaperVoter:

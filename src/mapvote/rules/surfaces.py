@@ -18,11 +18,12 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.codec.ballot import changed_cells_of
-from mapvote.config import VotingSettings
+from mapvote.config import Settings, VotingSettings
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import above_ground_points, reference_window
+from mapvote.core.sensors import Sensor
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import one_hot
@@ -36,6 +37,11 @@ _BLOCK = 2
 HALO = 96
 """Cells around a block that are judged along, so that what lies across its edge is judged alike from both sides: 29 m,
 a house and what stands before it."""
+
+
+def surface_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> SurfaceVoter:
+    """The voter of ``SURFACES`` (core/rule.py); surfaces need no model of the sensor."""
+    return SurfaceVoter(settings.voting, point_map)
 
 
 class SurfaceVoter:

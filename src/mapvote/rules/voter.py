@@ -12,11 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
+from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
-from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.point_map import cut_tiles
-from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool
+from mapvote.core.point_map import PointMap, cut_tiles
+from mapvote.core.rule import Rule
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, I64, N_STATES, U8, U64, Bool
+from mapvote.core.voting import cast
 from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.rules.packed_tiles import Shelf, Slot
@@ -43,7 +47,7 @@ class TileVotes:
 
 
 class Voter(Protocol):
-    """The paper's votes of each scan (rules/paper.py), or surfaces (rules/surfaces.py)."""
+    """How a vehicle counts by one rule (core/rule.py), for instance the paper's (rules/paper.py)."""
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
@@ -51,6 +55,31 @@ class Voter(Protocol):
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The votes of the scans so far, for every tile with votes, in any order: one by one, so that no drive is too
         long for memory. ``only``: of these tiles. The call changes nothing."""
+
+
+def make_voter(rule: Rule, settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
+    """The voter of a rule, nothing counted yet. MapvoteError if the rule's voter cannot be imported."""
+    voter: Voter = rule.load_voter()(settings, sensor, point_map)
+    return voter
+
+
+class Tally:
+    """Votes per cell and class over a drive: :func:`mapvote.core.voting.cast` on the tiles that a window touches."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, I32] = {}
+        """(256, 256, 5) int32 in VOTE_UNITs."""
+
+    def cast(self, grid: Grid, states: U8, weights: I32) -> None:
+        """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
+        for tile in grid.tiles():
+            window = self.lattice.tile(tile)
+            common = window.intersection(grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
+            inner, outer = common.slices_in(window), common.slices_in(grid)
+            cast(self.tiles[tile][inner], states[outer], weights[outer])
 
 
 _COMPACT_AT = 50_000

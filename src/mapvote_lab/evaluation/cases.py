@@ -24,6 +24,7 @@ from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingS
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
+from mapvote.core.rule import rule_named, rule_names
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteError
 from mapvote.core.voting import one_hot, plurality, to_wire
@@ -75,10 +76,14 @@ def paper_cases(settings: Settings) -> dict[str, Case]:
     return cases
 
 
-def own_cases(settings: Settings) -> dict[str, Case]:
-    """The default method, "surfaces"."""
-    voting = settings.voting.model_copy(update={"method": "surfaces"})
-    return {"surfaces": Case("surfaces", voting, settings.fuse.min_votes)}
+def rule_cases(settings: Settings) -> dict[str, Case]:
+    """Every rule of the table but the paper's, by its name: the product's own and those of plug-ins."""
+    cases = {}
+    for name in rule_names():
+        if name != "paper":
+            voting = settings.voting.model_copy(update={"method": name})
+            cases[name] = Case(name, voting, rule_named(name).min_votes or settings.fuse.min_votes)
+    return cases
 
 
 DEFAULT_CASES = "1,2,3,4,5,surfaces"
@@ -86,12 +91,12 @@ YARDSTICKS = ("nearest", "evidence")
 
 
 def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
-    """Cases by comma-separated names (1 to 5, "1 column" and its like, surfaces, yardsticks, or "all"
+    """Cases by comma-separated names (1 to 5, "1 column" and its like, a rule's name, yardsticks, or "all"
     that there is), and whether the yardsticks are wanted.
 
     MapvoteError names one that there is not, or says that no vote is left.
     """
-    every = {**paper_cases(settings), **own_cases(settings)}
+    every = {**paper_cases(settings), **rule_cases(settings)}
     names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
     for name in names:
         if name not in every and name not in ("yardsticks", *YARDSTICKS):
@@ -184,7 +189,7 @@ def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), read
     return known
 
 
-Rule = tuple[VotingSettings, PaperSettings]
+CountedBy = tuple[VotingSettings, PaperSettings]
 """By which a vehicle counts."""
 
 
@@ -205,7 +210,7 @@ def _cast(
                 tally[r, c, state] += weights[word]
 
 
-def tallies(drive: Words, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32]:
+def tallies(drive: Words, mapped: Bool, rules: Iterable[CountedBy]) -> dict[CountedBy, I32]:
     """(rows, cols, 5) votes in VOTE_UNITs of one drive by each rule, over the truth's window.
 
     ``mapped`` (rows, cols): where the map holds obstacle points.
@@ -221,7 +226,7 @@ def tallies(drive: Words, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32
     return found
 
 
-def counting_rule(case: Case) -> Rule:
+def counting_rule(case: Case) -> CountedBy:
     """Cases that differ only in who decides count alike."""
     return case.voting.model_copy(update={"two_stage": True}), case.paper
 

@@ -19,7 +19,7 @@ from mapvote.matching.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation import figures
 from mapvote_lab.evaluation.baselines import heights_above_ground
-from mapvote_lab.evaluation.cases import YARDSTICKS, ballot_states, paper_cases
+from mapvote_lab.evaluation.cases import ballot_states, paper_cases
 from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.scores import UNSCORED, reliability, same_rows
 from mapvote_lab.evaluation.tables import case_name
@@ -92,7 +92,7 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     truth[[1, 2, UNSCORED]] = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED
     panels = [("Truth (strict)", truth[evaluation.truth.strict])]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
-    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "surfaces", *YARDSTICKS)}
+    shown = {n: e for n, e in evaluation.result.cases.items() if " " not in n}
     names = {n: case_name(n) for n in shown}
     yield "scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."
     yield "local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."

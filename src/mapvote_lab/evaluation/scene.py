@@ -33,6 +33,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import PointMap
 from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.reference import LocalMap
+from mapvote.core.rule import rule_named
 from mapvote.core.types import F64, Drive, PosePrior, Scan
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive, read_map, write_map
@@ -40,10 +41,10 @@ from mapvote.formats.atomic import whole_file, whole_folder
 from mapvote.matching.localiser import GivenPoses, Localise, Localiser
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.rules.voter import NewPoints, Voter
+from mapvote.rules.voter import NewPoints, Voter, make_voter
 from mapvote.survey.build import build_map
-from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.cases import Case, KeptDrive, Progress, Rule, counting_rule, untold
+from mapvote.vehicle import write_ballot
+from mapvote_lab.evaluation.cases import Case, CountedBy, KeptDrive, Progress, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
@@ -174,12 +175,13 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
             sensor=drive.sensor,
         )
-        self._voters: dict[Rule, Voter] = {}
-        for rule in dict.fromkeys(map(counting_rule, cases)):
-            own = settings.model_copy(update=dict(zip(("voting", "paper"), rule, strict=True)))
-            self._voters[rule] = make_voter(own, drive.sensor, point_map)
+        self._voters: dict[CountedBy, Voter] = {}
+        for counted_by in dict.fromkeys(map(counting_rule, cases)):
+            own = settings.model_copy(update=dict(zip(("voting", "paper"), counted_by, strict=True)))
+            rule = rule_named(own.voting.method)
+            self._voters[counted_by] = make_voter(rule, own, drive.sensor, point_map)
         methods = {voting.method for voting, _ in self._voters}
-        self._new_points = {m: NewPoints(point_map.lattice, beyond=m != "paper") for m in methods}
+        self._new_points = {m: NewPoints(point_map.lattice, beyond=rule_named(m).takes_points_beyond) for m in methods}
 
     @property
     def report(self) -> DriveReport:

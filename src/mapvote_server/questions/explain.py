@@ -16,13 +16,14 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
 from mapvote.fusion.decision_record import REASONS, Record, Standing, Why
 from mapvote.fusion.edit import EditVotes
-from mapvote.fusion.fuse import Decision, decide_tile, deletions, rule_of
+from mapvote.fusion.fuse import Decision, decide_tile, deletions
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.shapes.geojson import utc
@@ -220,7 +221,7 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
         return recent_votes(connection, tile, asked)
 
     past = history if policy.round.stage == "two-stage" else None
-    decided = decide_tile(tile, counting, rule_of(policy.round.method), policy.fuse, past)
+    decided = decide_tile(tile, counting, rule_named(policy.round.method), policy.fuse, past)
     standings = standings_of(judged, decided.copies, decided.heard)
     return _Now(tile, cell, asked, judged, standings, said, decided)
 

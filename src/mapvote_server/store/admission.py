@@ -221,11 +221,13 @@ class Intake:
     def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
         ballot, newest, asked = one.ballot, self._newest, self._asked
-        if self._cast_by != one.cast_by or not ballot.settings_hash.startswith(asked.settings_hash):
-            theirs = f"{one.cast_by}, settings {ballot.settings_hash[:16]}"
-            ours = f"{self._cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
-            mend = "vote again with the fleet's configuration (mapvote config)"
-            return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
+        mend = "Vote again with the fleet's configuration (mapvote config)"
+        if self._cast_by != one.cast_by:
+            accepted = f"the current round accepts only {self._cast_by}"
+            return Conflict(f"This ballot uses method {one.cast_by}; {accepted}. {mend}")
+        if not ballot.settings_hash.startswith(asked.settings_hash):
+            accepted = f"the current round accepts only {asked.settings_hash[:16]}"
+            return Conflict(f"This ballot uses settings {ballot.settings_hash[:16]}; {accepted}. {mend}")
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
         impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, self._tiles.keys())

@@ -21,12 +21,13 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import pack_plane
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
 from mapvote.fusion.change_time import emptied_and_filled
 from mapvote.fusion.decision_record import Record, Standing, pack_edit_votes, pack_standings, pack_tally, packed_cells
 from mapvote.fusion.distrust import Copy
-from mapvote.fusion.fuse import fuse_tile, rule_of
+from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote
 from mapvote_server.errors import Unavailable
@@ -139,7 +140,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         return recent_votes(connection, tile, task.asked, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
-    decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
+    decision, edited = fuse_tile(tile, votes, rule_named(cast.method), task.asked.settings, task.version, recent)
     stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
     held, holds = (tile.obstacle_words, edited.obstacle_words) if hashes else (_NOWHERE, _NOWHERE)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import sqlalchemy as sa
 from pydantic import Field, ValidationError
 
-from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_you_mean
+from mapvote.config import FuseSettings, GateSettings, RuleName, Section, Settings, did_you_mean
 from mapvote.core.types import MapvoteError
 from mapvote_server.store import schema
 from mapvote_server.store.queries import log_event
@@ -22,7 +22,7 @@ from mapvote_server.store.queries import log_event
 class RoundPolicy(Section):
     """Method and settings of a round's ballots. Other ballots are refused, and standing ones do not count."""
 
-    method: Literal["paper", "surfaces"] = Field(default="surfaces", description="paper or surfaces")
+    method: RuleName = Field(default="surfaces", description="the vote rule: surfaces, paper, or that of a plug-in")
     stage: Literal["one-stage", "two-stage"] = "two-stage"
     settings_hash: str = Field(
         default="",

@@ -16,10 +16,11 @@ from histories import START_S, WALL, History, seen_along, street
 from mapvote.codec.planes import unpack_bytes
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.rule import rule_named
 from mapvote.core.types import N_STATES, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.decision_record import REASONS, Record, Standing, pack_tally, packed_cells, unpack_tally_plane
-from mapvote.fusion.fuse import decide_tile, rule_of
+from mapvote.fusion.fuse import decide_tile
 from mapvote_server.store import schema
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
@@ -122,7 +123,7 @@ def heard_again(store: Store, connection: sa.Connection, version: Version) -> di
     judged = from_sound_ballots(connection, asked, partial(judged_on, connection, tile))
     votes = [one.vote for one in judged if one.vote is not None]
     policy = asked.policy
-    heard = decide_tile(tile, votes, rule_of(policy.round.method), policy.fuse)
+    heard = decide_tile(tile, votes, rule_named(policy.round.method), policy.fuse)
     copies = {(copy.vehicle, copy.digest) for copy in heard.copies}
     names = {vote.vehicle for vote in heard.votes}
     return {

@@ -1,0 +1,118 @@
+"""The examples of docs/extending.md work from outside the package: a distribution of its own with an entry point."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from command_line import typed
+from mapvote.codec.ballot import Ballot, encode
+from mapvote.config import Settings, choose_case
+from mapvote.core import rule
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import MapvoteError
+from mapvote.fusion.fuse import update_map
+from mapvote.matching.localiser import GivenPoses
+from mapvote.vehicle import vote_drive
+from mapvote_server.api.app import URL, in_process
+from stores import NewStore
+from streets import drive_along, path, street
+
+PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text()
+Install = Callable[[str], None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Lays an example of the page as an installed distribution."""
+    own = list(rule.RULES)
+
+    def lay(module: str) -> None:
+        (source,) = re.findall(rf"^```python\n(# {module}\.py\n.*?)^```", PAGE, re.M | re.S)
+        entries = re.findall(rf'^```toml\n\[project\.entry-points\."([^"]+)"\]\n{module} = "([^"]+)"\n```', PAGE, re.M)
+        ((group, target),) = entries
+        folder = tmp_path / "site"
+        about = folder / f"{module}-1.0.dist-info"
+        about.mkdir(parents=True)
+        (folder / f"{module}.py").write_text(source)
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text(f"[{group}]\n{module} = {target}\n")
+        monkeypatch.syspath_prepend(folder)
+        rule.plugged_in.cache_clear()
+
+    yield lay
+    rule.plugged_in.cache_clear()
+    for name in [name for name in rule.RULES if name not in own]:
+        del rule.RULES[name]
+        sys.modules.pop(name, None)
+
+
+def ballot_by(method: str, point_map: PointMap) -> Ballot:
+    """A short drive past a new wall, voted on by a rule."""
+    poses = path(8)
+    drive = drive_along(poses, 3, prior=poses)
+    settings = choose_case(Settings(), method)
+    given = GivenPoses(drive.stamps_ns, poses)
+    return vote_drive(drive, point_map, settings, localise=given)[0]
+
+
+@pytest.fixture(scope="module")
+def old_map() -> PointMap:
+    """The street without the front of one house, so that a drive finds something new."""
+    points = street(7)
+    gone = (points[:, 1] > 11) & (points[:, 0] > -21) & (points[:, 0] < -7)
+    return map_from_points(points[~gone])
+
+
+def test_a_rule_of_another_distribution_casts_ballots_that_fuse_and_that_a_server_admits(
+    install: Install, old_map: PointMap, new_store: NewStore
+) -> None:
+    install("any_hit")
+    ballot = ballot_by("any_hit", old_map)
+    assert ballot.method == "any_hit"
+    updated, decisions = update_map(old_map, [ballot], Settings().fuse.model_copy(update={"min_votes": 1}))
+    assert sum(decision.added for decision in decisions.values()) > 100, "the new house comes in"
+    assert updated.n_points > old_map.n_points
+    store = new_store(old_map, name="fleet.db")
+    name = store.database.url.database
+    with in_process(store, owner="kim") as transport, httpx2.Client(transport=transport, base_url=URL) as client:
+        refused = client.put(f"/v1/ballots/{ballot.vehicle}/{ballot.drive}", content=encode(ballot))
+        assert refused.status_code == 409, "the policy asks for surfaces"
+    typed("policy", name, "round.method=any_hit")
+    with in_process(store, owner="kim") as transport, httpx2.Client(transport=transport, base_url=URL) as client:
+        admitted = client.put(f"/v1/ballots/{ballot.vehicle}/{ballot.drive}", content=encode(ballot))
+        assert admitted.status_code == 201, admitted.text
+        other = replace(ballot_by("surfaces", old_map), drive="other")
+        refused = client.put(f"/v1/ballots/{other.vehicle}/other", content=encode(other))
+        assert refused.status_code == 409
+        assert "uses method surfaces, two-stage; the current round accepts only any_hit, two-stage" in refused.text
+
+
+def test_a_rule_that_no_distribution_brings_is_named_with_those_that_are_known(old_map: PointMap) -> None:
+    with pytest.raises(MapvoteError, match=r"no case 'any_hit'; choose one of paper, surfaces, 1, 2, 3, 4, 5"):
+        choose_case(Settings(), "any_hit")
+    with pytest.raises(MapvoteError, match="vote rule 'any_hit' is unknown; known are paper, surfaces"):
+        rule.rule_named("any_hit")
+
+
+def test_versions_of_a_rule_never_share_a_round(install: Install) -> None:
+    install("any_hit")
+    settings = choose_case(Settings(), "any_hit")
+    before = settings.digest()
+    rule.RULES["any_hit"] = rule.Rule(voter="any_hit:AnyHit", version="2")
+    assert settings.digest() != before
+
+
+@pytest.mark.slow
+def test_evaluate_scores_a_rule_of_another_distribution(install: Install, tmp_path: Path) -> None:
+    install("any_hit")
+    said = typed("evaluate", "corner", "--seed", "5", "--case", "any_hit")
+    assert "any_hit" in said
+    assert not np.isnan(float(re.findall(r"any_hit\D+([\d.]+)", said)[0]))
