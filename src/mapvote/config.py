@@ -125,6 +125,11 @@ class FuseSettings(Section):
     min_votes: int = Field(
         default=2, ge=1, le=10_000, description="vehicles that a change needs; k + 1 resists k liars"
     )
+    one_vehicle: Literal["once", "days"] = Field(
+        default="once",
+        description="once: a vehicle has one vote; days: its drives of each day (UTC) are a voter of their own, for a "
+        "fleet of one vehicle. A fault of that vehicle then counts as often as it drives",
+    )
     max_contradiction: float = Field(
         default=0.5,
         gt=0,

@@ -134,6 +134,8 @@ def _print_outcome(answer: Mapping[str, Any], otherwise: str) -> None:
     tiles = f" in tiles {'; '.join(answer['tiles'])}" if answer["tiles"] else ""
     changed = f"{answer['points_added']} points added, {answer['points_deleted']} deleted"
     print(f"version {answer['version']} ({what}): {changed}{tiles}")
+    if answer.get("waits"):
+        print(answer["waits"])
     for reason in answer["held"]:
         print(f"hold: {reason}")
 
@@ -322,8 +324,14 @@ def coverage(
         rows.append((f"{about['row']},{about['col']}", f"{about['heading_deg']}°", *ends, *counts))
     if rows:
         print_table(("tile", "heading", "from (x, y), m", "to", "cells", "built", "gone"), rows, "One more pass")
-    else:
+    elif not found["cells"]:
         print("no cell waits for one more pass")
+    if found["without_path"]:
+        print(f"{found['without_path']} of {found['cells']} cells that wait: their ballots do not say where they drove")
+    if found["waits"]:
+        print(found["waits"])
+    if found["damaged"]:
+        typer.echo(f"left out: tiles {'; '.join(found['damaged'])} are damaged (see mapvote check)", err=True)
     if out is not None:
         write_whole(out, json.dumps(found) + "\n")
         print(f"{out}: {len(found['features'])} stretches of road")

@@ -32,7 +32,7 @@ from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, o
 from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
-from mapvote.fusion.tile_vote import TileVote, newest_votes, offered, one_each, silenced
+from mapvote.fusion.tile_vote import TileVote, by_voter, newest_votes, offered, one_each, silenced
 
 History = Callable[[], Sequence[TileVote]]
 """Gives the votes of a tile over a longer time."""
@@ -51,7 +51,7 @@ class Decision:
     """(256, 256) the states by which the tile's points come and go: others where noise spilled over."""
     quorum: int
     heard: Collection[str] = ()
-    """The vehicles whose votes were counted."""
+    """The voters whose votes were counted, see :func:`mapvote.fusion.tile_vote.voter_of`."""
     votes: Sequence[TileVote] = ()
     """Their votes; as all that only the edit needs, none once the tile is edited."""
     denied: Bool | None = None
@@ -137,7 +137,7 @@ def decide_tile(
     fusion/fuse.py), any order. ``history``: called, where objects are temporary, for all votes that count of the last
     ``history_days`` (fusion/change_time.py); without it all is of one moment, and everything new stays.
     """
-    given = list(drives)
+    given = by_voter(drives, settings)
     drives, copies = originals(given, settings)
     past = None if history is None else cache(partial(_originals_of, history, given, copies, settings))
     silenced = liars_among(copies, drives)
@@ -168,7 +168,7 @@ def _originals_of(
 ) -> Sequence[TileVote]:
     """The votes that ``history`` gives, without copies. Where they are those of the ``drives``, their ``copies`` are
     known."""
-    votes = history()
+    votes = by_voter(history(), settings)
     same = {(vote.vehicle, vote.digest) for vote in votes} == {(drive.vehicle, drive.digest) for drive in drives}
     return without(copies, votes) if same else originals(votes, settings)[0]
 

@@ -55,6 +55,39 @@ class Stretch:
         return self.built + self.gone
 
 
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """Changes that only the quorum prevents: all that have seen them agree, and they are one vote too few."""
+
+    cells: int
+    drives: int
+    """Drives that vote for them."""
+    vehicles: Sequence[str]
+    """Vehicles of these drives, by name."""
+    quorum: int
+
+    def __str__(self) -> str:
+        noun, verb = ("cell", "waits") if self.cells == 1 else ("cells", "wait")
+        drives = f"{self.drives} drive{'s say' if self.drives > 1 else ' says'} so"
+        alone = len(self.vehicles) == 1
+        by = f"{'all ' if self.drives > 1 and alone else ''}by {' and '.join(self.vehicles)}"
+        another = {2: "a second", 3: "a third"}.get(self.quorum, "another")
+        way_out = f"{another} vehicle or `fuse.min_votes = {self.quorum - 1}` decides"
+        return f"{self.cells} {noun} {verb}: {drives}, {by}; {way_out}"
+
+
+def lacks_quorum_only(states: Sequence[U8], quorum: int) -> U8:
+    """(rows, cols) the change that ``quorum`` - 1 of the vehicles and more than half of those that determined the cell
+    vote for; NO_VOTE in all other cells. ``states``: (rows, cols) of each vehicle."""
+    said = np.stack(states)
+    determined = np.isin(said, _DETERMINED).sum(axis=0)
+    out = np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    for change in (CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED) if quorum > 1 else ():
+        votes = (said == change).sum(axis=0)
+        out[(votes == quorum - 1) & (2 * votes > determined)] = change
+    return out
+
+
 def one_vote_short(states: Sequence[U8], quorum: int) -> U8:
     """(rows, cols) the change that one more vote for it would decide; NO_VOTE in all other cells.
 

@@ -123,9 +123,24 @@ class Dated(Protocol):
 D = TypeVar("D", bound=Dated)
 
 
+def voter_of(vote: Dated, settings: FuseSettings) -> str:
+    """Whose vote a drive is: its vehicle's; with ``one_vehicle = "days"`` its vehicle's of the day (UTC) on which the
+    drive ended."""
+    if settings.one_vehicle == "once":
+        return vote.vehicle
+    return f"{vote.vehicle} on {np.datetime64(vote.end_ns // DAY_NS, 'D')}"
+
+
+def by_voter(votes: Iterable[TileVote], settings: FuseSettings) -> list[TileVote]:
+    """The votes, each under the name of its voter, see :func:`voter_of`."""
+    if settings.one_vehicle == "once":
+        return list(votes)
+    return [replace(vote, vehicle=voter_of(vote, settings)) for vote in votes]
+
+
 def newest_votes(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     """The votes inside the window: drives within ``max_age_days`` of the newest on this tile, then those
-    of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
+    of the ``latest_vehicles`` voters (:func:`voter_of`) that passed last. Ties go to the later name."""
     votes = list(votes)
     if not votes:
         return []
@@ -133,12 +148,13 @@ def newest_votes(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     recent = [v for v in votes if newest - v.end_ns <= settings.max_age_days * DAY_NS]
     last: dict[str, int] = {}
     for vote in recent:
-        last[vote.vehicle] = max(last.get(vote.vehicle, vote.end_ns), vote.end_ns)
-    ranked = sorted(last, key=lambda vehicle: (last[vehicle], vehicle), reverse=True)
+        voter = voter_of(vote, settings)
+        last[voter] = max(last.get(voter, vote.end_ns), vote.end_ns)
+    ranked = sorted(last, key=lambda voter: (last[voter], voter), reverse=True)
     if len(ranked) <= settings.latest_vehicles:
         return recent
     chosen = set(ranked[: settings.latest_vehicles])
-    return [v for v in recent if v.vehicle in chosen]
+    return [v for v in recent if voter_of(v, settings) in chosen]
 
 
 def silenced(vote: TileVote, cells: I64) -> TileVote:

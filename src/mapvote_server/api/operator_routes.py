@@ -32,6 +32,7 @@ from mapvote_server.api.schemas import (
     Log,
     MinCells,
     Newest,
+    Passes,
     Places,
     PolicyAsk,
     PublishAsk,
@@ -53,6 +54,7 @@ from mapvote_server.api.schemas import (
 )
 from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Services
 from mapvote_server.errors import Held, Unavailable
+from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.explain import CellStory, explain_cell
 from mapvote_server.questions.history import changes_between, log_of, overview, page_between
 from mapvote_server.questions.vehicles import (
@@ -60,7 +62,6 @@ from mapvote_server.questions.vehicles import (
     standing_rows,
     tiles_seen,
     vehicle_standings,
-    wanted_passes,
 )
 from mapvote_server.store import keys
 from mapvote_server.store.integrity import check, restore_plane, set_aside
@@ -105,7 +106,8 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
             done = publish(parts.store, by=by, **said, gate=parts.gate, executor=executor)
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
-    return _as_answer(done)
+    waits = None if done.tiles else waiting_votes(parts.store)
+    return _as_answer(done, "" if waits is None else str(waits))
 
 
 @contextmanager
@@ -125,7 +127,7 @@ def _round(parts: Services, by: str, dry_run: bool) -> Iterator[Executor]:
         raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
 
 
-def _as_answer(done: Outcome) -> Published:
+def _as_answer(done: Outcome, waits: str = "") -> Published:
     return Published(
         version=done.version,
         published=done.published,
@@ -133,6 +135,7 @@ def _as_answer(done: Outcome) -> Published:
         points_added=done.added,
         points_deleted=done.deleted,
         held=list(done.held),
+        waits=waits,
     )
 
 
@@ -201,7 +204,7 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     return as_json(tile_squares(answer, parts.store.lattice) if format == "geojson" else {"tiles": answer})
 
 
-@router.get("/v1/coverage/passes", response_model=Places, responses=problems(403), summary="Where to drive next")
+@router.get("/v1/coverage/passes", response_model=Passes, responses=problems(403), summary="Where to drive next")
 def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
     return as_json(wanted_passes(parts.store))

@@ -181,6 +181,7 @@ class Published(Answer):
     points_added: int
     points_deleted: int
     held: list[str]
+    waits: str = Field(default="", description="changes that lack only the quorum, if nothing was published")
 
 
 class VerdictAnswer(Answer):
@@ -291,6 +292,7 @@ class DeskAnswer(Answer):
 
     version: int
     held: list[str] = Field(description="why the policy would hold the version")
+    waits: str = Field(description="changes that lack only the quorum, if nothing is pending")
     pending: Pending
     waiting: list[PendingFeature]
     reviewed: list[PendingFeature]
@@ -311,6 +313,15 @@ class Places(Answer):
     type: Literal["FeatureCollection"]
     frame: str
     features: list[PlacedFeature]
+
+
+class Passes(Places):
+    """Stretches of road, and the changes that wait for one more vote."""
+
+    cells: int = Field(description="that one more vote would decide")
+    without_path: int = Field(description="of these cells those that no drive with a path saw")
+    waits: str = Field(description="changes that lack only the quorum")
+    damaged: list[str] = Field(description="tiles that cannot be read, and are left out")
 
 
 class CoveredTile(Answer):

@@ -22,6 +22,7 @@ from mapvote.shapes.change_objects import ChangeObject, change_objects, changed_
 from mapvote.shapes.geojson import to_geojson
 from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
+from mapvote_server.questions.coverage import waiting_votes
 from mapvote_server.store.fusion_jobs import Fused
 from mapvote_server.store.publish import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote_server.store.queries import load_tile, tile_of
@@ -40,6 +41,8 @@ class Desk:
     """The newest, on which a publish would build."""
     held: list[str]
     """The policy's reasons to hold the version."""
+    waits: str
+    """Changes that lack only the quorum, if a publish would change nothing; else ""."""
     pending: dict[str, Any]
     """Changes that a publish would make, GeoJSON; accepted ones carry the verdict."""
     waiting: list[dict[str, Any]]
@@ -94,7 +97,9 @@ def _desk_of(store: Store, found: Round) -> Desk:
     }
     clouds = b"".join(came_and_went(old, new) for old, new in tiles)
     waiting = _waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
-    return Desk(version, [], pending, waiting, left_out, cells, edited, clouds)
+    lacking = None if found.changed else waiting_votes(store)
+    waits = "" if lacking is None else str(lacking)
+    return Desk(version, [], waits, pending, waiting, left_out, cells, edited, clouds)
 
 
 def review(

@@ -25,6 +25,7 @@ from mapvote.fusion.decision_record import REASONS, Record, Standing, Why
 from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.fuse import Decision, decide_tile, deletions
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
+from mapvote.fusion.next_pass import Waiting, lacks_quorum_only
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.shapes.geojson import utc
 from mapvote_server.store import schema
@@ -167,7 +168,7 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions else None
     by_version = [CellDecision(record.version, state, _edit_of(record, cell)) for record, state in decisions]
-    return CellStory(row, col, votes, by_version, probability, _thing(now))
+    return CellStory(row, col, votes, by_version, probability, "; ".join([*_lacks(now, votes), *_thing(now)]))
 
 
 def seen(stamp_ns: int | None, known: bool) -> int | None:
@@ -222,7 +223,7 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
 
     past = history if policy.round.stage == "two-stage" else None
     decided = decide_tile(tile, counting, rule_named(policy.round.method), policy.fuse, past)
-    standings = standings_of(judged, decided.copies, decided.heard)
+    standings = standings_of(judged, decided.copies, decided.heard, policy.fuse)
     return _Now(tile, cell, asked, judged, standings, said, decided)
 
 
@@ -323,7 +324,19 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     return round(float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0]), 3)
 
 
-def _thing(now: _Now) -> str:
+def _lacks(now: _Now, votes: Sequence[CellVote]) -> list[str]:
+    """Text: the change that lacks only the quorum, and the drives among ``votes`` that say so."""
+    states = [vote.states for vote in now.decided.votes if vote.states is not None]
+    if not states:
+        return []
+    change = int(lacks_quorum_only([plane[now.cell].reshape(1, 1) for plane in states], now.decided.quorum)[0, 0])
+    drives = [vote for vote in votes if vote.counts and vote.state == state_name(change)]
+    if change == NO_VOTE or not drives:
+        return []
+    return [str(Waiting(1, len(drives), sorted({vote.vehicle for vote in drives}), now.decided.quorum))]
+
+
+def _thing(now: _Now) -> list[str]:
     """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
     tile, cell, fuse = now.tile, now.cell, now.asked.settings
     text = _waits(now)
@@ -338,7 +351,7 @@ def _thing(now: _Now) -> str:
         expected = float(expected_days(tile.memory, here, 0.0, fuse)[0])
         past = f"{stays} things came and went here, after {days:.1f} days on average"
         text.append(f"{past}; the next can be expected to stay {expected:.1f}")
-    return "; ".join(text)
+    return text
 
 
 def _waits(now: _Now) -> list[str]:

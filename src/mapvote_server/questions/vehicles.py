@@ -8,7 +8,6 @@ test is exact for few data, and "undecidable" is one of its results.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -20,8 +19,7 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import F32, F64, I64, U8, CellState
-from mapvote.fusion.next_pass import Stretch, Witness, stretches
+from mapvote.core.types import F32, I64, U8, CellState
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.shapes.geojson import collection, utc
 from mapvote.shapes.outlines import pieces
@@ -214,44 +212,6 @@ def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
 def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
     """A row per vehicle, without the places."""
     return [{f.name: getattr(s, f.name) for f in fields(s) if f.name != "evidence"} for s in standings]
-
-
-def wanted_passes(store: Store) -> dict[str, Any]:
-    """Stretches of road on which one more pass would decide cells, those with most cells first: GeoJSON lines in map
-    metres, each in the direction to drive, with what the pass would decide there."""
-    found: list[Stretch] = []
-    with store.database.reading() as connection:
-        policy, driven = policy_in(connection), _driven(connection, store)
-        for window, votes in votes_by_tile(connection, store.lattice, policy):
-            witnesses = [Witness(said_by(vote), driven[vote.vehicle]) for vote in votes]
-            found += stretches(window, witnesses, policy.fuse.min_votes)
-    return collection(
-        [
-            (
-                {"type": "LineString", "coordinates": np.round(stretch.path_m, 2).tolist()},
-                {
-                    "row": stretch.tile[0],
-                    "col": stretch.tile[1],
-                    "heading_deg": round(float(np.degrees(stretch.heading_rad))),
-                    "cells": stretch.cells,
-                    "built": stretch.built,
-                    "gone": stretch.gone,
-                },
-            )
-            for stretch in sorted(found, key=lambda one: (-one.cells, one.tile, one.heading_rad))
-        ]
-    )
-
-
-def _driven(connection: sa.Connection, store: Store) -> dict[str, list[F64]]:
-    """By vehicle: the path of each of its standing drives, (n, 2) map metres."""
-    b, p = schema.ballots.c, schema.paths.c
-    query = sa.select(b.vehicle, p.path).join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
-    out = defaultdict[str, list[F64]](list)
-    for vehicle, path in connection.execute(query.order_by(b.seq)):
-        corner = np.array([store.lattice.x0, store.lattice.y0])
-        out[vehicle].append(corner + (unpack_path(path)[:, ::-1] + 0.5) * CELL_SIZE)
-    return out
 
 
 def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:

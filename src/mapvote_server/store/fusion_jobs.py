@@ -20,6 +20,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import pack_plane
 from mapvote.codec.tile_planes import pack_tile
+from mapvote.config import FuseSettings
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
@@ -29,7 +30,7 @@ from mapvote.fusion.decision_record import Record, Standing, pack_edit_votes, pa
 from mapvote.fusion.distrust import Copy
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import TileVote, voter_of
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, address_of
 from mapvote_server.store.integrity import Damage, DamagedBallots
@@ -152,7 +153,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
             pack_plane(decision.states, 1),  # quick rather than small
             pack_tally(decision.tally),
             pack_agreed(decision.odds, decision.states),
-            pack_standings(standings_of(judged, decision.copies, decision.heard)),
+            pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings)),
             pack_edit_votes(decision.edit_votes),
         ),
         vehicles=decision.vehicles,
@@ -170,17 +171,20 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     )
 
 
-def standings_of(judged: Sequence[Judged], copies: Iterable[Copy], heard: Collection[str]) -> list[Standing]:
-    """The standing of every ballot on a tile, by the copies among them and the vehicles that counted."""
+def standings_of(
+    judged: Sequence[Judged], copies: Iterable[Copy], heard: Collection[str], settings: FuseSettings
+) -> list[Standing]:
+    """The standing of every ballot on a tile, by the copies among them and the voters that counted."""
     copied = {(copy.vehicle, copy.digest): copy for copy in copies}
-    seqs = {(one.stored.vehicle, one.stored.digest): one.stored.seq for one in judged}
+    seqs = {(voter_of(one.stored, settings), one.stored.digest): one.stored.seq for one in judged}
     found = []
     for one in judged:
         why, alike = one.why, 0
-        copy = copied.get((one.stored.vehicle, one.stored.digest))
+        voter = voter_of(one.stored, settings)
+        copy = copied.get((voter, one.stored.digest))
         if copy is not None:
             why, alike = "copy", seqs[copy.heard_vehicle, copy.heard_digest]
-        elif not why and one.stored.vehicle not in heard:
+        elif not why and voter not in heard:
             why = "opposes"
         found.append(Standing(one.stored.seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike))
     return found

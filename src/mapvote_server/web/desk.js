@@ -23,7 +23,7 @@ export async function showDesk() {
   $("desk").hidden = false;
   $("desk-tally").textContent = waiting.length
     ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
-    : `No change is pending: a publish would leave version ${version} as it is.`;
+    : `No change is pending: a publish would leave version ${version} as it is.${desk.waits ? ` ${desk.waits}.` : ""}`;
   $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`The policy would hold it: ${reason}`])));
   $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
   const stays = [...(desk.waiting ?? [])].sort((a, b) => size(a) - size(b));
