@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from hand_made import Say, make_ballot, make_tile, states_plane, two_walls, wall
 from mapvote.cli import app
 from mapvote.config import FuseSettings
+from mapvote.core.rule import SURFACES
 from mapvote.core.types import CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
@@ -103,7 +104,7 @@ def test_by_days_a_tile_is_fused_as_if_each_day_of_a_vehicle_were_a_vehicle(said
     for drives, policy in ((votes, "days"), (renamed, "once")):
         fuse = FuseSettings.model_validate({"one_vehicle": policy, "latest_vehicles": 4})
         counting = newest_votes(drives, fuse)
-        found.append((fuse_tile(tile, counting, "columns", fuse, 2, partial(list, counting)), len(counting)))
+        found.append((fuse_tile(tile, counting, SURFACES, fuse, 2, partial(list, counting)), len(counting)))
     (one, n), (other, m) = found
     assert n == m
     assert np.array_equal(one[0].states, other[0].states)
