@@ -8,6 +8,7 @@ import shlex
 import socket
 import subprocess
 import sys
+import time
 import urllib.request
 from collections import deque
 from dataclasses import replace
@@ -54,7 +55,7 @@ def driven(tmp_path: Path) -> Any:
     live = Live(tmp_path, T_base_lidar=mount)
     live.poses = live.poses @ np.linalg.inv(mount)
     board, network = StatusBoard(live.live._maps, live.outbox), Network()
-    topics = SimpleNamespace(clouds=0, map_frame="map")
+    topics = SimpleNamespace(clouds=0, map_frame="map", now_ns=time.time_ns)
     ros = RosStatus(network, "car")  # type: ignore[arg-type]
     board.tell(0.0, ros.diagnose)
     for i in range(SCANS):

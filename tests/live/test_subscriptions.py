@@ -15,7 +15,8 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.live.dds import Chosen, Network, PublishedTopic, TopicRate, choose_topics, missing_for_drive
+from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
+from mapvote.live.dds import Network, PublishedTopic, TopicRate
 from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
@@ -109,7 +110,7 @@ class Vehicle:
 
 def subscriptions(domain: int, points: list[str]) -> Subscriptions:
     network = Network(domain)
-    chosen = choose_topics(network, points, None, 60.0, lambda: False)
+    chosen = choose_topics(network, Wish(tuple(points)), Voice(print), lambda: False, 60.0)
     assert chosen is not None
     return Subscriptions(network, chosen, SENSORS["hdl32e"])
 

@@ -32,15 +32,17 @@ def topics(
 
     mapvote topics
     """
-    from mapvote.live.dds import Network, measure_rates, missing_for_drive
+    from mapvote.live.choice import missing_for_drive
+    from mapvote.live.dds import Network, measure_rates
 
-    found = measure_rates(Network(domain), seconds)
+    network = Network(domain)
+    found = measure_rates(network, seconds)
     for one in found:
         rate = "not read here" if one.rate_hz is None else f"{one.rate_hz:.1f} Hz"
         quality = "reliable" if one.published.reliable else "best effort"
         frame = f" in {one.frame}" if one.frame else ""
         print(f"{one.published.topic} [{one.published.kind}] {rate}, {quality}{frame}")
-    for sentence in missing_for_drive(found):
+    for sentence in missing_for_drive(found, network.domain):
         print(f"missing: {sentence}")
 
 
@@ -79,7 +81,10 @@ def drive(
     ] = None,
     odometry: Annotated[
         str | None,
-        typer.Option(metavar="TOPIC", help="Odometry topic in the map's frame; default: the only one, if any"),
+        typer.Option(
+            metavar="TOPIC",
+            help="topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped), or /tf",
+        ),
     ] = None,
     mount: Annotated[
         str | None,
@@ -107,6 +112,18 @@ def drive(
         bool, typer.Option("--unchecked", help="vote even if the checks of the first ten seconds fail")
     ] = False,
     domain: Domain = None,
+    namespace: Annotated[
+        str, typer.Option(metavar="NAME", help="ROS 2 namespace of the vehicle's topics, for example /car1")
+    ] = "",
+    tf: Annotated[str, typer.Option(metavar="TOPIC", help="topic of moving frames; default: /tf")] = "",
+    tf_static: Annotated[str, typer.Option(metavar="TOPIC", help="topic of fixed frames; default: /tf_static")] = "",
+    remap: Annotated[
+        list[str] | None, typer.Option("-r", "--remap", metavar="FROM:=TO", help="remap a topic, as in ROS 2")
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option("-p", "--param", metavar="NAME:=VALUE", help="use_sim_time:=true")
+    ] = None,
+    ros_args: Annotated[bool, typer.Option("--ros-args", hidden=True)] = False,
     config: Config = None,
 ) -> None:
     """Vote while driving, from ROS 2 topics. A ballot closes every 2 km, every 10 minutes and after 2 minutes at rest.
@@ -114,12 +131,16 @@ def drive(
     mapvote drive --map URL --vehicle car_1 --send URL
     """
     import logging
+    import math
     import time
 
     from mapvote.config import load_settings
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
-    from mapvote.live.dds import Network, choose_topics
+    from mapvote.live.choice import Voice, Wish, choose_topics
+    from mapvote.live.dds import Network
+    from mapvote.live.messages import POSE_TOPIC
+    from mapvote.live.names import ros_names, sim_time_of
     from mapvote.live.service import Plan, run
     from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
     from mapvote.live.subscriptions import Subscriptions
@@ -138,6 +159,11 @@ def drive(
         idle,
         not unchecked,
     )
+    frames = [f"{topic}:={to}" for topic, to in (("/tf", tf), ("/tf_static", tf_static)) if to]
+    names = ros_names(namespace, [*(remap or []), *frames])
+    sim_time = sim_time_of(parameter or [])
+    wish = Wish(names.named("points", points), next(iter(names.named("odometry", odometry)), None), names)
+    voice = Voice(lambda text: print(text, flush=True))
     model, network, stopped = None if sensor is None else read_sensor(sensor, "--sensor"), Network(domain), [False]
     heartbeat = Heartbeat()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -150,12 +176,13 @@ def drive(
     with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
         warm_vehicle(plan.settings)
         heartbeat.ready()
-        chosen = choose_topics(network, points.split(",") if points else [], odometry, idle or 1e9, ended)
+        chosen = choose_topics(network, wish, voice, ended, idle or math.inf)
         if chosen is None:
             return
-        names = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
-        print(f"listening to {' and '.join(names)}", flush=True)
-        topics, ros = Subscriptions(network, chosen, model), RosStatus(network, vehicle)
+        listened = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
+        print(f"listening to {' and '.join(listened)}", flush=True)
+        topics = Subscriptions(network, chosen, model, names, sim_time=sim_time)
+        ros = RosStatus(network, vehicle, names.resolve(POSE_TOPIC))
         board = StatusBoard(maps, outbox)
         board.tell(1.0, ros.diagnose)
         if metrics is not None:
@@ -163,7 +190,7 @@ def drive(
         with _view(board, vehicle) if watch else nullcontext():
             if not watch:
                 board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
-            live = run(plan, topics, maps, outbox, ended, [board, ros.poses])
+            live = run(plan, topics, maps, outbox, ended, [board, ros.poses], voice)
         heartbeat.stopping()
     print(f"{vehicle}: {_result(live)}")
 

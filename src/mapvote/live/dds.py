@@ -12,7 +12,7 @@ import ctypes
 import os
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import first_line, require
-from mapvote.live.messages import CLOUD, ODOMETRY, READ, from_cdr, typestore
+from mapvote.live.messages import READ, from_cdr, typestore
 from mapvote.live.ros_environment import ros_environment
 
 _DEPTH = 64
@@ -308,61 +308,3 @@ def _frame(kind: str, data: memoryview) -> str:
         return str(getattr(getattr(from_cdr(kind, data), "header", None), "frame_id", ""))
     except MapvoteError as error:
         return f"damaged: {error}"
-
-
-def missing_for_drive(rates: list[TopicRate]) -> list[str]:
-    """What a vehicle needs and does not receive, a sentence each; empty if nothing is missing."""
-    if not rates:
-        return [
-            "no topic is sent in this domain: check ROS_DOMAIN_ID (here and there the same), and that CYCLONEDDS_URI "
-            "names an interface that the senders use"
-        ]
-    received = {one.published.kind for one in rates if one.messages}
-    out = []
-    if CLOUD not in received:
-        out.append(f"no {CLOUD} comes: start the LiDAR's driver")
-    if ODOMETRY not in received:
-        out.append(f"no {ODOMETRY} comes: without a prior the whole map is searched at the start")
-    if not any(one.published.topic == "/tf_static" and one.messages for one in rates):
-        out.append("no /tf_static comes: odometry is taken for the LiDAR's own pose")
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """The topics of one vehicle."""
-
-    points: tuple[PublishedTopic, ...]
-    """The first LiDAR's is the one in whose frame scans are."""
-    odometry: PublishedTopic | None
-
-
-def choose_topics(
-    network: Network, points: Sequence[str], odometry: str | None, patience_s: float, ended: Callable[[], bool]
-) -> Chosen | None:
-    """The topics named, else the only ones of their types; None if ``ended`` first. MapvoteError lists the published
-    ones if these do not come."""
-    end = time.monotonic() + patience_s
-    while not ended():
-        published = network.published()
-        clouds = [one for one in published if one.kind == CLOUD and (not points or one.topic in points)]
-        poses = [one for one in published if one.kind == ODOMETRY and odometry in (None, one.topic)]
-        late = time.monotonic() > end
-        if len(clouds) >= max(len(points), 1) and (poses or late):
-            break
-        if late:
-            listed = ", ".join(f"{one.topic} [{one.kind}]" for one in published) or "nothing"
-            wanted = ", ".join(points) or CLOUD
-            raise MapvoteError(f"no topic {wanted} in DDS domain {network.domain}; sent there: {listed}")
-        network.wait(0.1)
-    else:
-        return None
-    if not points and len(clouds) > 1:
-        names = ",".join(one.topic for one in clouds)
-        raise MapvoteError(f"several LiDARs: choose one, or join several, with --points {names}")
-    if len(poses) > 1:
-        raise MapvoteError(f"several topics; choose with --odometry: {', '.join(one.topic for one in poses)}")
-    if odometry is not None and not poses:
-        raise MapvoteError(f"no topic {odometry} of {ODOMETRY} in DDS domain {network.domain}")
-    by_name = {one.topic: one for one in clouds}
-    return Chosen(tuple(by_name[name] for name in points or by_name), poses[0] if poses else None)

@@ -19,7 +19,13 @@ from mapvote.formats.drives.rosbag import pose_of_message
 from mapvote.formats.extras import first_line, require
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
-READ = {CLOUD, ODOMETRY, TF, "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "std_msgs/msg/Header"}
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSES = (ODOMETRY, POSE_WITH_COVARIANCE, POSE)
+"""Types of topics that say where a vehicle is."""
+POSE_TOPIC = "mapvote/pose"
+"""Where a vehicle publishes its own pose, below its namespace."""
+CLOCK = "rosgraph_msgs/msg/Clock"
+READ = {CLOUD, ODOMETRY, TF, "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "std_msgs/msg/Header", CLOCK}
 READ |= {f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")}
 READ |= {
     f"geometry_msgs/msg/{name}{stamped}"
@@ -104,7 +110,12 @@ def to_cdr(kind: str, message: Any) -> bytes:
 
 def stamp_ns(header: Any) -> int:
     """The time in a std_msgs/Header, nanoseconds."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    return time_ns(header.stamp)
+
+
+def time_ns(time: Any) -> int:
+    """A builtin_interfaces/Time, nanoseconds."""
+    return int(time.sec) * 10**9 + int(time.nanosec)
 
 
 def header_of(time_ns: int, frame_id: str) -> Any:

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
-from mapvote.live.drive import FirstSeconds, LiveDrive
+from mapvote.live.choice import WAITS, Voice
+from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
+from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
 from mapvote.live.subscriptions import Cloud, Subscriptions
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")
-_PATIENCE_S = 5.0
-"""How long frames and odometry may take to come, after the first clouds."""
 _LOOP_S = 0.05
+_SILENT_S = 10.0
+"""Without a message for so long, a topic on the road is silent."""
+_JUDGED = 50
+"""Scans after which it is judged whether they find map and place."""
+_KEPT_SCANS, _KEPT_POSES = 50, 5000
+"""Scans and poses that wait until sensor and frames are known; the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,47 +52,75 @@ Watcher = Callable[[LiveDrive, Subscriptions], None]
 
 
 def prepare(
-    topics: Subscriptions, plan: Plan, ended: Callable[[], bool]
+    topics: Subscriptions, plan: Plan, ended: Callable[[], bool], voice: Voice | None = None
 ) -> tuple[list[list[Cloud]], list[tuple[int, F64]]]:
     """Take messages until sensor and mounts are known. Returns the scans and poses that arrived meanwhile: none if no
     cloud arrived for the idle time.
 
-    MapvoteError if /tf_static does not say where they are.
+    What is missing is said by ``voice``. MapvoteError if frames or odometry's mount are missing for the idle time.
     """
-    scans: list[list[Cloud]] = []
-    poses: list[tuple[int, F64]] = []
-    first_s, start = np.inf, time.monotonic()
-    while not ended() and (scans or not plan.idle_s or time.monotonic() < start + plan.idle_s):
+    voice = voice or Voice(log.warning)
+    scans: deque[list[Cloud]] = deque(maxlen=_KEPT_SCANS)
+    poses: deque[tuple[int, F64]] = deque(maxlen=_KEPT_POSES)
+    start_s = time.monotonic()
+    first_s = np.inf
+    while not ended():
         topics.network.wait(_LOOP_S)
         poses += topics.take_poses()
         scans += topics.take_scans()
+        now_s = time.monotonic()
         if scans:
-            first_s = min(first_s, time.monotonic())
-        lacking = _lacking(topics, plan)
-        tracked = topics.chosen.odometry is None or topics.base_frame or poses
-        if scans and topics.measure(scans) and not lacking and tracked:
+            first_s = min(first_s, now_s)
+        elif plan.idle_s and now_s >= start_s + plan.idle_s:
             break
-        if time.monotonic() > first_s + _PATIENCE_S and (topics.sensor is not None or not topics.frames[0]):
-            if lacking:
-                raise MapvoteError(lacking)
+        lack = _lack(topics, plan)
+        known = bool(scans) and topics.measure(scans)
+        tracked = topics.chosen.odometry is None or topics.poses > 0 or now_s > first_s + WAITS.odometry_s
+        if known and tracked and not lack:
             break
-    return scans, poses
+        if lack and plan.idle_s and now_s > max(start_s, first_s) + plan.idle_s:
+            raise MapvoteError(lack)
+        voice.lacks(lack or ("" if tracked else _no_pose(topics)))
+    if topics.chosen.odometry is not None and not topics.poses and scans:
+        log.warning("%s. The drive begins without it: the whole map is searched", _no_pose(topics))
+    return list(scans), list(poses)
 
 
-def _lacking(topics: Subscriptions, plan: Plan) -> str:
-    """What does not come of the frames that the drive needs, and how to mend it; "" if all is known."""
-    if not topics.frames[0]:
-        others = ", ".join(topic.topic for topic in topics.chosen.points[1:])
-        return f"no cloud comes from {topics.chosen.points[0].topic}, but from {others}: is it on?"
-    if topics.mounts() is None:
+def _no_pose(topics: Subscriptions) -> str:
+    """Why no pose comes of the chosen topic, and what to type."""
+    assert topics.chosen.odometry is not None
+    topic = topics.chosen.odometry.topic
+    if topics.chosen.odometry.kind == TF:
+        frames = ", ".join(topics.frames.names) or "none"
         return (
-            f"/tf_static does not say where {', '.join(topics.frames[1:])} sit to {topics.frames[0]}: start "
-            "robot_state_publisher, or name one LiDAR with --points"
+            f"no frame that moves on {topic} carries {topics.lidar_frames[0]}; frames: {frames}; type --odometry TOPIC"
+        )
+    if topics.last_unusable:
+        return f"{topic} sends nothing that can be used ({topics.last_unusable}); mend its sender, or type --odometry"
+    return f"{topic} is announced but sends nothing: start the odometry, or type --odometry TOPIC"
+
+
+def _lack(topics: Subscriptions, plan: Plan) -> str:
+    """What does not come of the clouds and frames that the drive needs, and what to type; "" if all is known."""
+    silent = [one.topic for one, frame in zip(topics.chosen.points, topics.lidar_frames, strict=True) if not frame]
+    if silent and topics.clouds == 0 and topics.last_unusable:
+        return f"{silent[0]} sends nothing that can be used: {topics.last_unusable}"
+    if silent:
+        heard = ", ".join(one.topic for one in topics.chosen.points if one.topic not in silent)
+        instead = f"; {heard} sends: type --points {heard}" if heard else ""
+        return f"{', '.join(silent)} is announced but sends no cloud: is the LiDAR on{instead}?"
+    first = topics.lidar_frames[0]
+    frames = ", ".join(topics.frames.names) or f"none, is {topics.tf_static} sent? (--tf-static TOPIC)"
+    if topics.mounts() is None:
+        others = ", ".join(topics.lidar_frames[1:])
+        return (
+            f"no frames join {others} to {first}: start robot_state_publisher, or name one LiDAR with --points. Frames "
+            f"heard: {frames}"
         )
     if plan.T_base_lidar is None and topics.chosen.odometry is not None and topics.T_base_lidar() is None:
         return (
-            f"/tf_static does not say where {topics.frames[0]} sits on {topics.base_frame}, which odometry "
-            "tracks: start robot_state_publisher, or say --mount"
+            f"no frames join {first} to {topics.base_frame}, which odometry tracks: start robot_state_publisher, or "
+            f"type --mount x,y,z,roll,pitch,yaw. Frames heard: {frames}"
         )
     return ""
 
@@ -97,31 +132,21 @@ def run(
     outbox: Outbox,
     ended: Callable[[], bool],
     watchers: Sequence[Watcher] = (),
+    voice: Voice | None = None,
 ) -> LiveDrive | None:
     """Vote until ``ended``, or until no cloud arrived for the idle time. Returns the drive, whose last ballot has left.
     None if it ended before a cloud arrived. MapvoteError if the first seconds show an error: then nothing leaves."""
-    scans, poses = prepare(topics, plan, ended)
+    voice = voice or Voice(log.warning)
+    scans, poses = prepare(topics, plan, ended, voice)
     if ended() or not scans or topics.sensor is None:
         return None
-    sensor, T = topics.sensor, plan.T_base_lidar
-
-    def make_vehicle(point_map: PointMap) -> Vehicle:
-        return Vehicle(plan.vehicle, sensor, point_map, plan.settings)
-
-    live = LiveDrive(
-        make_vehicle,
-        maps,
-        outbox,
-        name=plan.name,
-        cuts=plan.cuts,
-        with_poses=topics.chosen.odometry is not None,
-        T_base_lidar=topics.T_base_lidar() if T is None else T,
-        first=FirstSeconds(topics.sensor_told) if plan.checked else None,
-    )
+    live = _live_drive(plan, topics, maps, outbox)
+    needs = Needs(plan, maps)
     last_s = time.monotonic()
     while not ended():
-        for pose in poses:
-            live.on_pose(*pose)
+        if _mounted(live, topics, plan):
+            for pose in poses:
+                live.on_pose(*pose)
         for clouds in scans:
             live.on_scan(topics.waiting(clouds))
         stepped = live.step()
@@ -131,6 +156,7 @@ def run(
             last_s = time.monotonic()
         if plan.idle_s and time.monotonic() > last_s + plan.idle_s:
             break
+        voice.lacks(needs.lack(live, topics, time.monotonic() - last_s))
         for watcher in watchers:
             watcher(live, topics)
         if not stepped:
@@ -139,6 +165,80 @@ def run(
     _check(live, topics)
     live.finish()
     return live
+
+
+def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -> LiveDrive:
+    sensor = topics.sensor
+    assert sensor is not None
+
+    def make_vehicle(point_map: PointMap) -> Vehicle:
+        return Vehicle(plan.vehicle, sensor, point_map, plan.settings)
+
+    return LiveDrive(
+        make_vehicle,
+        maps,
+        outbox,
+        name=plan.name,
+        cuts=plan.cuts,
+        with_poses=topics.chosen.odometry is not None,
+        T_base_lidar=plan.T_base_lidar,
+        first=FirstSeconds(topics.sensor_told) if plan.checked else None,
+    )
+
+
+def _mounted(live: LiveDrive, topics: Subscriptions, plan: Plan) -> bool:
+    """Give the drive the mount that frames tell, which odometry that begins late may change; returns whether it is
+    known: poses of a body that the LiDAR is not joined to are of no use."""
+    if plan.T_base_lidar is not None:
+        return True
+    T = topics.T_base_lidar()
+    if T is not None:
+        live.T_base_lidar = T
+    return T is not None
+
+
+class Needs:
+    """What a drive on the road lacks."""
+
+    def __init__(self, plan: Plan, maps: Maps) -> None:
+        self._plan = plan
+        self._maps = maps
+        self._poses = 0
+        self._pose_s = time.monotonic()
+        """When the last pose arrived."""
+        self._before = Counts()
+        """The counts some scans ago."""
+        self._lacking_place = ""
+
+    def lack(self, live: LiveDrive, topics: Subscriptions, silent_s: float) -> str:
+        """The first thing that is missing, and what to do; "" if nothing is. ``silent_s``: since the last cloud."""
+        now_s = time.monotonic()
+        if topics.poses != self._poses:
+            self._poses = topics.poses
+            self._pose_s = now_s
+        if silent_s > _SILENT_S:
+            return "no cloud comes any more: is the LiDAR on, and the network up?"
+        if topics.chosen.odometry is not None:
+            if self._plan.T_base_lidar is None and topics.T_base_lidar() is None:
+                return f"{_lack(topics, self._plan)}. The drive goes on without odometry"
+            if now_s - self._pose_s > _SILENT_S:
+                return f"no pose comes from {topics.chosen.odometry.topic}: the drive goes on without odometry"
+        return self._lack_of_place(live.counts)
+
+    def _lack_of_place(self, counts: Counts) -> str:
+        """Whether scans find the map and a place on it, judged each few seconds."""
+        before = self._before
+        without_map = counts.without_map - before.without_map
+        decided = counts.localised + counts.lost - before.localised - before.lost
+        if without_map + decided >= _JUDGED:
+            self._lacking_place = ""
+            if without_map > decided:
+                away = getattr(self._maps, "away", "") or "the map has none there: is this the map of this road?"
+                self._lacking_place = f"tiles around the vehicle are not here: {away}"
+            elif counts.localised == before.localised:
+                self._lacking_place = "no scan has a sure place: is this the map of this road? mapvote doctor says more"
+            self._before = replace(counts)
+        return self._lacking_place
 
 
 def _check(live: LiveDrive, topics: Subscriptions) -> None:

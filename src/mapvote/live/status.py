@@ -21,14 +21,13 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import require
 from mapvote.live.dds import Network, Publication
 from mapvote.live.drive import Counts, LiveDrive
-from mapvote.live.messages import blank_message, header_of, pose_of, to_cdr
+from mapvote.live.messages import POSE_TOPIC, POSE_WITH_COVARIANCE, blank_message, header_of, pose_of, to_cdr
 from mapvote.live.outbox import Outbox, OutboxReport
 from mapvote.live.road_map import Maps, RoadMap
 from mapvote.live.subscriptions import Subscriptions
 
 log = logging.getLogger("mapvote.live")
-DIAGNOSTICS, POSE = "diagnostic_msgs/msg/DiagnosticArray", "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSE_TOPIC = "/mapvote/pose"
+DIAGNOSTICS, POSE = "diagnostic_msgs/msg/DiagnosticArray", POSE_WITH_COVARIANCE
 _OK, _WARN, _ERROR = 0, 1, 2
 _MINUTE_S, _SILENT_S = 60.0, 2.0
 _RECENT = 600
@@ -186,10 +185,10 @@ class StatusBoard:
 class RosStatus:
     """/diagnostics once a second, and a pose for each scan that voted."""
 
-    def __init__(self, network: Network, vehicle: str) -> None:
+    def __init__(self, network: Network, vehicle: str, pose_topic: str = f"/{POSE_TOPIC}") -> None:
         self._vehicle = vehicle
         self._diagnostics: Publication = network.publish("/diagnostics", DIAGNOSTICS, patience_s=0.0)
-        self._poses: Publication = network.publish(POSE_TOPIC, POSE, patience_s=0.0)
+        self._poses: Publication = network.publish(pose_topic, POSE, patience_s=0.0)
         self._refused = False
 
     def diagnose(self, status: Status, live: LiveDrive, topics: Subscriptions) -> None:
@@ -209,7 +208,7 @@ class RosStatus:
             )
             for level, about, message in status.troubles()
         ]
-        header = header_of(time.time_ns(), "")
+        header = header_of(topics.now_ns(), "")
         self._send(self._diagnostics, to_cdr(DIAGNOSTICS, blank_message(DIAGNOSTICS, header=header, status=parts)))
 
     def poses(self, live: LiveDrive, topics: Subscriptions) -> None:

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.core.geometry import inverse
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
-from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
-from mapvote.live.dds import Chosen, Network
+from mapvote.live.choice import Chosen
+from mapvote.live.dds import Network
 from mapvote.live.drive import WaitingScan
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr, matrix_of, stamp_ns
+from mapvote.live.frames import Frames
+from mapvote.live.log_lines import Repeated
+from mapvote.live.messages import BASE_FRAME, CLOCK, CLOUD, TF, from_cdr, matrix_of, stamp_ns, time_ns
+from mapvote.live.names import RosNames
 
 log = logging.getLogger("mapvote.live")
 _SWEEP = 0.55
@@ -124,36 +126,100 @@ class Clocks:
 class Subscriptions:
     """The topics of one vehicle. Writers may appear and vanish."""
 
-    def __init__(self, network: Network, chosen: Chosen, sensor: Sensor | None) -> None:
-        """``sensor``: of the first LiDAR; None: it is measured in the first scans."""
+    def __init__(
+        self,
+        network: Network,
+        chosen: Chosen,
+        sensor: Sensor | None,
+        names: RosNames | None = None,
+        *,
+        sim_time: bool = False,
+    ) -> None:
+        """``sensor``: of the first LiDAR; None: it is measured in the first scans. ``names`` resolves tf, tf_static and
+        clock. ``sim_time``: the time is that of the clock's topic."""
         self.network, self.chosen, self.sensor = network, chosen, sensor
+        self.names = names or RosNames()
         self.sensor_told = "stated" if sensor is not None else ""
-        self.frames: list[str] = [""] * len(chosen.points)
+        self.lidar_frames: list[str] = [""] * len(chosen.points)
         """The frame of each LiDAR, from its clouds."""
         self.base_frame, self.map_frame = "", ""
         """The frame that odometry tracks, and its parent."""
         self.clocks = Clocks()
-        self.clouds = self.unusable = 0
-        """Clouds that arrived; messages of any topic that cannot be used."""
-        self._edges: Edges = {}
+        self.frames = Frames()
+        self.clouds = self.poses = self.unusable = 0
+        """Clouds and poses that arrived; messages of any topic that cannot be used."""
+        self.last_unusable = ""
+        """Why the last message could not be used."""
+        self._repeated = Repeated(log.warning)
         self._sweeps = Sweeps(len(chosen.points))
         self._points, self._odometry = (
             [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
             for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
         )
-        self._tf = network.subscribe("/tf_static", TF, reliable=True, transient_local=True)
+        self.tf = self._frames_topic("tf")
+        self.tf_static = self._frames_topic("tf_static")
+        self._tf_static = network.subscribe(self.tf_static, TF, reliable=True, transient_local=True)
+        self._tf = network.subscribe(self.tf, TF, reliable=False, depth=_DEPTH)
+        self._clock = network.subscribe(self.names.resolve("/clock"), CLOCK, reliable=False, depth=1)
+        self.sim_time = sim_time
+        self._clock_ns = 0
+
+    def _frames_topic(self, name: str) -> str:
+        """/tf or /tf_static as remapped, else that of the namespace where somebody sends it, else the global one."""
+        remapped = self.names.resolve(f"/{name}")
+        own = self.names.resolve(name)
+        sent = {one.topic for one in self.network.published()}
+        return own if remapped == f"/{name}" and own in sent else remapped
+
+    def now_ns(self) -> int:
+        """The time of ROS 2, nanoseconds: that of the clock's topic under sim time (0 before its first message)."""
+        if not self.sim_time:
+            return time.time_ns()
+        for _, data in self._clock.take():
+            with self._some_unusable(CLOCK):
+                self._clock_ns = time_ns(from_cdr(CLOCK, data).clock)
+        return self._clock_ns
 
     def take_poses(self) -> list[tuple[int, F64]]:
-        """Poses of odometry that arrived: stamps, and T_map_base."""
-        out = []
+        """Poses that arrived: stamps, and T_map_base."""
+        kind = "" if self.chosen.odometry is None else self.chosen.odometry.kind
+        out: list[tuple[int, F64]] = []
         for sent_ns, data in (received for reader in self._odometry for received in reader.take()):
-            with self._some_unusable(ODOMETRY):
-                message = from_cdr(ODOMETRY, data)
-                T = matrix_of(message.pose.pose.position, message.pose.pose.orientation)
-                self.base_frame = message.child_frame_id.strip("/")
-                self.map_frame = message.header.frame_id.strip("/")
-                out.append((stamp_ns(message.header), T))
-                self.clocks.pose(sent_ns, out[-1][0], time.monotonic())
+            with self._some_unusable(kind):
+                message = from_cdr(kind, data)
+                poses = self._poses_of_tf(message) if kind == TF else [self._pose_of(message)]
+                out += poses
+                for stamp_ns, _ in poses:
+                    self.clocks.pose(sent_ns, stamp_ns, time.monotonic())
+        self.poses += len(out)
+        return out
+
+    def _pose_of(self, message: Any) -> tuple[int, F64]:
+        """Stamp and pose of an Odometry, a PoseStamped or a PoseWithCovarianceStamped. The last two do not name what
+        they track: it is base_link (REP 105) where the LiDAR sits on one."""
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        T = matrix_of(pose.position, pose.orientation)
+        named = getattr(message, "child_frame_id", "").strip("/")
+        if not named and self.frames.between(BASE_FRAME, self.lidar_frames[0]) is not None:
+            named = BASE_FRAME
+        self.base_frame = named
+        self.map_frame = message.header.frame_id.strip("/")
+        return stamp_ns(message.header), T
+
+    def _poses_of_tf(self, message: Any) -> list[tuple[int, F64]]:
+        """The poses of the body that carries the first LiDAR, in the frame at the top of the tree."""
+        out = []
+        for transform in message.transforms:
+            self.frames.add(transform, fixed=False)
+            body = transform.child_frame_id.strip("/")
+            lidar = self.lidar_frames[0]
+            if not lidar or (body != lidar and self.frames.fixed(body, lidar) is None):
+                continue
+            self.base_frame = body
+            self.map_frame = self.frames.root(body)
+            T = self.frames.between(self.map_frame, body)
+            if T is not None:
+                out.append((stamp_ns(transform.header), T))
         return out
 
     @contextmanager
@@ -163,47 +229,49 @@ class Subscriptions:
             yield
         except MapvoteError as error:
             self.unusable += 1
-            if self.unusable & (self.unusable - 1) == 0:
-                log.warning("%s is left out: %s (%d messages so far)", kind, error, self.unusable)
+            self.last_unusable = f"{kind}: {error}"
+            self._repeated(kind, f"{kind} is left out: {error}")
 
     def take_scans(self) -> list[list[Cloud]]:
         """Clouds that arrived, joined to scans."""
-        for _, data in self._tf.take():
-            with self._some_unusable(TF):
-                for transform in from_cdr(TF, data).transforms:
-                    self._add_frame(transform)
+        for _, data in self._tf_static.take():
+            self._add_frames(data, fixed=True)
+        if self.mounts() is None or self.T_base_lidar() is None:  # a joint that is fixed, but sent on /tf
+            for _, data in self._tf.take():
+                self._add_frames(data, fixed=False)
         clouds: list[Cloud] = []
         for lidar, reader in enumerate(self._points):
             for sent_ns, data in reader.take():
                 with self._some_unusable(CLOUD):
                     message = from_cdr(CLOUD, data)
-                    self.frames[lidar] = message.header.frame_id.strip("/")
+                    self.lidar_frames[lidar] = message.header.frame_id.strip("/")
                     clouds.append(Cloud(lidar, stamp_ns(message.header), sent_ns, message))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
         self.clouds += len(clouds)
         return self._sweeps.add(clouds)
 
-    def _add_frame(self, t: Any) -> None:
-        """A geometry_msgs/TransformStamped, both ways."""
-        parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
-        T = matrix_of(t.transform.translation, t.transform.rotation)
-        for here, there, T_here_there in ((parent, child, T), (child, parent, inverse(T))):
-            known = [edge for edge in self._edges.get(here, []) if edge[0] != there]
-            self._edges[here] = [*known, (there, T_here_there)]
+    def _add_frames(self, data: memoryview, *, fixed: bool) -> None:
+        with self._some_unusable(TF):
+            for transform in from_cdr(TF, data).transforms:
+                self.frames.add(transform, fixed=fixed)
 
     def T_base_lidar(self) -> F64 | None:
-        """(4, 4) the first LiDAR on what odometry tracks, by /tf_static; the identity if both are one frame, or nobody
-        names what odometry tracks. None if /tf_static does not say."""
-        if self.base_frame in ("", self.frames[0]):
+        """(4, 4) the first LiDAR on what odometry tracks; the identity if both are one frame, or nobody names what
+        odometry tracks. None if no frames join the two."""
+        if self.base_frame in ("", self.lidar_frames[0]):
             return np.eye(4)
-        return T_from(self._edges, self.base_frame).get(self.frames[0])
+        return self.frames.between(self.base_frame, self.lidar_frames[0])
 
     def mounts(self) -> list[F64] | None:
-        """(4, 4) each: T_first_lidar of every LiDAR; None while /tf_static does not say."""
-        if len(self.frames) == 1:
+        """(4, 4) each: T_first_lidar of every LiDAR; None while no frames join them."""
+        first = self.lidar_frames[0]
+        if len(self.lidar_frames) == 1:
             return [np.eye(4)]
-        reached = T_from(self._edges, self.frames[0]) if all(self.frames) else {}
-        return [reached[frame] for frame in self.frames] if reached.keys() >= set(self.frames) else None
+        if not all(self.lidar_frames):
+            return None
+        T_first = [self.frames.between(first, frame) for frame in self.lidar_frames]
+        found = [T for T in T_first if T is not None]
+        return found if len(found) == len(T_first) else None
 
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
@@ -228,7 +296,7 @@ class Subscriptions:
             scan = scan_from_point_cloud2(cloud.message, sensor)
             if cloud.lidar:
                 if mounts is None:
-                    raise MapvoteError(f"/tf_static does not say where {self.frames[cloud.lidar]} sits")
+                    raise MapvoteError(f"no frame says where {self.lidar_frames[cloud.lidar]} sits")
                 scan = scan.seen_from(mounts[cloud.lidar])
             scans.append(scan)
         return scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
