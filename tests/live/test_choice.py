@@ -15,7 +15,7 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.live import choice
-from mapvote.live.choice import Chosen, Waits, Voice, Wish, choose_topics
+from mapvote.live.choice import Chosen, Voice, Waits, Wish, choose_topics
 from mapvote.live.dds import Network, PublishedTopic
 from mapvote.live.messages import (
     CLOCK,

@@ -24,6 +24,7 @@ from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
+from mapvote.live.log_lines import Repeated
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
@@ -224,6 +225,7 @@ class LiveDrive:
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
         self._period_ns = 0
         """Between scans: the shortest recent step."""
+        self._repeated = Repeated(log.warning)
         self.first = first
         """None once :meth:`first_findings` was asked."""
         self._held = list[tuple[str, Callable[[], Ballot], str | None]]()
@@ -243,7 +245,8 @@ class LiveDrive:
     def on_pose(self, time_ns: int, T_map_base: F64) -> None:
         """One pose of odometry in the map's frame, in any order."""
         if self._poses and time_ns < self._poses[-1][0] - _BACK_NS:
-            log.warning("odometry's clock jumped back by %.1f s", 1e-9 * (self._poses[-1][0] - time_ns))
+            back_s = 1e-9 * (self._poses[-1][0] - time_ns)
+            self._repeated("odometry", f"odometry's clock jumped back by {back_s:.1f} s")
             self._poses.clear()
         self._poses.append((time_ns, T_map_base))
 
@@ -259,7 +262,7 @@ class LiveDrive:
             self._jump(step_ns)
         elif step_ns <= 0:
             self.counts.late += 1
-            log.warning("a scan at %d ns is not later than the last one: left out", scan.stamp_ns)
+            self._repeated("late", f"a scan at {scan.stamp_ns} ns is not later than the last one: left out")
             return
         elif self._last_ns >= 0 and self._period_ns:
             self.counts.missing += max(0, round(step_ns / self._period_ns) - 1)
@@ -356,7 +359,7 @@ class LiveDrive:
             scan = waiting.read()
         except MapvoteError as error:
             self.counts.unusable += 1
-            log.warning("%s", error)
+            self._repeated("unusable", str(error))
             return
         prior = self._prior(waiting.stamp_ns)
         self.counts.without_pose += self._with_poses and prior is None
