@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.brightness import from_bytes
 from mapvote.core.columns import base_layers, column_bits, flat_cells, mark_obstacles
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.types import F32, F64, I32, I64, U8, U32, U64, Bool, check_array, read_only
-
-_SCALES = (1.0, 255.0, 4095.0, 65535.0)
-"""What files give the brightest point: 1, or the largest number of 8, 12 or 16 bits, whatever type they keep it in."""
 
 PLANES = 4
 """Of a tile's memory."""
@@ -183,7 +181,7 @@ class Tile:
         for name, column in self.fields.items():
             new = np.zeros(len(points), dtype=column.dtype)
             if name == "intensity" and intensity is not None:
-                new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
+                new = from_bytes(intensity, column)
             fields[name] = np.concatenate([column, new])
         return self.but(points=np.concatenate([self.points, points]), fields=fields)
 
@@ -224,16 +222,3 @@ class Tile:
         words, ground_z, base = np.zeros(CELLS, dtype=np.uint64), self.ground_z.reshape(-1), self.base.reshape(-1)
         mark_obstacles(words, read_only(self.points), read_only(self.cells), read_only(ground_z), read_only(base))
         return words.reshape(self.window.shape)
-
-
-def in_bytes(intensity: NDArray[Any]) -> U8:
-    """(n,) a field of intensities as ballots have them, 255 for 1.0."""
-    shares = np.nan_to_num(np.asarray(intensity, dtype=np.float64)) / max(brightest(intensity), 1e-9)
-    return np.asarray(np.rint(255.0 * np.clip(shares, 0.0, 1.0)), dtype=np.uint8)
-
-
-def brightest(intensity: NDArray[Any]) -> float:
-    """The value that means 1.0 in a field of a map: the smallest scale in use that holds all of the values (n,)."""
-    highest = float(np.nanmax(intensity, initial=0.0))
-    scales = _SCALES[1:] if intensity.dtype.kind in "iu" else _SCALES
-    return next((scale for scale in scales if highest <= scale), highest)

@@ -11,8 +11,9 @@ import numpy as np
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_fields_plane
+from mapvote.core.brightness import in_bytes
 from mapvote.core.grid import Lattice, TileIndex
-from mapvote.core.tile import Tile, in_bytes
+from mapvote.core.tile import Tile
 from mapvote.core.types import U8, MapvoteError
 from mapvote.shapes.packed_cloud import Levels, came_and_went, make_levels
 from mapvote_server.errors import Unavailable

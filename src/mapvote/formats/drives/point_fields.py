@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.brightness import unit_intensity
 from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
@@ -142,15 +143,6 @@ def _likely_cause(points: F32) -> str:
         unit, factor = ("millimetres", 1000) if farthest > 15_000.0 else ("centimetres", 100)
         return f"they look like {unit} (the farthest {farthest:.0f}); divide x, y, z by {factor}"
     return "the file is damaged, or not float32 x, y, z, intensity"
-
-
-def unit_intensity(intensity: NDArray[np.number]) -> F32:
-    """Intensity in [0, 1]: 8-bit values (any above 1) are divided by 255 and cut there; not a number becomes 0."""
-    values = np.array(intensity, dtype=np.float32)
-    values[~np.isfinite(values)] = 0.0
-    if values.max(initial=0.0) > 1.0:
-        values /= np.float32(255.0)
-    return np.clip(values, 0.0, 1.0, out=values)
 
 
 def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F32:

@@ -1,0 +1,132 @@
+"""The scale of an intensity or a colour: which value means full brightness. One rule for files of every format, for
+scans, for maps and for ballots.
+
+Files hold 8, 12 or 16 bits, in whatever type, or reals from 0 to 1. Whole numbers are on the smallest of these scales
+that holds them all. Reals are on the smallest that holds nearly all: rounding lifts a few above 1, and an outlier must
+not darken the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.types import F32, F64, I64, U8
+
+
+@dataclass(frozen=True, slots=True)
+class BrightnessRule:
+    """Numbers of the rule."""
+
+    scales: tuple[float, ...] = (1.0, 255.0, 4095.0, 65535.0)
+    """Values of full brightness in use: reals, and the largest number of 8, 12 and 16 bits."""
+    rounding: float = 0.05
+    """Share by which reals may exceed their scale."""
+    outliers: float = 0.01
+    """Share of the reals that may lie above the scale of the others."""
+    darkest: float = 0.02
+    """Reals whose bright end is below this share of a scale are on a scale of their own, which ends there."""
+    bins_per_octave: int = 8
+    """Resolution at which the bright end of reals is found over pieces."""
+
+    @property
+    def edges(self) -> F64:
+        """(k,) ascending ends of the bins in which reals are counted: the scales themselves, and values between."""
+        limits = np.array(self.scales) * (1.0 + self.rounding)
+        between = limits[0] * 2.0 ** (np.arange(33 * self.bins_per_octave) / self.bins_per_octave)
+        return np.unique(np.concatenate([limits, between]))
+
+
+RULE = BrightnessRule()
+_EDGES = RULE.edges
+
+
+@dataclass(slots=True)
+class Brightness:
+    """What values of one column there are, counted piece by piece."""
+
+    n: int = 0
+    """Finite values."""
+    undefined: int = 0
+    """Values that are not finite."""
+    negative: int = 0
+    highest: float = 0.0
+    whole: bool = True
+    """Whether all finite values are whole numbers."""
+    real: bool = False
+    """Whether the column has a type of reals."""
+    _counts: I64 = field(default_factory=lambda: np.zeros(len(_EDGES) + 1, np.int64))
+    """Finite reals by the bin of ``RULE.edges``."""
+
+    @classmethod
+    def of(cls, values: NDArray[Any]) -> Brightness:
+        """Those of one column (n,)."""
+        counted = cls()
+        counted.add(values)
+        return counted
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Count a piece (n,)."""
+        if values.dtype.kind != "f":
+            self.n += len(values)
+            self.negative += int((values < 0).sum()) if values.dtype.kind == "i" else 0
+            self.highest = max(self.highest, float(values.max(initial=0)))
+            return
+        self.real = True
+        finite = values[np.isfinite(values)]
+        self.n += len(finite)
+        self.undefined += len(values) - len(finite)
+        self.negative += int((finite < 0).sum())
+        self.highest = max(self.highest, float(finite.max(initial=0.0)))
+        self.whole = self.whole and bool((finite == np.floor(finite)).all())
+        beyond = finite[finite > _EDGES[0]]  # few or none of most columns
+        self._counts[0] += len(finite) - len(beyond)
+        self._counts += np.bincount(np.searchsorted(_EDGES, beyond), minlength=len(self._counts))
+
+    @property
+    def full(self) -> float:
+        """The value that means 1.0."""
+        if self.whole and (not self.real or self.highest > 1.0):
+            return next((scale for scale in RULE.scales[1:] if self.highest <= scale), self.highest)
+        bright = min(self._bright_end(), self.highest)
+        scale = next((s for s in RULE.scales if bright <= s * (1.0 + RULE.rounding)), bright)
+        return bright if scale > 1.0 and bright < RULE.darkest * scale else scale
+
+    def _bright_end(self) -> float:
+        """What all but a few of the reals do not exceed, rounded up to the end of a bin."""
+        most = self.n - int(RULE.outliers * self.n)
+        last = int(np.searchsorted(np.cumsum(self._counts), most))
+        return float(_EDGES[last]) if last < len(_EDGES) else self.highest
+
+
+def full_scale(values: NDArray[Any]) -> float:
+    """The value of a column (n,) that means 1.0."""
+    return Brightness.of(values).full
+
+
+def shares(values: NDArray[Any], full: float | None = None) -> NDArray[np.floating]:
+    """(n,) brightness from 0 to 1 of a column, as float32 if that is its type, else float64; what is not finite or
+    negative is 0. ``full``: the value that means 1.0, where it is known."""
+    scale = max(full_scale(values) if full is None else full, 1e-9)
+    out = values / np.asarray(scale, np.float32 if values.dtype == np.float32 else np.float64)
+    out[~np.isfinite(out)] = 0.0
+    return np.clip(out, 0.0, 1.0, out=out)
+
+
+def unit_intensity(values: NDArray[Any]) -> F32:
+    """(n,) brightness from 0 to 1 as scans have it."""
+    return shares(values).astype(np.float32, copy=False)
+
+
+def in_bytes(values: NDArray[Any]) -> U8:
+    """(n,) brightness as ballots have it, 255 for 1.0."""
+    return np.asarray(np.rint(255.0 * shares(values)), dtype=np.uint8)
+
+
+def from_bytes(brightness: U8, like: NDArray[Any]) -> NDArray[Any]:
+    """Brightness (m,), 255 for 1.0, on the scale and in the type of the column ``like`` (n,)."""
+    values = brightness * (full_scale(like) / 255.0)
+    return (values if like.dtype.kind == "f" else np.rint(values)).astype(like.dtype)
