@@ -30,7 +30,7 @@ from mapvote.formats.geo.frame import read_projector
 from mapvote.formats.maps.autoware import write_autoware
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.formats.maps.ply_e57 import write_ply
+from mapvote.formats.maps.ply import write_ply
 
 POINTS = np.random.default_rng(0).uniform([-30, -30, -1], [30, 30, 5], (80, 3))
 GIANT = [b"99999999999", b"-1", b"nan", b"0", b"18446744073709551615"]

@@ -87,6 +87,16 @@ class Brightness:
         self._counts += np.bincount(np.searchsorted(_EDGES, beyond), minlength=len(self._counts))
 
     @property
+    def is_count(self) -> bool:
+        """Whether the values are whole numbers of 8 to 16 bits, and none stands for a share of 1."""
+        return self.whole and self.highest <= RULE.scales[-1] and (not self.real or self.highest > 1.0)
+
+    @property
+    def above(self) -> int:
+        """Reals beyond the value that means 1.0, by more than rounding."""
+        return int(self._counts[np.searchsorted(_EDGES, self.full * (1.0 + RULE.rounding)) + 1 :].sum())
+
+    @property
     def full(self) -> float:
         """The value that means 1.0."""
         if self.whole and (not self.real or self.highest > 1.0):

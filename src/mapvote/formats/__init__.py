@@ -6,7 +6,7 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -21,10 +21,12 @@ from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.geo.frame import LOCAL, PROJECTOR, MapFrame, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import Convert, settle
-from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces
+from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, CloudPieces
+from mapvote.formats.maps.field_names import KEPT
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
+from mapvote.formats.maps.marked_points import DROPPED, MarkedPoints, without_marked
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
+from mapvote.formats.maps.tiling import GPS_TIMES, Look, in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS, drive_format
 
 __all__ = [
@@ -38,9 +40,6 @@ __all__ = [
     "write_map",
     "write_pcd",
 ]
-NOISE = (7, 18)
-"""ASPRS classes: low noise, high noise."""
-
 Offset = tuple[float, float, float]
 
 
@@ -82,7 +81,8 @@ def read_map(path: Path | str, look: Look | None = None) -> PointMap:
         if look is not None:
             look(lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles)))
         return point_map
-    return map_of(str(path), in_map_metres(str(path), stream_cloud(path)), look=look)
+    sound = without_marked(path, stream_cloud(path))
+    return map_of(str(path), in_map_metres(str(path), sound), look=look)
 
 
 def stream_cloud(path: Path | str) -> Iterator[Cloud]:
@@ -110,36 +110,29 @@ def import_cloud(
     from_crs: str | None = None,
     folder: Path | None = None,
     look: Look | None = None,
+    drop: Collection[str] = DROPPED,
 ) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
     ``wanted``: the frame to project to. ``from_crs``: the file's coordinate system, where the file states none or a
     wrong one. ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of
-    them.
+    them. ``drop``: of ``MARKS`` those whose points are left out.
     """
     pieces = stream_cloud(path)
     if from_crs is not None:
         said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
         pieces = (replace(piece, frame=said) for piece in pieces)
     dropped: dict[str, None] = {}
-    noise = 0
+    sieve = MarkedPoints(drop)
 
     def kept() -> Iterator[Cloud]:
-        nonlocal noise
-        for piece in in_map_metres(str(path), pieces, wanted, sure=from_crs is not None):
+        metric = in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)
+        for piece in sieve.without(metric):
             dropped.update(dict.fromkeys(piece.dropped))
-            bad = np.isin(piece.fields.get("classification", ()), NOISE)
-            if not bad.any():
-                yield piece
-                continue
-            noise += int(bad.sum())
-            fields = {name: column[~bad] for name, column in piece.fields.items()}
-            yield replace(piece, points=piece.points[~bad], fields=fields)
+            yield piece
 
     point_map = map_of(str(path), kept(), folder, look)
-    told = [f"coordinates: {frame_of(point_map.georeference).told()}"]
-    if noise:
-        told.append(f"dropped: {noise} points that the file classifies as noise (classes 7 and 18)")
+    told = [f"coordinates: {frame_of(point_map.georeference).told()}", *sieve.told()]
     if dropped:
         told.append(f"dropped fields: {', '.join(dropped)}")
     return point_map, told
@@ -201,7 +194,8 @@ def _pieces(
                 on_ground = tile.has_ground & ~tile.columns[1]
                 fields["classification"] = np.where(on_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
             points = convert(tile.points_map)
-            yield Cloud(points - np.array(offset) if any(offset) else points, frame=frame, fields=fields)
+            shifted = points - np.array(offset) if any(offset) else points
+            yield Cloud(shifted, frame=frame, fields=fields, gps_times=point_map.georeference.get(GPS_TIMES, ""))
 
     return CloudPieces.gathered(pieces, frame)
 

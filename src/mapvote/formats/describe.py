@@ -16,6 +16,7 @@ from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import is_map_folder
+from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.tiling import in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS
 
@@ -29,7 +30,9 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
     for kind, layout in MAPS.items():
         if layout.recognised(path):
             about: dict[str, dict[str, None]] = {"other fields": {}, "stored as": {}}
-            point_map = map_of(str(path), in_map_metres(str(path), _noted(layout.stream(path), about)))
+            point_map = map_of(
+                str(path), in_map_metres(str(path), _noted(without_marked(path, layout.stream(path)), about))
+            )
             return kind, _map(point_map) + [(name, ", ".join(found) or "none") for name, found in about.items()]
     for kind, drive_layout in DRIVES.items():
         if drive_layout.recognised(path):

@@ -9,7 +9,7 @@ from pathlib import Path
 from mapvote.core.types import Drive
 from mapvote.formats.drives import bag_files, datasets, rosbag, scan_folder
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.maps import autoware, las, pcd, ply_e57
+from mapvote.formats.maps import autoware, e57, las, pcd, ply
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
 
 
@@ -77,8 +77,8 @@ MAPS: dict[str, MapFormat] = {
     "PCD file": MapFormat(_file(".pcd"), pcd.stream_pcd),
     "folder of PCD tiles": MapFormat(pcd.is_pcd_tiles, pcd.stream_pcd_tiles),
     "LAS or LAZ file": MapFormat(_file(".las", ".laz"), las.stream_las),
-    "PLY file": MapFormat(_file(".ply"), ply_e57.stream_ply),
-    "E57 file": MapFormat(_file(".e57"), ply_e57.stream_e57),
+    "PLY file": MapFormat(_file(".ply"), ply.stream_ply),
+    "E57 file": MapFormat(_file(".e57"), e57.stream_e57),
 }
 """Maps that are only points, in the order in which they are tried."""
 
@@ -86,7 +86,7 @@ WRITERS: dict[str, MapWriter] = {
     ".pcd": MapWriter("PCD file", pcd.write_pcd),
     ".las": MapWriter("LAS file", las.write_las, classes=True),
     ".laz": MapWriter("LAZ file", las.write_las, classes=True),
-    ".ply": MapWriter("PLY file", ply_e57.write_ply),
+    ".ply": MapWriter("PLY file", ply.write_ply),
     "": MapWriter("Autoware tile folder", autoware.write_autoware),
 }
 """By the suffix of the path; a folder has none."""

@@ -23,7 +23,7 @@ from mapvote.formats.drives.trajectory import read_trajectory
 from mapvote.formats.geo.frame import MapFrame, enu_frame, poses_from_gnss
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.formats.maps.ply_e57 import write_ply
+from mapvote.formats.maps.ply import write_ply
 
 N = 4
 START = 1_600_000_000

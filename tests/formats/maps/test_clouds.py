@@ -24,7 +24,7 @@ from mapvote.formats.maps.autoware import lay_version, stream_autoware, write_au
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, lattice_of
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.pcd import read_pcd_table
-from mapvote.formats.maps.ply_e57 import write_ply
+from mapvote.formats.maps.ply import write_ply
 
 ENCODINGS = "ascii", "binary", "binary_compressed"
 UTM = np.array([367_123.0, 3_951_876.0, 40.0])

@@ -79,7 +79,7 @@ def test_noise_is_dropped_and_ground_classes_are_ground(tmp_path: Path) -> None:
     classes = np.concatenate([np.full(len(flat), 2), np.full(50, 7)]).astype(np.uint8)
     write_las(tmp_path / "a.las", Cloud(np.concatenate([flat, noise]), fields={"classification": classes}))
     point_map, told = import_cloud(tmp_path / "a.las")
-    assert any("50 points that the file classifies as noise" in line for line in told)
+    assert any("50 points that the file marks as noise" in line for line in told)
     ground = point_map.tiles[0, 0].ground_z
     assert ground[20, 80] == pytest.approx(3.0, abs=0.05)
     assert ground[20, 20] == pytest.approx(0.0, abs=0.05)

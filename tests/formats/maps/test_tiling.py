@@ -17,12 +17,12 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import LazyTiles, PointMap, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, import_cloud, read_map, write_map
-from mapvote.formats.maps import pcd, ply_e57, tiling
+from mapvote.formats.maps import pcd, ply, tiling
 from mapvote.formats.maps.cloud import Cloud, lattice_of
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.mapvote_folder import read_manifest
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.ply_e57 import write_ply
+from mapvote.formats.maps.ply import write_ply
 from mapvote.formats.maps.tiling import map_of
 from mapvote.fusion.fuse import update_map
 
@@ -82,7 +82,7 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
     monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
     monkeypatch.setattr(pcd, "_BLOCK", 700)
-    monkeypatch.setattr(ply_e57, "_BLOCK", 700)
+    monkeypatch.setattr(ply, "_BLOCK", 700)
 
 
 @pytest.mark.usefixtures("large")

@@ -51,6 +51,8 @@ def street(seed: int = 0, kinds: Mapping[str, str] = KINDS) -> PointMap:
     posts = np.repeat(rng.uniform((1.0, 1.0), (140.0, 55.0), (40, 2)), 10, axis=0)
     points = np.concatenate([np.c_[xy, rng.normal(0, 0.01, 1500)], np.c_[posts, np.tile(np.arange(0.4, 3.4, 0.3), 40)]])
     fields = {name: rng.integers(0, 60000, len(points)).astype(kind) for name, kind in kinds.items()}
+    if "classification" in fields:
+        fields["classification"] = rng.choice([1, 2, 5, 6, 17], len(points)).astype(kinds["classification"])  # no noise
     return map_from_points(points, map_id="street", fields=fields)
 
 

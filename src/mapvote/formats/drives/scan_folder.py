@@ -33,9 +33,11 @@ from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans,
 from mapvote.formats.extras import read_text
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import Cloud, joined, table_of, xyz
+from mapvote.formats.maps.field_names import known_fields
 from mapvote.formats.maps.las import stream_las
+from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
-from mapvote.formats.maps.ply_e57 import stream_ply
+from mapvote.formats.maps.ply import stream_ply
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
@@ -229,8 +231,8 @@ def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
     files = scan_files(*found)
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
         ".ply": lambda file: _table(stream_ply(file)),
-        ".las": lambda file: _table(stream_las(file)),
-        ".laz": lambda file: _table(stream_las(file)),
+        ".las": lambda file: _table(without_marked(file, stream_las(file))),
+        ".laz": lambda file: _table(without_marked(file, stream_las(file))),
         ".npy": lambda file: _read_npy(file, options.columns),
     }
     read = readers.get(found[1]) or layout_of(files, options).read
@@ -284,7 +286,9 @@ def open_pcd_scans(path: Path, options: DriveOptions) -> Drive:
         if viewpoints is not None and in_map_frame:
             table = table.copy()
             points = geometry.transform(geometry.inverse(viewpoints[index[file]]), xyz(str(file), table))
-            table["x"], table["y"], table["z"] = points.T
+            names = known_fields(table.dtype.names or ())
+            for axis, column in zip("xyz", points.T, strict=True):
+                table[names[axis]] = column
         return table
 
     def prior() -> Trajectory | F64 | None:

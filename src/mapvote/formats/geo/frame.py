@@ -52,6 +52,8 @@ class MapFrame:
     """What z counts from, e.g. "EGM2008 height", where a file states it."""
     projector: str = ""
     """The text of Autoware's map_projector_info.yaml, where the map has one."""
+    refusal: str = ""
+    """Why nobody can make out which coordinate system a file means, and how to name it; empty if it is known."""
 
     @property
     def is_local(self) -> bool:

@@ -37,6 +37,8 @@ def settle(
     ``sure``: the user stated that the file is in local metres.
     MapvoteError if the file is in degrees, or geocentric, and no frame is requested.
     """
+    if stated.refusal:
+        raise MapvoteError(stated.refusal)
     if stated.is_local:
         if wanted is None or wanted.is_local:
             if not sure:

@@ -10,31 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.brightness import Brightness
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.maps.field_names import COLOURS, KEPT, known_fields, other_fields
 
 log = logging.getLogger("mapvote.formats")
 
 NEAR_ORIGIN_M = 50_000.0
 """Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
 
-
-KEPT = (
-    "intensity",
-    "red",
-    "green",
-    "blue",
-    "classification",
-    "gps_time",
-    "return_number",
-    "number_of_returns",
-)
-"""Fields of points that a map keeps, by LAS's names."""
 GROUND, UNCLASSIFIED = 2, 1
 """ASPRS classes."""
-SCALED = ("intensity", "red", "green", "blue")
-"""Those that count from nothing to a full scale, which depends on the type."""
+SCALED = {"intensity": "intensity"} | dict.fromkeys(COLOURS, "colour")
+"""Fields that count from nothing to a full scale, and what shares it."""
+_SHORT = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)
+"""Types of coordinates that float32 holds exactly."""
+WEEK_S = 604_800.0
+"""Seconds of a GPS week."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +42,13 @@ class Cloud:
     """The file's statement of its coordinates: they may be in feet or degrees still."""
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
+    gps_times: str = ""
+    """What ``gps_time`` counts from, "week" or "adjusted standard"; empty if the file does not say."""
 
     def where(self, chosen: Bool) -> Cloud:
         """Those of its points that are ``chosen`` (n,), with their fields."""
         fields = {name: column[chosen] for name, column in self.fields.items()}
         return replace(self, points=self.points[chosen], fields=fields)
-
-
-def full_scale(values: NDArray[Any]) -> float:
-    """The value that means 1.0: the largest of an integer type; of floats 1, or 255 if any is above 1."""
-    if values.dtype.kind in "iu":
-        return float(np.iinfo(values.dtype).max)
-    return 255.0 if len(values) and float(np.nanmax(values)) > 1.0 else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +63,10 @@ class CloudPieces:
     """(2, 3) lowest and highest coordinates; 0 where there are no points."""
     kinds: Mapping[str, np.dtype[Any]]
     """Fields of any piece; where one lacks it its points have 0."""
-    full: Mapping[str, float]
-    """The value that means 1.0, of those that count up to a full scale."""
+    brightness: Mapping[str, Brightness]
+    """Values of intensity, and of the three colours together."""
+    gps_times: str
+    """As of the pieces; of times that nobody named, what their size tells."""
 
     @classmethod
     def of(cls, cloud: Cloud | CloudPieces) -> CloudPieces:
@@ -85,18 +76,25 @@ class CloudPieces:
     @classmethod
     def gathered(cls, pieces: Callable[[], Iterator[Cloud]], frame: MapFrame) -> CloudPieces:
         """Goes through all pieces once."""
-        n, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
+        n = 0
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
         kinds: dict[str, np.dtype[Any]] = {}
-        full: dict[str, float] = {}
+        brightness: dict[str, Brightness] = {}
+        gps_times = ""
+        latest_s = 0.0
         for piece in pieces():
             n += len(piece.points)
             low = np.minimum(low, piece.points.min(axis=0, initial=np.inf))
             high = np.maximum(high, piece.points.max(axis=0, initial=-np.inf))
             kinds |= {name: column.dtype for name, column in piece.fields.items()}
-            for name in SCALED:
-                if name in piece.fields:
-                    full[name] = max(full.get(name, 0.0), full_scale(piece.fields[name]))
-        return cls(pieces, frame, n, np.array([low, high]) if n else np.zeros((2, 3)), kinds, full)
+            for name, column in piece.fields.items():
+                if name in SCALED:
+                    brightness.setdefault(SCALED[name], Brightness()).add(column)
+            gps_times = gps_times or piece.gps_times
+            latest_s = max(latest_s, float(np.nanmax(piece.fields.get("gps_time", np.zeros(1)), initial=0.0)))
+        corners = np.array([low, high]) if n else np.zeros((2, 3))
+        told = gps_times or ("adjusted standard" if latest_s > WEEK_S else "week")
+        return cls(pieces, frame, n, corners, kinds, brightness, told)
 
     def __iter__(self) -> Iterator[Cloud]:
         """The pieces, each with all fields."""
@@ -126,7 +124,7 @@ def cloud_of_table(where: str, table: NDArray[np.void]) -> Cloud:
     """The points of a structured array with x, y, z, and of its fields what a map keeps: numbers under LAS's names,
     PCL's packed rgb taken apart. MapvoteError as :func:`xyz`."""
     names = table.dtype.names or ()
-    out = {name: np.ascontiguousarray(table[name]) for name in KEPT if name in names}
+    out = {ours: np.ascontiguousarray(table[name]) for ours, name in known_fields(names).items() if ours in KEPT}
     for packed in ("rgb", "rgba"):
         if packed in names and "red" not in out and table.dtype[packed].itemsize == 4:
             word = np.ascontiguousarray(table[packed]).view(np.uint32)
@@ -151,23 +149,19 @@ def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
 def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     """As :func:`xyz`, but a view of ``table`` where they are float32 side by side, as nearly every LiDAR has them."""
     names = table.dtype.names or ()
-    missing = [axis for axis in "xyz" if axis not in names]
+    found = known_fields(names)
+    missing = [axis for axis in "xyz" if axis not in found]
     if missing:
         raise MapvoteError(f"{where}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
-    x, y, z = (table.dtype.fields[axis] for axis in "xyz")  # type: ignore[index]
+    x, y, z = (table.dtype.fields[found[axis]] for axis in "xyz")  # type: ignore[index]
     single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
     if single and table.flags.c_contiguous and len(table):
         return np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
-    exact = any(table.dtype[axis] not in (np.float32, np.float16, np.int16, np.uint16) for axis in "xyz")
+    exact = any(table.dtype[found[axis]] not in _SHORT for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
     for column, axis in enumerate("xyz"):
-        out[:, column] = table[axis]
+        out[:, column] = table[found[axis]]
     return out
-
-
-def other_fields(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The fields that a map does not keep; padding (names that start with an underscore or a hash) is none."""
-    return tuple(n for n in names if n not in ("x", "y", "z", "rgb", *KEPT) and not n.startswith(("_", "#")))
 
 
 def lattice_of(points: NDArray[np.floating]) -> Lattice:

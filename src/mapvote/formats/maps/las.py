@@ -12,6 +12,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import MapvoteError
+from mapvote.core.brightness import Brightness, shares
+from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
 from mapvote.formats.geo.units import METRES, with_units
 from mapvote.formats.maps import laz_subprocess
-from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces, other_fields
-from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
+from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
+from mapvote.formats.maps.field_names import other_fields
+from mapvote.formats.maps.laz_subprocess import FIELDS, FLAGS, Head, Piece, read_head, read_pieces
 
 log = logging.getLogger("mapvote.formats")
 
@@ -60,8 +63,6 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
     return MapFrame(with_units(_known(where, text), plane, up))
 
 
-STEP_M = 0.0001
-"""Coordinates are whole multiples of this from the file's offset: exact to 0.05 mm over 400 km."""
 MAX_POINTS_PER_BYTE = 16
 """Real LAZ files need a byte or more for a point."""
 
@@ -84,16 +85,26 @@ def stream_las(path: Path) -> Iterator[Cloud]:
 
 
 def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
-    frame = MapFrame(_known(str(path), head.wkt)) if head.wkt else frame_of_keys(str(path), head.geo_keys)
-    others = tuple(n for n in other_fields(tuple(n.lower() for n in head.dimensions)) if n not in FIELDS)
+    frame = _frame(str(path), head)
+    others = tuple(name for name in other_fields(head.dimensions) if name not in (*FLAGS, *"XYZ"))
+    times = "" if "gps_time" not in head.dimensions else "adjusted standard" if head.adjusted_time else "week"
     done = 0
     for points, fields in pieces:
         done += len(points)
-        yield Cloud(points, others, frame, fields)
+        yield Cloud(points, others, frame, fields, times)
+    _check_held(path, head.promised, head.held or 0)
     if done != head.promised:
         raise MapvoteError(f"{path}: cut off: {done} points, but its header says {head.promised}; copy it again")
     if not done:
         yield Cloud(np.empty((0, 3)), others, frame)
+
+
+def _frame(where: str, head: Head) -> MapFrame:
+    """The frame that the file names; one that only says what is wrong where nobody can make it out."""
+    try:
+        return MapFrame(_known(where, head.wkt)) if head.wkt else frame_of_keys(where, head.geo_keys)
+    except MapvoteError as error:
+        return MapFrame(refusal=str(error))
 
 
 def _known(where: str, crs: str) -> str:
@@ -144,55 +155,122 @@ def _pieces_of(stream: io.BufferedReader, head: Head) -> Iterator[Piece]:
 
 
 def _check_counts(path: Path) -> bool:
-    """Whether the points are compressed (LAZ). MapvoteError if the header counts more than the file has room for:
-    laspy would believe it and hang.
+    """Whether the points are compressed (LAZ). MapvoteError if the header counts more points than the file has room
+    for, which laspy would believe and hang, or fewer than it holds.
 
     Offsets of the LAS 1.4 specification: 25 minor version, 96 start of the points, 100 VLRs, 104 point format (LAZ
-    sets a high bit), 107 points (to 1.3), 243 EVLRs and 247 points (1.4).
+    sets a high bit), 105 bytes of a point, 107 points (to 1.3), 111 points by return, 227 waveforms (1.3), 235 EVLRs'
+    start, 243 EVLRs and 247 points (1.4), 255 points by return (1.4).
     """
     size = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(255).ljust(255, b"\0")
+        header = stream.read(375).ljust(375, b"\0")
+    version, compressed = header[25], bool(header[104] & 0xC0)
     start, vlrs = struct.unpack_from("<II", header, 96)
-    evlrs, points = (
-        struct.unpack_from("<IQ", header, 243) if header[25] >= 4 else (0, struct.unpack_from("<I", header, 107)[0])
-    )
+    record, legacy = struct.unpack_from("<HI", header, 105)
+    evlrs, points = struct.unpack_from("<IQ", header, 243) if version >= 4 else (0, legacy)
     room = max(size - start, 0) * MAX_POINTS_PER_BYTE
     if header[:4] != b"LASF" or start > size or vlrs * 54 > size or evlrs * 60 > size or points > room:
         raise MapvoteError(
             f"{path}: not a whole LAS or LAZ file (its header promises more than it holds); copy it again"
         )
-    return bool(header[104] & 0xC0)
+    # Of LAS the size tells how many points there are; of LAZ the header's own count by return may.
+    if compressed:
+        returns = sum(
+            struct.unpack_from("<15Q", header, 255) if version >= 4 else struct.unpack_from("<5I", header, 111)
+        )
+        if returns > points:
+            log.warning("%s: its header counts %d points, but %d returns: are points missing?", path, points, returns)
+    else:
+        waveforms = struct.unpack_from("<Q", header, 227)[0] if version >= 3 else 0
+        after = struct.unpack_from("<Q", header, 235)[0] if evlrs else 0
+        end = min((place for place in (waveforms, after) if start < place < size), default=size)
+        _check_held(path, points, (end - start) // max(record, 1))
+    return compressed
 
 
-def las_fields(fields: Mapping[str, NDArray[Any]], full: Mapping[str, float]) -> dict[str, NDArray[Any]]:
-    """Columns as LAS holds them: 16 bits of intensity and colour, from the ``full`` scale that they have."""
-    out = {}
-    for name, kind in FIELDS.items():
-        if name not in fields:
-            continue
-        values = fields[name]
-        if name in SCALED and values.dtype != np.uint16:
-            values = np.rint(np.clip(values.astype(np.float64) / full[name], 0.0, 1.0) * 65535.0)
-        out[name] = values.astype(kind)
-    return out
+def _check_held(path: Path, promised: int, held: int) -> None:
+    """MapvoteError if a file holds more points than its header counts."""
+    if held > promised:
+        raise MapvoteError(
+            f"{path}: its header counts {promised} points, but data for {held - promised} more follow; correct the "
+            "number of points in the header (lasinfo -repair does), or export it again"
+        )
+
+
+def _as_las(name: str, values: NDArray[Any], brightness: Brightness) -> NDArray[Any]:
+    """A column as LAS holds it. Whole numbers from 0 to 65,535 stay as they are; other brightness is scaled so that
+    full becomes 65,535; 8-bit colours too, for LAS's colours have 16 bits."""
+    kind = np.dtype(FIELDS[name])
+    if values.dtype == kind:
+        return values
+    if kind.kind == "f":
+        return values.astype(kind)
+    highest = 15 if name in ("return_number", "number_of_returns", "las_flags") else np.iinfo(kind).max
+    if name in SCALED and not (brightness.is_count and (name == "intensity" or brightness.full > 255.0)):
+        return np.rint(shares(values, brightness.full) * highest).astype(kind)
+    return np.rint(np.clip(np.nan_to_num(values.astype(np.float64)), 0, highest)).astype(kind)
+
+
+def _tell_of_brightness(path: Path, clouds: CloudPieces) -> None:
+    """Say what LAS cannot hold of intensities and colours, and on which scale they are written."""
+    for name, values in clouds.brightness.items():
+        lost = {"negative": values.negative, "not finite": values.undefined, "above the scale": values.above}
+        counts = ", ".join(f"{n} {kind}" for kind, n in lost.items() if n)
+        if counts:
+            log.warning("%s: %s of %d values: %s; LAS holds 0 to 65535", path, name, values.n, counts)
+        if not values.is_count:
+            log.warning("%s: %s from 0 to %g is written as 0 to 65535", path, name, values.full)
+
+
+@dataclass(frozen=True, slots=True)
+class LasSteps:
+    """Resolution of coordinates in LAS files, which are whole multiples of a step from the file's offset."""
+
+    length: float = 1e-4
+    """Metres, or feet: exact to 0.05 mm over 400 km."""
+    degree: float = 1e-12
+    """Degrees: float64 as they are computed, to 0.1 micrometres."""
+    largest: int = 2**31 - 1
+    """Steps from the offset that 32 bits hold."""
+
+
+STEPS = LasSteps()
+
+
+def steps_and_offsets(corners: F64, *, degrees: bool) -> tuple[F64, F64]:
+    """((3,) steps, (3,) offsets) for coordinates within ``corners`` (2, 3); ``degrees``: of x and y. Powers of ten,
+    the finest wanted that 32 bits hold over the whole extent."""
+    wanted = np.array([STEPS.degree if degrees else STEPS.length] * 2 + [STEPS.length])
+    half = 0.5 * (corners[1] - corners[0])
+    needed = 10.0 ** np.ceil(np.log10(np.maximum(1.001 * half, 1e-30) / STEPS.largest))
+    offsets = 0.5 * (corners[0] + corners[1])
+    digits = np.where([degrees, degrees, False], 6, 0)
+    return np.maximum(wanted, needed), np.array([np.round(o, d) for o, d in zip(offsets, digits, strict=True)])
 
 
 def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
     """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
 
-    Every point is return 1 of 1 where nothing else is known. Whole or not at all.
+    x is east or longitude, y north or latitude, whatever order the coordinate system names. Every point is return 1 of
+    1 where nothing else is known. Whole or not at all.
     """
     laspy = require("laspy", "las", str(path))
     clouds = CloudPieces.of(cloud)
-    header = laspy.LasHeader(point_format=7 if "red" in clouds.kinds else 6, version="1.4")
-    header.scales = np.full(3, STEP_M)
     shift = np.zeros(3)
+    geographic = False
+    header = laspy.LasHeader(point_format=7 if "red" in clouds.kinds else 6, version="1.4")
+    # Back to the coordinates that the CRS means.
     if not clouds.frame.is_local and not clouds.frame.crs.startswith(ENU):
-        shift = np.array(clouds.frame.offset_m)  # back to the coordinates that the CRS means
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(read_crs(clouds.frame.crs).to_wkt("WKT1_GDAL")))
+        shift = np.array(clouds.frame.offset_m)
+        crs = read_crs(clouds.frame.crs)
+        geographic = bool(crs.is_geographic)
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
-    header.offsets = np.floor(clouds.corners.mean(axis=0) + shift)
+    adjusted = clouds.gps_times == "adjusted standard"
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
+    header.scales, header.offsets = steps_and_offsets(clouds.corners + shift, degrees=geographic)
+    _tell_of_brightness(path, clouds)
     compressed = path.suffix.lower() == ".laz"
     with (
         whole_file(path) as partial,
@@ -200,9 +278,21 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
         laspy.open(stream, mode="w", header=header, do_compress=compressed, closefd=False) as out,
     ):
         for piece in clouds:
-            record = laspy.ScaleAwarePointRecord.zeros(len(piece.points), header=header)
-            record.x, record.y, record.z = (piece.points.astype(np.float64, copy=False) + shift).T
-            record.return_number = record.number_of_returns = np.ones(len(record), dtype=np.uint8)
-            for name, values in las_fields(piece.fields, clouds.full).items():
-                record[name] = values
-            out.write_points(record)
+            out.write_points(_record(laspy, header, piece, clouds.brightness, shift))
+
+
+def _record(laspy: Any, header: Any, piece: Cloud, brightness: Mapping[str, Brightness], shift: F64) -> Any:
+    """One piece as laspy's points."""
+    record = laspy.ScaleAwarePointRecord.zeros(len(piece.points), header=header)
+    record.x, record.y, record.z = (piece.points.astype(np.float64, copy=False) + shift).T
+    record.return_number = record.number_of_returns = np.ones(len(record), dtype=np.uint8)
+    for name in FIELDS:
+        if name not in piece.fields:
+            continue
+        values = _as_las(name, piece.fields[name], brightness.get(SCALED.get(name, ""), Brightness()))
+        if name != "las_flags":
+            record[name] = values
+            continue
+        for flag, bit in FLAGS.items():
+            record[flag] = (values & bit) > 0
+    return record

@@ -8,8 +8,10 @@ process starts fast, nothing of mapvote is imported here.
 
 from __future__ import annotations
 
+import struct
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -26,15 +28,27 @@ FIELDS = {
     "red": "<u2",
     "green": "<u2",
     "blue": "<u2",
+    "las_flags": "|u1",
 }
 """What a map keeps of a point besides x, y, z."""
+FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
+"""Bits of ``las_flags``."""
+LAYERED = 3
+"""LASzip's compressor of the point formats from 6 on."""
+OVERLAP_CLASS, UNCLASSIFIED = 12, 1
+"""Up to LAS 1.3, and in point formats 0 to 5, class 12 says what the flag "overlap" says later."""
 
 
 class Head(msgspec.Struct):
     """What there is besides points, or why they cannot be read."""
 
     promised: int = 0
-    """The content of the file's header."""
+    """Points that the file's header counts."""
+    held: int | None = None
+    """Points that the chunks of a LAZ file hold, where they tell."""
+    point_format: int = 0
+    adjusted_time: bool = False
+    """Whether gps_time is adjusted standard GPS time; else it counts from the start of a GPS week."""
     dimensions: tuple[str, ...] = ()
     wkt: str = ""
     geo_keys: dict[int, int] = {}
@@ -44,7 +58,7 @@ class Head(msgspec.Struct):
     @property
     def fields(self) -> list[str]:
         """The columns that follow x, y, z in every piece."""
-        return [name for name in FIELDS if name in self.dimensions]
+        return [name for name in FIELDS if name in self.dimensions or name == "las_flags"]
 
 
 Piece = tuple[NDArray[np.float64], dict[str, NDArray[Any]]]
@@ -64,14 +78,50 @@ def read_head(file: Any) -> Head:
     }
     names = tuple(file.header.point_format.dimension_names)
     text = wkt[0].replace("\0", "").strip() if wkt else ""
-    return Head(file.header.point_count, names, text, {} if text else keys)
+    adjusted = int(file.header.global_encoding.gps_time_type) == 1
+    return Head(file.header.point_count, None, file.header.point_format.id, adjusted, names, text, {} if text else keys)
 
 
 def read_pieces(file: Any, head: Head) -> Iterator[Piece]:
     """The points of an opened LAS file and their fields; whatever laspy and lazrs raise, panics included."""
+    stored = [name for name in head.fields if name != "las_flags"]
     for chunk in file.chunk_iterator(CHUNK):
         points = np.column_stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)])
-        yield points, {name: np.ascontiguousarray(chunk[name], dtype=FIELDS[name]) for name in head.fields}
+        fields = {name: np.array(chunk[name], dtype=FIELDS[name]) for name in stored}
+        flags = np.zeros(len(points), np.uint8)
+        for name, bit in FLAGS.items():
+            if name in head.dimensions:
+                flags |= np.asarray(chunk[name]).astype(np.uint8) * np.uint8(bit)
+        if head.point_format < 6:
+            overlapping = fields["classification"] == OVERLAP_CLASS
+            flags[overlapping] |= FLAGS["overlap"]
+            fields["classification"][overlapping] = UNCLASSIFIED
+        yield points, {**fields, "las_flags": flags}
+
+
+def points_in_chunks(path: str, start: int) -> int | None:
+    """Points that a LAZ file holds; None if its chunks do not tell. Chunks of varying size say how many points each
+    holds. Of equal chunks all but the last are full, and in the point formats from 6 on the last one counts its own.
+
+    ``start``: where the point data begin. LASzip's VLR: 12 chunk size, 32 number of items, from 34 on type and size of
+    each (2 + 2 + 2 bytes).
+    """
+    import laspy
+    import lazrs
+
+    with open(path, "rb") as stream:
+        vlrs = [v for v in laspy.LasHeader.read_from(stream).vlrs if type(v).__name__ == "LasZipVlr"]
+        record = vlrs[0].record_data
+        stream.seek(start)
+        chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(record))
+        size = struct.unpack_from("<I", record, 12)[0]
+        if size == 0xFFFFFFFF:
+            return sum(points for points, _ in chunks)
+        if struct.unpack_from("<H", record, 0)[0] != LAYERED or not chunks:
+            return None
+        point_bytes = sum(struct.unpack_from("<H", record, 36 + 6 * i)[0] for i in range(record[32]))
+        stream.seek(start + 8 + sum(n for _, n in chunks[:-1]) + point_bytes)
+        return (len(chunks) - 1) * int(size) + int(struct.unpack("<I", stream.read(4))[0])
 
 
 def main() -> None:
@@ -81,6 +131,8 @@ def main() -> None:
 
         with laspy.open(sys.argv[1]) as file:
             head = read_head(file)
+            with suppress(Exception):  # a file without chunk table, which lazrs reads all the same
+                head.held = points_in_chunks(sys.argv[1], file.header.offset_to_point_data)
             out.write(msgspec.json.encode(head) + b"\n")
             for points, fields in read_pieces(file, head):
                 out.write(b"%d\n" % len(points))

@@ -29,7 +29,8 @@ from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
-from mapvote.formats.maps.cloud import GROUND, KEPT, Cloud, joined, lattice_of
+from mapvote.formats.maps.cloud import GROUND, Cloud, joined, lattice_of
+from mapvote.formats.maps.field_names import KEPT
 
 _IN_MEMORY = 64 << 20
 """Bytes that are not worth a file."""
@@ -86,6 +87,8 @@ log = logging.getLogger("mapvote.formats")
 _SOME = 1_000_000
 """Points used to distinguish degrees from metres; and points in a piece."""
 _XYZ = "xyz"
+GPS_TIMES = "gps_times"
+"""What a map says of its points' times among its georeference, as ``Cloud.gps_times``."""
 
 Look = Callable[[Callable[[], Iterator[NDArray[np.floating]]]], None]
 """Given the points (n, 3) of a map, metres, piece by piece, repeatable; raises MapvoteError to stop."""
@@ -133,7 +136,7 @@ def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look
     taken.spill.close()
     ground = lay_ground(parts.heights(), parts.heights(of_ground=True), parts.points)
     tiles = in_memory_if_small(LazyTiles(lambda index: parts.tile(index, ground[index]), parts.points))
-    return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.frame.georeference())
+    return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.georeference())
 
 
 @dataclass
@@ -145,6 +148,8 @@ class _Taken:
     frame: MapFrame = field(default_factory=MapFrame)
     total: int = 0
     bad: int = 0
+    flagged: bool = False
+    gps_times: str = ""
     _low: F64 = field(default_factory=lambda: np.full(3, np.inf))
     _high: F64 = field(default_factory=lambda: np.full(3, -np.inf))
     _kinds: list[dict[str, np.dtype[Any]]] = field(default_factory=list)
@@ -152,6 +157,8 @@ class _Taken:
     def take(self, cloud: Cloud) -> None:
         points = cloud.points
         self.frame = cloud.frame
+        self.gps_times = self.gps_times or cloud.gps_times
+        self.flagged = self.flagged or bool(cloud.fields.get("las_flags", np.zeros(1)).any())
         self._kinds.append({name: column.dtype for name, column in {**cloud.fields, _XYZ: points}.items()})
         good = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
         self.total += len(points)
@@ -165,6 +172,11 @@ class _Taken:
         self._high = np.maximum(self._high, columns[_XYZ].max(axis=0))
         for start in range(0, len(columns[_XYZ]), _SOME):
             self.spill.add({name: column[start : start + _SOME] for name, column in columns.items()})
+
+    def georeference(self) -> dict[str, str]:
+        """What the map says of its coordinates and times."""
+        times = {GPS_TIMES: self.gps_times} if self.gps_times else {}
+        return self.frame.georeference() | times
 
     def lattice(self) -> Lattice:
         """Where the map's cells lie. MapvoteError if no map can be made of what was taken."""
@@ -180,8 +192,10 @@ class _Taken:
         return lattice_of(np.array([self._low, self._high]))
 
     def blocks(self) -> Iterator[Columns]:
-        """What was taken, in order: the fields that all pieces have, each in one type."""
+        """What was taken, in order: the fields that all pieces have, each in one type. Flags only if one is set."""
         names = [name for name in (_XYZ, *KEPT) if all(name in kinds for kinds in self._kinds)]
+        if not self.flagged and "las_flags" in names:
+            names.remove("las_flags")
         types = {name: np.result_type(*(kinds[name] for kinds in self._kinds)) for name in names}
         for number in range(len(self.spill)):
             block = self.spill.read(number)

@@ -1,0 +1,69 @@
+"""How programs spell the fields of a point, and which of them a map keeps.
+
+PCL writes ``intensity``, PDAL ``Intensity`` or ``gpstime``, CloudCompare ``scalar_Intensity`` and ``scalar_GpsTime``,
+Open3D ``red``, MeshLab ``diffuse_red``. Letters' case, underscores and blanks make no difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+KEPT = (
+    "intensity",
+    "red",
+    "green",
+    "blue",
+    "classification",
+    "gps_time",
+    "return_number",
+    "number_of_returns",
+    "las_flags",
+)
+"""Fields of points that a map keeps, by LAS's names. ``las_flags`` holds the bits of ``LAS_FLAGS``."""
+LAS_FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
+"""Bits of the flags of a point, as LAS 1.4 numbers them."""
+COLOURS = ("red", "green", "blue")
+
+_SPELLINGS: Mapping[str, tuple[str, ...]] = {
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "intensity": ("intensity", "reflectivity", "reflectance", "remission"),
+    "red": ("red", "diffusered"),
+    "green": ("green", "diffusegreen"),
+    "blue": ("blue", "diffuseblue"),
+    "classification": ("classification",),
+    "gps_time": ("gpstime",),
+    "return_number": ("returnnumber",),
+    "number_of_returns": ("numberofreturns",),
+    "las_flags": ("lasflags",),
+}
+"""Plain spellings of each field, the best first."""
+
+
+def plain(name: str) -> str:
+    """A name without case, underscores, blanks and CloudCompare's prefix."""
+    return name.lower().removeprefix("scalar_").replace("_", "").replace(" ", "")
+
+
+def known_fields(names: Sequence[str]) -> dict[str, str]:
+    """For x, y, z and each field of ``KEPT`` that ``names`` hold: which of them holds it."""
+    by_spelling: dict[str, str] = {}
+    for name in names:
+        by_spelling.setdefault(plain(name), name)
+    found: dict[str, str] = {}
+    for ours, spellings in _SPELLINGS.items():
+        there = [by_spelling[spelling] for spelling in spellings if spelling in by_spelling]
+        if ours in names:
+            found[ours] = ours
+        elif there:
+            found[ours] = there[0]
+    if not any(colour in found for colour in COLOURS) and {"r", "g", "b"} <= by_spelling.keys():
+        found |= {colour: by_spelling[colour[0]] for colour in COLOURS}
+    return found
+
+
+def other_fields(names: Sequence[str]) -> tuple[str, ...]:
+    """The fields that a map does not keep; padding (names that start with an underscore or a hash) is none."""
+    kept = {*known_fields(names).values(), "rgb", "rgba"}
+    return tuple(name for name in names if name not in kept and not name.startswith(("_", "#")))

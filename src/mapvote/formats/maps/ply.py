@@ -1,0 +1,74 @@
+"""PLY files: written here (a header and numpy's bytes, piece by piece), read through plyfile (extra ``ply``)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mapvote.core.types import MapvoteError
+from mapvote.formats.atomic import whole_file
+from mapvote.formats.extras import reading, require
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of
+
+_BLOCK = 500_000
+"""Vertices handed on at a time."""
+_TYPES = {
+    "f8": "double", "f4": "float", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"
+}  # fmt: skip
+
+_MEND = "correct the numbers of elements in the header, or export it again"
+
+
+def stream_ply(path: Path) -> Iterator[Cloud]:
+    """The vertices of a PLY file, ascii or binary, float or double; faces are ignored. Binary vertices without lists
+    stay on disk until their piece is read. MapvoteError if the file is damaged or holds no element "vertex"."""
+    library = require("plyfile", "ply", str(path))
+    with reading(path, "PLY file of vertices"):
+        with path.open("rb") as stream:
+            is_text = b"ascii" in stream.readline() + stream.readline()
+            stream.seek(0)
+            source = _full_lines(stream) if is_text else stream
+            file = library.PlyData.read(source)
+            more = source.read() if is_text else stream.read().strip(b"\0\r\n ")
+        if more:
+            raise MapvoteError(f"{path}: data follow the elements that its header counts ({_counts(file)}); {_MEND}")
+        if "vertex" not in file:
+            raise ValueError("it holds no element vertex")
+        vertices = file["vertex"].data
+        vertices = vertices[[name for name in vertices.dtype.names if not vertices.dtype[name].hasobject]]  # no lists
+        for start in range(0, max(len(vertices), 1), _BLOCK):
+            part = np.array(vertices[start : start + _BLOCK])
+            part = part.astype(part.dtype.newbyteorder("="))
+            yield cloud_of_table(str(path), part)
+
+
+def _full_lines(stream: BinaryIO) -> io.StringIO:
+    """The lines of a text that hold something, as plyfile wants them."""
+    return io.StringIO("".join(line.decode("latin-1").rstrip() + "\n" for line in stream if line.strip()))
+
+
+def _counts(file: Any) -> str:
+    return ", ".join(f"{element.count} {element.name}" for element in file.elements)
+
+
+def write_ply(path: Path, cloud: Cloud | CloudPieces) -> None:
+    """A cloud as double x, y, z and its fields, binary little-endian: nothing is rounded. Whole or not at all.
+
+    The frame is not written: PLY has no place for it.
+    """
+    clouds = CloudPieces.of(cloud)
+    kinds = [(axis, np.dtype("<f8")) for axis in "xyz"]
+    kinds += [
+        (name, kind.newbyteorder("<") if kind.str[1:] in _TYPES else np.dtype("<f8"))
+        for name, kind in clouds.kinds.items()
+    ]
+    properties = "".join(f"property {_TYPES[kind.str[1:]]} {name}\n" for name, kind in kinds)
+    start = f"ply\nformat binary_little_endian 1.0\ncomment mapvote\nelement vertex {clouds.n}\n"
+    with whole_file(path) as partial, partial.open("wb") as stream:
+        stream.write(f"{start}{properties}end_header\n".encode("ascii"))
+        for piece in clouds:
+            stream.write(table_of(piece, kinds).tobytes())
