@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -15,6 +16,11 @@ from mapvote.formats import export_map, read_map, registry
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "src").rglob("*.js")])
+_spec = importlib.util.spec_from_file_location("document_numbers", ROOT / "benchmarks/document_numbers.py")
+assert _spec is not None
+assert _spec.loader is not None
+document_numbers = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(document_numbers)
 names = [str(page.relative_to(ROOT)) for page in PAGES]
 
 
@@ -80,6 +86,12 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     api = (tmp_path / "site" / "api" / "index.html").read_text()
     assert all(f".{name}" in api for name in ("build_map", "vote_drive", "update_map", "MapClient"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_tables_of_numbers_are_those_of_the_program(page: Path) -> None:
+    """``<!-- numbers: Movers -->`` stands above a table that benchmarks/document_numbers.py writes."""
+    assert document_numbers.with_tables(page.read_text()) == page.read_text(), "python benchmarks/document_numbers.py"
 
 
 def test_no_source_refers_to_a_document_that_is_not_here() -> None:

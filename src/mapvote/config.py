@@ -15,11 +15,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from mapvote.core.record import method_version
 from mapvote.core.rule import rule_named, rule_names
 from mapvote.core.types import MapvoteError
-
-METHOD_VERSION = 9
-"""Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
 
 
 def cache_folder() -> Path:
@@ -272,11 +270,11 @@ class Settings(Section):
     def digest(self) -> str:
         """SHA-256 of what a vehicle votes by: ballots of one round must agree on it, whatever a server's limits are.
 
-        Settings, METHOD_VERSION and the rule's own version: two programs that would vote otherwise on the same drive
-        never share a round.
+        Settings, the numbers that vehicles vote by (core/record.py) and the rule's own version: two programs that would
+        vote otherwise on the same drive never share a round.
         """
         settings = self.model_dump_json(include={"ndt", "moving", "voting", "paper"})
-        version = f"{METHOD_VERSION} {rule_named(self.voting.method).version}".strip()
+        version = f"{method_version()} {rule_named(self.voting.method).version}"
         return hashlib.sha256(f"{version} {settings}".encode()).hexdigest()
 
 

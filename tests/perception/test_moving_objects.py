@@ -13,12 +13,12 @@ from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F32, F64, Bool
-from mapvote.perception import moving_objects
 from mapvote.perception.moving_objects import (
+    MOVERS,
     NOTHING,
-    REACH_M,
     U16,
     LookCounts,
+    Movers,
     MovingFilter,
     Pixels,
     Samples,
@@ -78,8 +78,8 @@ class Street:
             self.scans.append((points, origin, points[:, 2] > 0.3, round(t * 1e9)))
             self.truth.append(which >= len(fixed))
 
-    def run(self, sensor: Sensor, settings: MovingSettings) -> list[Bool]:
-        moving = MovingFilter(sensor, settings)
+    def run(self, sensor: Sensor, settings: MovingSettings, movers: Movers = MOVERS) -> list[Bool]:
+        moving = MovingFilter(sensor, settings, movers)
         masks = []
         for points, origin, obstacle, stamp_ns in self.scans:
             masks += moving.push(points, origin, obstacle, stamp_ns)
@@ -131,7 +131,7 @@ def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: f
     corners = np.column_stack([grid.x0 + CELL_SIZE * cols, grid.y0 + CELL_SIZE * rows, np.ones(4)])
     origin = np.array([x, x, LIDAR_HEIGHT])
     assert np.linalg.norm(corners - origin, axis=1).max() > 56.5
-    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, REACH_M, CELL_SIZE)
+    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, MOVERS.reach_m, CELL_SIZE)
     assert (voxel_of >= 0).all()
 
 
@@ -157,14 +157,14 @@ def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() 
     assert decided + len(moving.flush()) == len(street.scans)
 
 
-def test_nothing_older_than_the_window_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_older_than_the_window_is_used() -> None:
     sensor = coarse("hdl32e")
-    monkeypatch.setattr(moving_objects, "PAST_S", 1.0)
+    movers = Movers(past_s=1.0)
     settings = MovingSettings(lookahead_s=0.5)
     street = Street(sensor, 10.0, 2.5, [ONCOMING])
-    whole = street.run(sensor, settings)
+    whole = street.run(sensor, settings, movers)
     street.scans = street.scans[5:]
-    late = street.run(sensor, settings)
+    late = street.run(sensor, settings, movers)
     for index in range(10, len(late)):  # a second of history behind it
         np.testing.assert_array_equal(late[index], whole[index + 5])
 

@@ -32,6 +32,9 @@ def warmup() -> None:
 def config(
     config: Config = None,
     toml: Annotated[bool, typer.Option("--toml", help="print as TOML, e.g. to start a settings file")] = False,
+    all_: Annotated[
+        bool, typer.Option("--all", help="also list the numbers of every algorithm, which no setting changes")
+    ] = False,
 ) -> None:
     """Show every setting with its value, where the value comes from, and what it means.
 
@@ -57,4 +60,9 @@ def config(
             rows.append([Text(cell, "" if source == "default" else "bold green") for cell in row])
         rows.append(None)
     print_table(("setting", "value", "source", "meaning"), rows, "Settings")
+    if all_:
+        from mapvote.core.record import numbers
+
+        listed = [(number.name, str(number.value), number.meaning) for number in numbers()]
+        print_table(("number", "value", "meaning"), listed, "Numbers of the algorithms")
     print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.")

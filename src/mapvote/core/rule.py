@@ -34,7 +34,7 @@ class Rule:
     takes_clouds: bool = False
     """Ballots name the voxels that go, so a session's cloud can vote by it although it has no scans."""
     version: str = ""
-    """Any text. Ballots of two versions never share a round."""
+    """Any text, changed whenever the rule's code would vote otherwise. Ballots of two versions never share a round."""
 
     def load_voter(self) -> Any:
         """The function that ``voter`` names. MapvoteError if it cannot be imported."""
@@ -51,9 +51,10 @@ PAPER = Rule(
     min_votes=1,
     needs_sight=True,
     takes_points_beyond=False,
+    version="1",
 )
 """Paper III and IV."""
-SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True)
+SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True, version="1")
 """Height at the cost of a 2D grid: a word of 0.3 m voxels a cell (docs/method.md)."""
 RULES: dict[str, Rule] = {"paper": PAPER, "surfaces": SURFACES}
 """The rules of this package. :func:`rule_names` and :func:`rule_named` know those of other distributions too."""

@@ -28,7 +28,7 @@ from mapvote.matching.odometry import Fix
 from mapvote.perception.raycast import ScanView, Sky, cast_rays, find_obstacles
 
 
-class Movers(Protocol):
+class MoversFilter(Protocol):
     """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
 
     def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]: ...
@@ -162,7 +162,7 @@ class Frontend:
     def __init__(
         self,
         localise: Localise,
-        movers: Movers,
+        movers: MoversFilter,
         ground: LocalMap,
         compared: LocalMap | None = None,
         *,

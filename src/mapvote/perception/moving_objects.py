@@ -12,7 +12,7 @@ rays passed both just below and just above the place, because a ray over a roof 
 It needs no map, only poses, so it serves SLAM and voting alike.
 
 Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
-us hides is seen through only once it has driven on. Nothing older than ``PAST_S`` (2 s) before it is used.
+us hides is seen through only once it has driven on. Nothing older than ``Movers.past_s`` (2 s) before it is used.
 
 Limits: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
 moving, and what only the sky lies behind is judged by the cells it is connected to (rays without return are unknown).
@@ -35,6 +35,7 @@ from mapvote.config import MovingSettings
 from mapvote.core.geometry import rows_from, turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool
 from mapvote.core.voxels import grouped, voxel_key
@@ -220,35 +221,42 @@ def look(
     return int(left)
 
 
-# Set on the development streets of the simulator.
-REACH_M = 57.0
-"""Points farther away are never called moving: the corners of the local grid are 56.7 m away."""
-PAST_S = 2.0
-"""How far back other scans are used."""
-LOOKS_PAST = 6
-"""Scans used before."""
-LOOKS_AHEAD = 5
-"""Scans used after."""
-PIXEL_DEG = 0.6
-"""Direction pixel of the free-space look-up."""
-TILT_DEG = 4.0
-"""Pitch and roll of the vehicle to allow for."""
-MARGIN_M = 0.5
-"""A ray that ends this far behind a voxel saw through it."""
-HEIGHT_M = 0.12
-"""Rays this far above and below a voxel bear witness to it."""
-MIN_FREE = 2
-"""Scans that saw through a voxel before it can be called brief."""
-ENOUGH = 3
-"""Scans that agree without dissent settle a voxel."""
-FREE_SHARE = 0.5
-"""Share of the scans able to see a voxel that saw through it."""
-MIN_VOXELS = 4
-"""Brief voxels that a moving object has at least."""
-SHARE_WHOLE = 0.5
-"""Brief share at which connected cells move together."""
-SHARE_PART = 0.7
-"""The same for what remains beside static cells."""
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class Movers:
+    """Numbers of the filter, set on the development streets of the simulator."""
+
+    reach_m: float = 57.0
+    """Points farther away are never called moving: the corners of the local grid are 56.7 m away."""
+    past_s: float = 2.0
+    """Scans older than this before a scan are not used."""
+    looks_past: int = 6
+    """Scans used before."""
+    looks_ahead: int = 5
+    """Scans used after."""
+    pixel_deg: float = 0.6
+    """Direction pixel of the free-space look-up."""
+    tilt_deg: float = 4.0
+    """Pitch and roll of the vehicle to allow for."""
+    margin_m: float = 0.5
+    """A ray that ends this far behind a voxel saw through it."""
+    height_m: float = 0.12
+    """Rays this far above and below a voxel bear witness to it."""
+    min_free: int = 2
+    """Scans that saw through a voxel before it can be called brief."""
+    enough: int = 3
+    """Scans that agree without dissent settle a voxel."""
+    free_share: float = 0.5
+    """Share of the scans able to see a voxel that saw through it."""
+    min_voxels: int = 4
+    """Brief voxels that a moving object has at least."""
+    share_whole: float = 0.5
+    """Brief share at which connected cells move together."""
+    share_part: float = 0.7
+    """The same share for the cells that remain beside static ones."""
+
+
+MOVERS = Movers()
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,13 +279,13 @@ class MovingFilter:
     Scans go in with :meth:`push`, in order of time; masks come out as soon as ``lookahead_s`` has been seen.
     """
 
-    def __init__(self, sensor: Sensor, settings: MovingSettings, reach_m: float | None = None) -> None:
-        """``reach_m``: the range of the filter, REACH_M by default."""
-        self.settings, self.reach_m = settings, REACH_M if reach_m is None else reach_m
-        slope_min = np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0)))
-        slope_max = np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0)))
-        per_slope = 1.0 / np.tan(np.radians(0.5 * PIXEL_DEG))
-        turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, PIXEL_DEG))
+    def __init__(self, sensor: Sensor, settings: MovingSettings, movers: Movers = MOVERS) -> None:
+        self.settings = settings
+        self.movers = movers
+        slope_min = np.tan(np.radians(max(sensor.fov_bottom_deg - movers.tilt_deg, -60.0)))
+        slope_max = np.tan(np.radians(min(sensor.fov_top_deg + movers.tilt_deg, 60.0)))
+        per_slope = 1.0 / np.tan(np.radians(0.5 * movers.pixel_deg))
+        turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, movers.pixel_deg))
         slopes = int(np.ceil((slope_max - slope_min) * per_slope))
         self._pixels = Pixels(turns, slopes, np.float32(slope_min), np.float32(per_slope))
         self._window: deque[_Scan] = deque()
@@ -297,7 +305,7 @@ class MovingFilter:
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
         nearest = range_image(points, origin, self._pixels)
-        voxel_of, samples = voxels(points, obstacle, origin, self.reach_m, CELL_SIZE)
+        voxel_of, samples = voxels(points, obstacle, origin, self.movers.reach_m, CELL_SIZE)
         self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, samples))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
@@ -315,7 +323,7 @@ class MovingFilter:
                 break
             out.append(self._moving(at))
             self._waiting -= 1
-            oldest_ns = self._window[at].stamp_ns - round(PAST_S * 1e9)
+            oldest_ns = self._window[at].stamp_ns - round(self.movers.past_s * 1e9)
             while self._window[0].stamp_ns < oldest_ns:
                 self._window.popleft()
         return out
@@ -323,22 +331,24 @@ class MovingFilter:
     def _moving(self, at: int) -> Bool:
         """The mask of the window's scan ``at``, from the other scans of the window."""
         scan = self._window[at]
+        movers = self.movers
         m = left = len(scan.samples)
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
         waiting, sought = Samples(x, y, z, np.arange(m, dtype=np.int32)), room_to_look(m)
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
-            rule = MARGIN_M, HEIGHT_M, ENOUGH
+            rule = movers.margin_m, movers.height_m, movers.enough
             left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
         free, total = counts.free, counts.free + counts.hit
-        brief = (counts.sides == BOTH_SIDES) & (free >= MIN_FREE) & (free >= FREE_SHARE * total)
-        half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
+        brief = (counts.sides == BOTH_SIDES) & (free >= movers.min_free) & (free >= movers.free_share * total)
+        half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
         lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
         cols, rows = np.floor(scan.samples[:, :2].T / CELL_SIZE).astype(np.int64) - lowest[:, None]
         side = 2 * half + 1
-        shares = SHARE_WHOLE, SHARE_PART
-        moves = moving_components(rows * side + cols, side, total >= MIN_FREE, brief, MIN_VOXELS, *shares)
+        shares = movers.share_whole, movers.share_part
+        seen_often = total >= movers.min_free
+        moves = moving_components(rows * side + cols, side, seen_often, brief, movers.min_voxels, *shares)
         return np.append(moves, False)[scan.voxel_of]  # -1: points that cannot be moving
 
     def _witnesses(self, at: int) -> list[_Scan]:
@@ -347,8 +357,8 @@ class MovingFilter:
         Those before and after take turns, the farthest first: they are the likeliest to settle a voxel soon.
         """
         scans = list(self._window)
-        before = _spread(scans[:at], LOOKS_PAST)
-        after = _spread(scans[:at:-1], LOOKS_AHEAD)
+        before = _spread(scans[:at], self.movers.looks_past)
+        after = _spread(scans[:at:-1], self.movers.looks_ahead)
         return [s for pair in zip_longest(before, after) for s in pair if s is not None]
 
 

@@ -55,7 +55,7 @@ from mapvote.core.types import F32, F64, I32, I64, U64, Bool
 from mapvote.core.voxels import BESIDE, VoxelCloud, slot_of, thin, voxel_keys
 from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation
-from mapvote.perception.moving_objects import MovingFilter
+from mapvote.perception.moving_objects import MOVERS, MovingFilter
 from mapvote.rules.evidence import HIT, PASSES, WORDS, count_scan, free_words, least_passed
 from mapvote.rules.packed_tiles import PackedTiles, count_of
 from mapvote.survey.pose_graph import DriveTrack
@@ -81,7 +81,7 @@ class Mapper:
         drive = track.drive
         frontend = Frontend(
             GivenPoses(drive.stamps_ns, track.T_map_lidar),
-            MovingFilter(drive.sensor, self.settings.moving, self.settings.mapping.reach_m),
+            MovingFilter(drive.sensor, self.settings.moving, replace(MOVERS, reach_m=self.settings.mapping.reach_m)),
             self._around,
             self._near,
             with_sight=False,
