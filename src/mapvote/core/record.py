@@ -99,7 +99,7 @@ def numbers_table(names: Iterable[str]) -> str:
     wanted = set(names)
     rows = [number for number in numbers() if number.name.partition(".")[0] in wanted]
     lines = [f"| `{number.name}` | {number.value} | {number.meaning} |" for number in rows]
-    return "\n".join(["| RecordField | Value | Meaning |", "|---|---|---|", *lines])
+    return "\n".join(["| Number | Value | Meaning |", "|---|---|---|", *lines])
 
 
 def _fields_of(cls: type) -> Iterator[RecordField]:
