@@ -21,6 +21,8 @@ from mapvote.doctor.bags import check_bag
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
 from mapvote.doctor.maps import check_cloud, check_map, examine_map, tile_by_tile
+from mapvote.doctor.mount import RULES as MOUNTS
+from mapvote.doctor.mount import mount_of_prior
 from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
 from mapvote.formats import is_cloud, open_drive_on
@@ -49,10 +51,26 @@ def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[
     cheap = cheap_checks(drive, e.looks)
     if IN_MAP_FRAME in cheap:  # then nothing else can be checked
         return cheap, np.tile(np.eye(4), (len(drive), 1, 1))
-    found = [*cheap, *check_ranges(e), *check_road(e), *e.leaps]
+    mount = None if e.T is None else mount_of_prior(e.T)
+    if mount is not None:
+        turned = DriveEvidence(mount.turned(drive), progress)
+        vars(turned)["looks"] = e.looks
+        found, T = _by_scans(turned)
+        # Prior and points that agree on a mount are sound. A road below a sensor that leans so shows the mount, too.
+        if not any_error(found) or (
+            mount.lean_deg > MOUNTS.lean_deg and turned.road.up == "+z" and turned.road.is_there
+        ):
+            return in_order([*cheap, *found]), e.T if T is turned.T or T is None else T @ mount.C
+    found, T = _by_scans(e)
+    return in_order([*cheap, *found]), T
+
+
+def _by_scans(e: DriveEvidence) -> tuple[list[Finding], F64 | None]:
+    """(what scans show once they are compared, the prior (n, 4, 4) as it would be mended)."""
+    found = [*check_ranges(e), *check_road(e), *e.leaps]
     of_prior, T = agreement(e)
     attitude = [] if any_error(of_prior) else check_attitude(e)
-    return in_order([*found, *of_prior, *attitude]), T
+    return [*found, *of_prior, *attitude], T
 
 
 def diagnose(
@@ -108,7 +126,12 @@ def _with_map(
     if any_error(of_points):  # as it is, no scan can fit it
         unit = in_another_unit(MapEvidence(drive, T, point_map, progress))
         return [*found, *named, *([unit] if unit is not None else [])], T
-    more, T = check_on_map(drive, T, point_map, progress)
+    mount = mount_of_prior(T)
+    if mount is None:
+        more, T = check_on_map(drive, T, point_map, progress)
+    else:
+        more, T_level = check_on_map(mount.turned(drive), T @ mount.C.T, point_map, progress)
+        T = T_level @ mount.C
     if not of_map and all(f.severity == "note" for f in more):
         found = [f for f in found if not f.map_tells]
     return [*found, *named, *more], T

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity, any_error, usable
+from mapvote.doctor.mount import check_lean, mount_of_prior
 from mapvote.formats.drives.options import source_of_times
 from mapvote.formats.drives.sensor_estimate import contradiction
 
@@ -56,7 +57,7 @@ _LOOK = np.dtype(
         ("high", "f8", 3),
         ("mean", "f8", 3),
         ("range_m", "f8", 3),  # ranges from the origin: of a tenth, half and 99 % of the points
-        ("sectors", "f8", _SECTORS),  # share of the points in each ten degrees of azimuth, from -180 deg
+        ("sectors", "f8", _SECTORS),  # share of the points in each ten degrees of azimuth about the vertical, from -180
         ("near", "f8"),  # share within 2 m of the origin
         ("unit", "f8", 3),  # share of each coordinate that lies in [0, 1]
         ("rounded", "f8", len(_QUANTA_M)),  # share of the points whose x, y and z are multiples of _QUANTA_M
@@ -103,6 +104,9 @@ class Looking:
         self.drive = replace(drive, read_scan=self._read)
         """The same drive, checked while it is read."""
         self._unseen = drive
+        T = drive.T_map_lidar_prior
+        mount = None if T is None or not len(T) else mount_of_prior(T)
+        self._R = None if mount is None else mount.C[:3, :3].astype(np.float32)
         self._rows: dict[int, np.void] = {}
         self._refused: dict[int, str] = {}
         self._times = self._intensity = False
@@ -114,7 +118,7 @@ class Looking:
             self._refused[i] = str(error)
             raise
         if i not in self._rows:
-            self._rows[i] = _look(i, scan.points)
+            self._rows[i] = _look(i, scan.points, self._R)
             self._times |= scan.time_s is not None
             self._intensity |= scan.intensity is not None
         return scan
@@ -147,12 +151,13 @@ def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) 
     return looking
 
 
-def _look(index: int, points: F32) -> np.void:
-    """One row of :class:`Looks`: of every so many of the points (n, 3)."""
+def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
+    """One row of :class:`Looks`: of every so many of the points (n, 3). ``R`` (3, 3) turns them to z up."""
     xyz = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
     n = len(xyz)
     share = 1.0 / max(n, 1)
-    distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(xyz[:, 1], xyz[:, 0])
+    level = xyz if R is None else xyz @ R.T
+    distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(level[:, 1], level[:, 0])
     seen = np.cumsum(np.bincount(np.minimum(distance / _BIN_M, _BINS - 1.0).astype(np.int64), minlength=_BINS))
     sectors = ((azimuth + np.pi) / (2.0 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
     steps = np.diff(azimuth)
@@ -184,6 +189,8 @@ def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
     found = [*_check_times(drive), *_check_scans(drive, looks)]
     if T is None:
         return [*found, NO_PRIOR] if len(drive) >= 2 else found
+    if len(looks):
+        found += check_lean(drive, int(looks["index"][len(looks) // 2]))
     return [*found, *_check_track(drive, T)] if len(T) >= 2 else found
 
 
@@ -234,7 +241,7 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
 
 
 def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
-    """Jumps of the prior, rows that stand still, rounding, tilts."""
+    """Jumps of the prior, rows that stand still, rounding."""
     steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     way_m, usual_m = float(steps_m.sum()), float(np.median(steps_m))
     if way_m < 0.5:
@@ -253,10 +260,6 @@ def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
                 what = f"the prior's positions are rounded to {quantum:g} m"
                 yield Finding("warning", what, "float32 of large coordinates? Write double")
                 break
-    tilt_deg = float(np.median(np.rad2deg(np.arccos(np.clip(T[:, 2, 2], -1, 1)))))
-    if tilt_deg > 30:
-        mend = "fine for a sensor mounted so; else its axes are not x forward, z up"
-        yield Finding("warning", f"the prior tilts the sensor by {tilt_deg:.0f} deg", mend)
 
 
 def _jumps_and_stops(steps_m: F64, usual_m: float) -> Iterator[Finding]:
