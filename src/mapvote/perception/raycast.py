@@ -179,6 +179,8 @@ SECTORS = 256
 """In a turn: of 1.4 deg, 8 firings or so of each beam; the ones beside a sector must be as empty."""
 ANSWERED = 0.25
 """Share of a sector's rays that must have a return: where fewer have, lost packets or the vehicle may be the cause."""
+LEAST_UPRIGHT = 0.866
+"""Cosine of the lean, at most 30 deg, up to which a beam has one slope in every direction of the map."""
 SKY_M = 60.0
 """Horizontal metres for which a ray into the sky is followed: to the corners of any window, and well within range."""
 _EVERY = 2
@@ -227,10 +229,15 @@ class Sky:
 
     def __init__(self, sensor: Sensor) -> None:
         beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere the end of a ray is unknown
-        self._slopes = np.tan(np.radians(beams)).astype(np.float32)
+        upright = np.tan(np.radians(beams)).astype(np.float32)
+        self._slopes = {True: upright, False: np.ascontiguousarray(-upright[::-1])}
+        """By whether the sensor's z axis points up: upside down, the lowest beam is the highest."""
         self._least = ANSWERED * len(beams) * sensor.azimuths / SECTORS
 
     def rays(self, up_map: F64, rays: Rays) -> Rays:
-        """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the sensor's
-        upward axis in their frame, which may lean some degrees."""
-        return _into_sky(rays, self._slopes, up_map[:2] / up_map[2], self._least)
+        """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the axis that the
+        sensor turns about, in their frame. It may lean some degrees, and point down. Of a sensor that leans by more
+        no ray is known to have passed into the sky: its beams are no cones about the vertical."""
+        if abs(up_map[2]) < LEAST_UPRIGHT * np.linalg.norm(up_map):
+            return _into_sky(rays, np.zeros(0, np.float32), np.zeros(2), np.inf)
+        return _into_sky(rays, self._slopes[bool(up_map[2] > 0.0)], up_map[:2] / up_map[2], self._least)
