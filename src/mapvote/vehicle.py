@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,12 +22,14 @@ from mapvote.codec.planes import pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
+from mapvote.core.mount import mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
+from mapvote.formats.drives.sensor_estimate import sensor_upright
 from mapvote.matching.localiser import Localise, Localiser
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
@@ -270,7 +272,20 @@ def vote_drive(
     localise: Localise | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Ballot, DriveReport]:
-    """Every scan of ``drive`` observed by one Vehicle. ``progress(done, total)`` is called after each scan."""
+    """Every scan of ``drive`` observed by one Vehicle. ``progress(done, total)`` is called after each scan.
+
+    A sensor that its prior mounts upside down, on its side or turned is localised in axes with x ahead and z up; the
+    report has its own again.
+    """
+    mount = None
+    if localise is None and drive.T_map_lidar_prior is not None:
+        mount = mount_of_prior(drive.T_map_lidar_prior)
+    if mount is not None:
+        mount = mount.in_steps()
+        own, drive = drive, mount.turned(drive)
+        measured = own.sensor_told.startswith("measured")
+        middle = drive.read_scan(len(drive) // 2).by_lidar()[0][1]
+        drive = replace(drive, sensor=sensor_upright(own.sensor, measured, middle, mount.lean_deg))
     vehicle = Vehicle(
         drive.vehicle,
         drive.sensor,
@@ -286,7 +301,11 @@ def vote_drive(
         if progress:
             progress(i + 1, len(drive))
     vehicle.finish()
-    return vehicle.ballot(), vehicle.report
+    report = vehicle.report
+    ballot = vehicle.ballot()
+    if mount is not None:
+        report.T_map_lidar[:] = [np.asarray(T @ mount.C) for T in report.T_map_lidar]
+    return ballot, report
 
 
 def stretch_name(drive_id: str, k: int) -> str:

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from mapvote.codec.ballot import decode, unpack_states
+from mapvote.core.mount import mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
 from mapvote.doctor import Finding, Progress, any_error, in_order
 from mapvote.doctor.bags import check_bag
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
+from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
 from mapvote.doctor.maps import check_cloud, check_map, examine_map, tile_by_tile
-from mapvote.doctor.mount import RULES as MOUNTS
-from mapvote.doctor.mount import mount_of_prior
 from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
 from mapvote.formats import is_cloud, open_drive_on
@@ -58,7 +58,7 @@ def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[
         found, T = _by_scans(turned)
         # Prior and points that agree on a mount are sound. A road below a sensor that leans so shows the mount, too.
         if not any_error(found) or (
-            mount.lean_deg > MOUNTS.lean_deg and turned.road.up == "+z" and turned.road.is_there
+            mount.lean_deg > ROAD_BELOW.lean_deg and turned.road.up == "+z" and turned.road.is_there
         ):
             return in_order([*cheap, *found]), e.T if T is turned.T or T is None else T @ mount.C
     found, T = _by_scans(e)

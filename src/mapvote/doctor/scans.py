@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.mount import mount_of_prior
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity, any_error, usable
-from mapvote.doctor.mount import check_lean, mount_of_prior
+from mapvote.doctor.lean import check_lean
 from mapvote.formats.drives.options import source_of_times
 from mapvote.formats.drives.sensor_estimate import contradiction
 

@@ -18,6 +18,8 @@ _SURE = 0.7
 """Share of points that must lie on a ring for the rings to be believed."""
 _EDGE_DEG, _MORE = 1.5, 1.3
 """A stated sensor is another one if scans show beams so far beyond its own, or so many times as many."""
+_UPRIGHT_DEG = 30.0
+"""Up to so much a sensor may lean, and its beams still have about one elevation each."""
 _SECTOR_DEG = 2.0
 _BLIND_DEG = 10.0
 
@@ -84,6 +86,23 @@ def contradiction(stated: Sensor, scan: Scan) -> str:
         f"the scans show {len(seen)} beams from {seen[-1]:.1f} to {seen[0]:.1f} deg{name}, but a {stated.name} has "
         f"{len(beams)} from {beams[-1]:.1f} to {beams[0]:.1f} deg"
     )
+
+
+def sensor_upright(sensor: Sensor, measured: bool, scan: Scan, lean_deg: float) -> Sensor:
+    """The sensor of a drive that was turned to z up, from that of the drive before. ``scan`` is of the turned drive.
+
+    Its rings may go round the vertical, whatever axes its points were recorded in (clouds in the axes of the vehicle),
+    or round its own axis. Upside down the lowest beam is the highest. Of rings that lean no beam has one elevation.
+    """
+    found = estimate_sensor([scan], sensor.rate_hz)
+    if found.sensor.rings and found.on_rings >= _SURE:
+        if measured:
+            return found.sensor
+        if not contradiction(sensor, scan):
+            return sensor
+    if lean_deg > 180.0 - _UPRIGHT_DEG:
+        return replace(sensor, elevations_deg=tuple(-e for e in reversed(sensor.elevations_deg)))
+    return sensor if lean_deg < _UPRIGHT_DEG else replace(sensor, rings=False)
 
 
 def _angles(scan: Scan) -> tuple[F64, F64, F64]:

@@ -1,42 +1,32 @@
 """How the sensor is mounted by the prior: its poses say which way is up and ahead in the axes of the points.
 
-Roofs, bellies and ceilings carry sensors upside down, on their side and turned. The checks ask for x ahead and z up.
-Of a sensor mounted otherwise they get a drive turned so: points C p and poses T C^-1 have the same points in the map.
+Roofs, bellies and ceilings carry sensors upside down, on their side and turned. Whoever asks for x ahead and z up gets
+the drive turned: points C p and poses T C^-1 have the same points in the map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
+from mapvote.core.geometry import from_xyz_rpy, poses_at
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.doctor import Finding
 
 
 @dataclass(frozen=True, slots=True)
 class MountRules:
-    """What counts as a mount, and as a road below it."""
+    """What counts as a mount."""
 
     usual_deg: float = 20.0
-    """A sensor that leans or is turned by no more is looked at in its own axes."""
-    lean_deg: float = 30.0
-    """A lean by more than this is reported where no road lies below."""
+    """A sensor that leans or is turned by no more is taken in its own axes."""
     steady: float = 0.95
     """Length of the mean of unit vectors: up, or ahead, in the axes of the sensor, scan by scan."""
+    step_deg: int = 45
+    """Mounts are told apart so finely where a drive is localised."""
     step_m: float = 1.0
     """Positions so far apart show the way ahead."""
-    near_m: float = 15.0
-    """The road is looked for in points no farther than this."""
-    own_m: float = 2.0
-    """Nearer points may be the vehicle's."""
-    depth_m: tuple[float, float] = (0.2, 12.0)
-    """Of a road below the sensor."""
-    bin_m: float = 0.2
-    """Thickness of a layer of points."""
-    share: float = 0.1
-    """Of the near points, in the layer that is the road."""
 
 
 RULES = MountRules()
@@ -60,6 +50,12 @@ class Mount:
             T_map_lidar_prior=None if T is None else T @ self.C.T,
             T_base_lidar=drive.T_base_lidar @ self.C.T,
         )
+
+    def in_steps(self) -> Mount:
+        """The mount by roll, pitch and yaw in steps of ``MountRules.step_deg`` that is nearest: a prior knows up and
+        ahead to some degrees, and matching takes care of what is left, as of any sensor's."""
+        nearest = int(np.argmax(np.einsum("nij,ij->n", _STEPS, self.C[:3, :3])))
+        return replace(self, C=poses_at([np.zeros(3)], _STEPS[nearest][None])[0])
 
 
 def _turned(scan: Scan, C: F64) -> Scan:
@@ -95,6 +91,17 @@ def mount_of_prior(T: F64, rules: MountRules = RULES) -> Mount | None:
     return Mount(C, lean_deg)
 
 
+def _rotations(step_deg: int) -> F64:
+    """(n, 3, 3) rotations by roll, pitch and yaw in steps about each axis, and their inverses."""
+    angles = np.radians(np.arange(0, 360, step_deg)).tolist()
+    poses = [from_xyz_rpy(0.0, 0.0, 0.0, *rpy) for rpy in product(angles, repeat=3)]
+    rotations = np.array(poses)[:, :3, :3]
+    return np.concatenate([rotations, rotations.swapaxes(1, 2)])
+
+
+_STEPS = _rotations(RULES.step_deg)
+
+
 def _ahead(T: F64, rules: MountRules) -> F64 | None:
     """(3,) the way driven in the axes of the sensor; None if it stands, or drives no steady way."""
     p = T[:, :3, 3]
@@ -108,22 +115,3 @@ def _ahead(T: F64, rules: MountRules) -> F64 | None:
     ways = ways[length > 1e-6] / length[length > 1e-6, None]
     mean = ways.mean(axis=0) if len(ways) else np.zeros(3)
     return mean if np.linalg.norm(mean) > rules.steady else None
-
-
-def check_lean(drive: Drive, index: int, rules: MountRules = RULES) -> Iterator[Finding]:
-    """Does a road lie below a sensor that leans by the prior? Of scan ``index``; nothing is registered."""
-    mount = None if drive.T_map_lidar_prior is None else mount_of_prior(drive.T_map_lidar_prior)
-    if mount is None or mount.lean_deg <= rules.lean_deg:
-        return
-    points = drive.read_scan(index).points @ mount.C[:3, :3].T
-    away = np.linalg.norm(points, axis=1)
-    heights = points[(away < rules.near_m) & (away > rules.own_m), 2]
-    layers = np.bincount(np.floor((heights + rules.near_m) / rules.bin_m).astype(np.int64), minlength=1)
-    densest_m = (int(np.argmax(layers)) + 0.5) * rules.bin_m - rules.near_m
-    low, high = rules.depth_m
-    what = f"the prior tilts the sensor by {mount.lean_deg:.0f} deg"
-    if low <= -densest_m <= high and layers.max() >= rules.share * max(len(heights), 1):
-        yield Finding("note", f"{what}, and by the points a road lies {-densest_m:.1f} m below it: it is mounted so")
-        return
-    mend = "is it mounted so? Else mend the prior's rotations: x is forward, z up"
-    yield Finding("warning", f"{what}, but no road lies below it then", mend)
