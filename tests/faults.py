@@ -81,7 +81,7 @@ Break = Callable[[Recording], Recording]
 
 def points(change: Change) -> Break:
     """Of a scan's x, y, z (n, 3)."""
-    return rows(lambda s: np.column_stack([change(s[:, :3].astype(np.float64)), s[:, 3]]))
+    return rows(lambda s: np.column_stack([change(s[:, :3].astype(np.float64)), s[:, 3:]]))
 
 
 def rows(change: Change) -> Break:
@@ -152,6 +152,13 @@ def turn(**deg: float) -> F64:
 
 def turned(**deg: float) -> Change:
     return lambda p: transform(turn(**deg), p)
+
+
+def mounted(r: Recording, rpy_deg: tuple[float, float, float]) -> Recording:
+    """The drive as a sensor that is turned so would have recorded it; the prior knows the mount."""
+    C = from_xyz_rpy(0, 0, 0, *np.radians(rpy_deg).tolist())
+    turned_scans = [np.column_stack([transform(C, s[:, :3]), s[:, 3:]]) for s in r.scans]
+    return replace(r, scans=turned_scans, T=r.T @ inverse(C))
 
 
 def half_turned(r: Recording, whole: bool) -> Recording:

@@ -6,12 +6,13 @@ The street: a road, two rows of walls with gaps; the car turns gently, so that a
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from faults import Recording, broken, kinds_of, serious, sound_street, verdict
+from faults import Recording, broken, kinds_of, mounted, serious, sound_street, verdict
 from mapvote.core import geometry
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
@@ -60,6 +61,42 @@ def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
     assert serious(found) == []
     assert any("mistakes of the prior show from " in f.what for f in found), found
     assert serious(diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings) == []
+
+
+MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (45, 45, 45), (0, 0, 90), (20, 100, 200)]
+"""Roll, pitch and yaw of the points, degrees."""
+
+
+@pytest.mark.parametrize("rpy_deg", MOUNTS)
+def test_a_mount_that_prior_and_points_agree_on_is_sound(
+    tmp_path: Path, sound: Recording, rpy_deg: tuple[float, float, float]
+) -> None:
+    mounted(sound, rpy_deg).write(tmp_path / "d")
+    assert serious(diagnose(tmp_path / "d").findings) == []
+    assert serious(diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings) == []
+
+
+@pytest.mark.parametrize(("rpy_deg", "name"), [((180, 0, 0), "upside down"), ((-90, 0, 0), "axis .y points up")])
+def test_a_mount_that_the_prior_does_not_know_is_an_error(
+    tmp_path: Path, sound: Recording, rpy_deg: tuple[float, float, float], name: str
+) -> None:
+    replace(mounted(sound, rpy_deg), T=sound.T).write(tmp_path / "d")
+    assert re.search(name, " ".join(serious(diagnose(tmp_path / "d").findings)))
+
+
+def test_a_prior_that_turns_a_sensor_over_which_stands_upright_is_named(tmp_path: Path, sound: Recording) -> None:
+    replace(mounted(sound, (180, 0, 0)), scans=sound.scans).write(tmp_path / "d")
+    what = " ".join(serious(diagnose(tmp_path / "d").findings))
+    assert "the prior tilts the sensor by 180 deg, but no road lies below it then" in what
+
+
+def test_what_else_is_wrong_with_a_sensor_upside_down_is_named(tmp_path: Path, sound: Recording) -> None:
+    r = mounted(sound, (180, 0, 0))
+    r.T[:, :3, 3] /= 0.3048
+    r.write(tmp_path / "d")
+    what = " ".join(serious(diagnose(tmp_path / "d").findings))
+    assert "too large" in what
+    assert "upside down" not in what
 
 
 FAST = {
