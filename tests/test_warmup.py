@@ -13,7 +13,8 @@ import pytest
 import mapvote
 from mapvote.core.ground import _grow
 from mapvote.core.voting import count_states
-from mapvote.fusion.distrust import contradicts, find_alike
+from mapvote.fusion.copies import find_alike
+from mapvote.fusion.distrust import contradicts
 from mapvote.matching.ndt import align
 from mapvote.perception.moving_objects import look
 from mapvote.warmup import warm_up

@@ -28,7 +28,8 @@ from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, remembered, temporary
-from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, originals, without
+from mapvote.fusion.copies import Copy, liars_among, originals, without
+from mapvote.fusion.distrust import contradictors, deniers
 from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled

@@ -26,8 +26,8 @@ from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
 from mapvote.fusion.change_time import emptied_and_filled
+from mapvote.fusion.copies import Copy
 from mapvote.fusion.decision_record import Record, Standing, pack_edit_votes, pack_standings, pack_tally, packed_cells
-from mapvote.fusion.distrust import Copy
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote, voter_of

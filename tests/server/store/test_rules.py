@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from histories import START_S, live, street
 from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
-from mapvote.fusion.distrust import Copy
+from mapvote.fusion.copies import Copy
 from mapvote.fusion.tile_vote import TileVote
 from mapvote_server.store import schema, votes
 from mapvote_server.store.database import remembered
