@@ -330,6 +330,9 @@ def diff(
 def merge(
     paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="maps that overlap, in any format and frame")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
+    apart: Annotated[
+        float, typer.Option(min=0.0, metavar="M", help="accept maps that stay so many metres apart (median)")
+    ] = 0.1,
 ) -> None:
     """Merge overlapping maps into one, in the frame of the first: registered, adjusted together, one point per voxel.
 
@@ -343,7 +346,7 @@ def merge(
     with waiting("reading"):
         maps = [read_map(path) for path in paths]
     with waiting("registering and merging"):
-        merged = merge_maps(maps)
+        merged = merge_maps(maps, most_apart_m=apart)
     for (i, j), far in merged.apart_m.items():
         print(f"{paths[i]} and {paths[j]}: {far:.3f} m apart after adjustment (median)")
     with waiting(f"writing {out}"):

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.compare.register import Patches, Registered, register_maps, with_free_space_of
-from mapvote.core.geometry import inverse, poses_at, transform
+from mapvote.compare.free_space import with_free_space_of
+from mapvote.compare.register import Registered, register_maps
+from mapvote.core.geometry import inverse, inverses, poses_at, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
@@ -27,7 +28,7 @@ from mapvote.survey.driven_road import road_under
 from mapvote.survey.pose_graph import Anchors, Links, optimise
 
 MOST_APART_M = 0.1
-"""By the median over the patches of a pair, after the adjustment."""
+"""How far the patches of a pair may be apart (median), after the adjustment, unless another bound is given."""
 _HELD = 1e-4
 _SAME_FRAME_M, _SAME_FRAME_RAD = 0.5, np.radians(0.5)
 _MOST_MAPS = 64
@@ -45,14 +46,15 @@ class Merged:
     """Median distance of the patches of each pair that overlaps, after the adjustment."""
 
 
-def merge_maps(maps: Sequence[PointMap]) -> Merged:
+def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MOST_APART_M) -> Merged:
     """One map on the lattice and in the frame of the first, or in the mean of their frames if all state one.
 
     The ground is computed anew, from the driven paths where the maps carry them; the paths stay. A voxel is free if its
     middle lies in one that a map knows to be free, and no map has a point in it. Each point's field SOURCES has bit k
     set where map k has a point in its voxel.
 
-    MapvoteError, with figures, if a map overlaps no other one, is bent, or contradicts another by more than 0.1 m.
+    MapvoteError, with figures, if a map overlaps no other one, is bent, or lies more than ``most_apart_m`` off another
+    (median of the patches).
     """
     if not 2 <= len(maps) <= _MOST_MAPS:
         raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
@@ -63,20 +65,47 @@ def merge_maps(maps: Sequence[PointMap]) -> Merged:
             pairs[i, j] = register_maps(maps[i], maps[j])
         except MapvoteError as error:
             why[i, j] = str(error)
-    T = _adjusted(maps, pairs, why, np.median(clouds[0], axis=0))
-    apart_m = {(i, j): _apart_m(found.patches, inverse(T[i]) @ T[j]) for (i, j), found in pairs.items()}
-    _refuse_contradictions(pairs, apart_m)
+    T = _adjusted(maps, pairs, why, np.array([np.median(cloud, axis=0) for cloud in clouds]))
+    apart_m = {(i, j): float(np.median(one.patches.apart_m(inverse(T[i]) @ T[j]))) for (i, j), one in pairs.items()}
+    _refuse_contradictions(pairs, apart_m, most_apart_m)
     return Merged(_laid(maps, clouds, T), T, apart_m)
 
 
 def _adjusted(
-    maps: Sequence[PointMap], pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str], middle: F64
+    maps: Sequence[PointMap], pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str], middles: F64
 ) -> F64:
     """(n, 4, 4) where the maps lie in the first one's frame: along the pairs, then all links together.
 
-    Surveys of one lattice that lie within _SAME_FRAME_M of where they say, at ``middle`` (3,), state one frame, each
-    with the error of its own prior: then no map is right alone, and the adjusted frame is the mean of theirs."""
-    n = len(maps)
+    Surveys of one lattice that lie within _SAME_FRAME_M of where they say, at their ``middles`` (n, 3), state one
+    frame, each with the error of its own prior: then no map is right alone, and the adjusted frame is the mean of
+    theirs."""
+    T = _along_the_pairs(len(maps), pairs, why)
+    # The graph holds each map's middle in a frame about the first one's middle: in the coordinates of a country the
+    # error of a turn would be multiplied by the distance from their origin.
+    about = poses_at(middles)
+    nodes = inverse(about[0]) @ T @ about
+    links = [
+        Links(
+            np.array([i]),
+            np.array([j]),
+            (inverse(about[i]) @ one.T_a_b @ about[j])[None],
+            one.fit.sigma_m,
+            float(np.radians(one.fit.sigma_deg)),
+        )
+        for (i, j), one in pairs.items()
+    ]
+    moved_m = [np.linalg.norm(transform(T[k], middles[k][None])[0] - middles[k]) for k in range(len(maps))]
+    if any(one.lattice != maps[0].lattice or one.georeference != maps[0].georeference for one in maps) or any(
+        far_m > _SAME_FRAME_M for far_m in moved_m
+    ):
+        anchors = Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)
+    else:
+        anchors = Anchors(np.arange(len(T)), inverse(about[0]) @ about, _SAME_FRAME_M, _SAME_FRAME_RAD)
+    return np.asarray(about[0] @ optimise(nodes, links, [anchors], iterations=10) @ inverses(about))
+
+
+def _along_the_pairs(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str]) -> F64:
+    """(n, 4, 4) where the maps lie in the first one's frame, each by one pair. MapvoteError where no pair leads."""
     T = np.tile(np.eye(4), (n, 1, 1))
     placed = {0}
     while len(placed) < n:
@@ -91,32 +120,28 @@ def _adjusted(
         else:
             T[i] = T[j] @ inverse(pairs[step].T_a_b)
         placed |= {i, j}
-    links = [
-        Links(np.array([i]), np.array([j]), one.T_a_b[None], one.fit.sigma_m, float(np.radians(one.fit.sigma_deg)))
-        for (i, j), one in pairs.items()
-    ]
-    if any(one.lattice != maps[0].lattice or one.georeference != maps[0].georeference for one in maps) or any(
-        np.linalg.norm(T_first[:3, :3] @ middle + T_first[:3, 3] - middle) > _SAME_FRAME_M for T_first in T
-    ):
-        return optimise(T, links, [Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)], iterations=10)
-    where_they_say = Anchors(np.arange(len(T)), np.tile(np.eye(4), (len(T), 1, 1)), _SAME_FRAME_M, _SAME_FRAME_RAD)
-    return optimise(T, links, [where_they_say], iterations=10)
+    return T
 
 
-def _apart_m(patches: Patches, T_a_b: F64) -> float:
-    return float(np.median(np.linalg.norm(patches.residuals(T_a_b)[patches.compared, :3], axis=1)))
-
-
-def _refuse_contradictions(pairs: dict[tuple[int, int], Registered], apart_m: dict[tuple[int, int], float]) -> None:
-    complaints = [f"maps {i + 1} and {j + 1}: {part.told()}" for (i, j), one in pairs.items() for part in one.bent]
-    complaints += [
+def _refuse_contradictions(
+    pairs: dict[tuple[int, int], Registered], apart_m: dict[tuple[int, int], float], most_apart_m: float
+) -> None:
+    bent = [f"maps {i + 1} and {j + 1}: {part.told()}" for (i, j), one in pairs.items() for part in one.bent]
+    if bent:
+        raise MapvoteError(
+            f"the maps contradict each other: {'; '.join(bent)}. Build one map of all drives "
+            "(mapvote build DRIVE DRIVE)"
+        )
+    apart = [
         f"maps {i + 1} and {j + 1} are {far:.2f} m apart (median of {int(pairs[i, j].patches.compared.sum())} patches)"
         for (i, j), far in apart_m.items()
-        if far > MOST_APART_M
+        if far > most_apart_m
     ]
-    if complaints:
+    if apart:
         raise MapvoteError(
-            f"the maps contradict each other by more than {MOST_APART_M:g} m after adjustment: {'; '.join(complaints)}"
+            f"the maps contradict each other by more than {most_apart_m:g} m after adjustment: {'; '.join(apart)}. "
+            "Build one map of all drives (mapvote build DRIVE DRIVE), or accept the difference by --apart M: walls "
+            "then become as thick as the maps lie apart"
         )
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from mapvote.core.columns import TOP_BIT
+from mapvote.compare.free_space import with_free_space_of
+from mapvote.compare.point_to_plane import PLANE_MATCH, Surface, refine_on_planes
 from mapvote.core.geometry import exp, exps, hat, inverse, logs, rotation_angle, transform
-from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.core.voxels import voxel_downsample
-from mapvote.matching.coarse_search import LEAST_LEAD, place_without_prior
+from mapvote.matching.coarse_search import LEAST_LEAD, place_without_prior, stands
 from mapvote.matching.ndt import fitness, refine
 from mapvote.matching.ndt_map import NdtMap
 from mapvote.matching.prepare import thin_for_levels
@@ -25,6 +25,8 @@ STEP_M, SIDE_M = 15.0, 30.0
 """Patches begin every STEP_M and are SIDE_M wide: neighbours share three quarters of their points."""
 _LEAST_POINTS = 150
 """Voxels of .7 m that a patch must fill."""
+_SURFACE_M, _THIN_M = 0.1, 0.3
+"""Sides of the voxels that hold one point of a cloud: for the distances to surfaces, and for NDT."""
 _AROUND_M = 10.0
 """Margin of the other cloud around the patch."""
 _MIN_INLIERS = 0.5
@@ -39,7 +41,6 @@ distance from the survey's path, may be bent."""
 _GAIN = 0.1
 """It is bent if its own place fits better than the motion of the whole by such a share: along a wall without ends every
 place fits alike."""
-_STANDS_M = 0.5
 _LEAST_BENT = 3
 """Patches side by side that are off: fewer are the sparse fringe of a survey, where NDT finds what it likes."""
 _ROUNDS = 20
@@ -76,12 +77,24 @@ class Patches:
         """By which share of its likelihood what stands in patch k fits better at its own place than under one motion:
         its ground fits everywhere."""
         near, mine = self.points[k]
-        ndt_map, clouds = _ndt(near, self.T_a_patch[k, :3, 3]), thin_for_levels(mine[_stands(mine)])
+        ndt_map, clouds = _ndt(near, self.T_a_patch[k, :3, 3]), thin_for_levels(mine[stands(mine)])
         other = T_a_b.copy()
         other[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
         finest = len(ndt_map.levels) - 1
         own = fitness(ndt_map, clouds, self.T_a_patch[k], finest)
         return 1.0 - fitness(ndt_map, clouds, other, finest) / max(own, 1e-9)
+
+    def apart_m(self, T_a_b: F64) -> F64:
+        """(m,) how far each compared patch moves from one motion to where it lies on the surfaces of a, metres."""
+        out = []
+        for k in np.flatnonzero(self.compared):
+            near, mine = self.points[k]
+            start = T_a_b.copy()
+            start[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
+            information = np.asarray(np.linalg.inv(self.covariance[k]), dtype=np.float64)
+            refined = refine_on_planes(Surface.of(near), mine, Surface.of(mine).normals(mine), start, information)
+            out.append(np.linalg.norm(refined[:3, 3] - start[:3, 3]))
+        return np.array(out)
 
     @property
     def bound_m(self) -> F64:
@@ -98,13 +111,14 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F
     """Every patch of b that overlaps a, registered from T_a_b. MapvoteError if none overlaps.
 
     ``paths``: (n, 3) each, from where a or b was measured, in a's frame by T_a_b."""
-    thin_a, thin_b = points_a[voxel_downsample(points_a, 0.3)], points_b[voxel_downsample(points_b, 0.3)]
+    thin_a, thin_b = _thinned(points_a, _THIN_M), _thinned(points_b, _THIN_M)
     tree_a, tree_b = KDTree(thin_a[:, :2]), KDTree(thin_b[:, :2])
     path_trees = [KDTree(path) for path in paths]
     centres, poses, covariances, inliers, compared, levers_m, kept = [], [], [], [], [], [], []
     T = T_a_b
     corners = np.unique(np.floor(thin_b[:, :2] / STEP_M).astype(np.int64), axis=0)
     for corner in corners:
+        # The points of b in the patch, and those of a around it.
         middle = STEP_M * (corner + 0.5)
         mine = thin_b[tree_b.query_ball_point(middle, SIDE_M / 2, p=np.inf)]
         if len(mine) < _LEAST_POINTS:
@@ -115,6 +129,7 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F
         clouds = thin_for_levels(mine - centre)
         if clouds[-1].shape[1] < _LEAST_POINTS or len(near) < _LEAST_POINTS:
             continue
+        # Where the patch fits best by itself.
         guess = np.eye(4)
         guess[:3, :3], guess[:3, 3] = T[:3, :3], at
         found = refine(_ndt(near, at), clouds, guess)
@@ -139,12 +154,11 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F
     )
 
 
-def _stands(points: F64) -> Bool:
-    """(n,) points that lie higher than _STANDS_M above the lowest one of their square metre."""
-    _, cell = np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0, return_inverse=True)
-    lowest = np.full(len(points), np.inf)
-    np.minimum.at(lowest, cell.reshape(-1), points[:, 2])
-    return np.asarray(points[:, 2] > lowest[cell.reshape(-1)] + _STANDS_M)
+def _thinned(points: F64, size_m: float) -> F64:
+    """One of the points (n, 3) per voxel of side ``size_m``, counted from a voxel at their own corner: the coordinates
+    of a country reach beyond what a key of a voxel holds."""
+    x0, y0 = size_m * np.floor(points[:, :2].min(axis=0) / size_m)
+    return points[voxel_downsample(points, size_m, x0, y0)]
 
 
 def _ndt(points: F64, centre: F64) -> NdtMap:
@@ -158,8 +172,10 @@ class RigidFit:
     """One motion for all patches."""
 
     T_a_b: F64
+    middle: F64
+    """(3,) middle of the patches that agree, in a's frame."""
     covariance: F64
-    """(6, 6) of (rho, phi) about the middle of the patches that agree, in a's axes."""
+    """(6, 6) of (rho, phi) about ``middle``, in a's axes."""
     shift_m: F64
     """(k,) length of each patch's residual shift."""
     agree: Bool
@@ -208,7 +224,7 @@ def fit_rigid(patches: Patches, T_a_b: F64) -> RigidFit:
     bent = np.zeros_like(off)
     for mine in _side_by_side(patches.T_a_patch[:, :2, 3], off):
         bent |= mine & (mine.sum() >= _LEAST_BENT)
-    return RigidFit(T, covariance, np.linalg.norm(r[:, :3], axis=1), patches.compared & ~off, bent)
+    return RigidFit(T, middle, covariance, np.linalg.norm(r[:, :3], axis=1), patches.compared & ~off, bent)
 
 
 def bent_under(patches: Patches, T_a_b: F64) -> Bool:
@@ -330,13 +346,14 @@ class Registered:
 
     def told(self) -> list[str]:
         """The registration in sentences."""
-        T = self.T_a_b
+        T, middle = self.T_a_b, self.fit.middle
         yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
-        x, y, z = T[:3, 3]
+        dx, dy, dz = np.round(middle - transform(inverse(T), middle[None])[0], 3) + 0.0
         agree = int(self.fit.agree.sum())
         lines = [
-            f"B lies in A at x {x:.3f}, y {y:.3f}, z {z:.3f} m, turned by {yaw:.3f} deg, tilted by {tilt:.3f} deg "
+            f"in the middle of the overlap (A's x {middle[0]:.1f}, y {middle[1]:.1f}, z {middle[2]:.1f}) B is moved by "
+            f"x {dx:.3f}, y {dy:.3f}, z {dz:.3f} m, turned by {round(yaw, 3) + 0.0:.3f} deg, tilted by {tilt:.3f} deg "
             f"(+-{self.fit.sigma_m:.3f} m, {self.fit.sigma_deg:.3f} deg)",
             f"{agree} of {int(self.patches.compared.sum())} patches of {SIDE_M:.0f} m agree on it; the best place "
             f"elsewhere scores {self.lead:.0%} less",
@@ -397,12 +414,36 @@ def register_maps(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> 
         raise MapvoteError(
             f"only {agree} of {int(patches.compared.sum())} pieces agree on one motion: not one place, or badly bent"
         )
+    fit = replace(fit, T_a_b=_on_surfaces(points_a, points_b, patches, fit))
     moved, why = None, ""
     if unbend and fit.bent.any():
         moved, why = _unbend(points_a, points_b, patches, fit, paths)
     rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
     points = rigid if moved is None else moved
     return Registered(fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, why)
+
+
+def _on_surfaces(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) -> F64:
+    """(4, 4) the motion of ``fit``, moved to where b lies on the surfaces of a, by the points in patches that agree."""
+    T = np.eye(4)
+    T[:3, :3] = fit.T_a_b[:3, :3]
+    T[:3, 3] = fit.middle
+    middle_b = transform(inverse(fit.T_a_b), fit.middle[None])[0]
+    # Only points of b that a rigid motion lays on a, and the points of a around them.
+    agree = KDTree(patches.T_a_patch[fit.agree, :2, 3])
+    surfaces = []
+    for points, T_a_points in ((points_a, np.eye(4)), (points_b, fit.T_a_b)):
+        thin = _thinned(points, _SURFACE_M)
+        apart = agree.query(transform(T_a_points, thin)[:, :2], p=np.inf, distance_upper_bound=SIDE_M / 2)[0]
+        surfaces.append(Surface.of(thin[np.isfinite(apart)]))
+    surface_a, surface_b = surfaces
+    matched = _thinned(surface_b.points, _THIN_M)
+    matched = matched[np.random.default_rng(0).permutation(len(matched))[: PLANE_MATCH.most_points]]
+    information = np.asarray(np.linalg.inv(fit.covariance), dtype=np.float64)
+    T = refine_on_planes(surface_a, matched - middle_b, surface_b.normals(matched), T, information)
+    T_a_b = T.copy()
+    T_a_b[:3, 3] -= T[:3, :3] @ middle_b
+    return T_a_b
 
 
 def _bent_parts(patches: Patches, fit: RigidFit) -> tuple[BentPart, ...]:
@@ -447,38 +488,3 @@ def _is_in_place(T: F64, points: F64) -> bool:
     return bool(
         np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle) < _SAME_M and np.degrees(rotation_angle(T)) < _SAME_DEG
     )
-
-
-def with_free_space_of(point_map: PointMap, maps: Sequence[PointMap], T: F64) -> PointMap:
-    """The map with the free space that ``maps`` know, which lie in its frame at T (k, 4, 4).
-
-    Each voxel asks the maps for its own middle: the other way round, the voxels of a turned map leave gaps. No voxel
-    that holds a point of the map becomes free."""
-    out = {}
-    from_map = [(one, inverse(T_map)) for one, T_map in zip(maps, T, strict=True)]
-    for index, tile in point_map.tiles.items():
-        rows, cols = np.nonzero(np.isfinite(tile.ground_z))
-        words = np.zeros(len(rows), dtype=np.uint64)
-        x, y = tile.window.centres()
-        middles = np.column_stack([x[cols], y[rows], np.zeros(len(rows))])
-        for one, T_one_map in from_map:
-            for bit in range(TOP_BIT):
-                middles[:, 2] = (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE
-                is_free = _is_free(one, transform(T_one_map, middles))
-                words |= is_free.astype(np.uint64) << np.uint64(bit)
-        free = np.zeros(tile.window.shape, dtype=np.uint64)
-        free[rows, cols] = words
-        free &= ~tile.obstacle_words
-        out[index] = replace(tile, free=free) if free.any() else tile
-    return replace(point_map, tiles=out)
-
-
-def _is_free(one: PointMap, places: F64) -> Bool:
-    """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
-    out = np.zeros(len(places), dtype=np.bool_)
-    for part, mine, cell in one.by_tile(places):
-        if part.free is not None:
-            bit = np.floor(places[mine, 2] / CELL_SIZE).astype(np.int64) - part.base[cell]
-            words = part.free[cell] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
-            out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
-    return out

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.columns import flat_cells
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.ground import lay_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 
 _EXTENT_M = 1e7
+NEAR_ORIGIN_M = 50_000.0
+"""Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
 _CHUNK = 1_000_000
 """Points of one block: a large cloud is never copied as a whole."""
 KEPT_POINTS = 10_000_000
@@ -216,6 +218,18 @@ def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileInde
     return {tile: lattice.tile(tile).from_map(points_map[mine]) for tile, mine in cut_tiles(points_map, lattice)}
 
 
+def lattice_of(points: NDArray[np.floating]) -> Lattice:
+    """The lattice at (0, 0), or for points (n, 2+) far from it one that starts at a multiple of a tile's side below
+    them: the keys of voxels reach 314 km."""
+    low = points[:, :2].min(axis=0).astype(np.float64)
+    high = points[:, :2].max(axis=0).astype(np.float64)
+    if max(np.abs(low).max(), np.abs(high).max()) < NEAR_ORIGIN_M:
+        return Lattice()
+    side = TILE_CELLS * CELL_SIZE
+    x0, y0 = np.floor(low / side) * side
+    return Lattice(round(float(x0), 1), round(float(y0), 1))
+
+
 def map_from_points(
     points_map: NDArray[np.floating],
     *,
@@ -227,14 +241,15 @@ def map_from_points(
 ) -> PointMap:
     """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground computed.
 
-    ``road`` (m, 3), map metres: places known to be ground, from which it grows; without, it must be found.
-    ``fields``: columns (n,) that stay with the points. ``map_id`` defaults to a hash of the points and the lattice.
+    ``lattice``: default :func:`lattice_of` the points. ``road`` (m, 3), map metres: places known to be ground, from
+    which it grows; without, it must be found. ``fields``: columns (n,) that stay with the points. ``map_id`` defaults
+    to a hash of the points and the lattice.
     Raises MapvoteError if there are no points, or if some are not finite or lie beyond 10,000 km.
     """
-    lattice = lattice or Lattice()
     points = np.asarray(points_map)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise MapvoteError(f"a map needs points: got an array of shape {points.shape}, expected (n, 3) with n > 0")
+    lattice = lattice or lattice_of(points)
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
     for start in range(0, len(points), _CHUNK):
         piece = np.ascontiguousarray(points[start : start + _CHUNK], dtype=np.float64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F32, F64, I32, I64, Bool, read_only
+from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, read_only
 
 _MIDDLE = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
@@ -199,15 +199,31 @@ class VoxelCloud:
 
 
 @kernel
-def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> None:
+def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> int:
+    """Fill ``keys`` (n,). Returns the index of the first of the points (n, 3) that lies beyond all keys, or -1."""
+    reach = float(_MIDDLE) * size
+    beyond = -1
     for i in range(len(points)):
-        keys[i] = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], size)
+        x, y, z = points[i, 0] - x0, points[i, 1] - y0, points[i, 2]
+        if not (abs(x) < reach and abs(y) < reach and abs(z) < reach) and beyond < 0:
+            beyond = i
+        keys[i] = voxel_key(x, y, z, size)
+    return beyond
 
 
 def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float = CELL_SIZE) -> I64:
-    """(n,) int64 key of each point's voxel on the lattice, see :func:`packed_key`. Voxel layers start at z = 0."""
+    """(n,) int64 key of each point's voxel on the lattice, see :func:`packed_key`. Voxel layers start at z = 0.
+
+    MapvoteError for a point beyond 2^20 voxels of (x0, y0, 0): two voxels would share one key.
+    """
     keys = np.empty(len(points), dtype=np.int64)
-    _enter_keys(np.array(points, dtype=np.float64, order="C"), x0, y0, size, keys)
+    beyond = _enter_keys(np.array(points, dtype=np.float64, order="C"), x0, y0, size, keys)
+    if beyond >= 0:
+        x, y, z = points[beyond]
+        raise MapvoteError(
+            f"a point at ({x:.1f}, {y:.1f}, {z:.1f}) is farther than {1e-3 * _MIDDLE * size:.0f} km from the corner of "
+            f"the map's lattice ({x0:.1f}, {y0:.1f}): leave the point out, or begin the lattice near the points"
+        )
     return keys
 
 

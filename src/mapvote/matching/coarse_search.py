@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
+from scipy.spatial import KDTree
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
-from mapvote.core.types import F32, F64, I64, MapvoteError
+from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample, voxel_keys
 from mapvote.matching.ndt import fitness, refine
 from mapvote.matching.ndt_map import NdtMap, build_ndt
@@ -35,6 +36,9 @@ _HEIGHTS = (0.0, -1.5, 1.5)
 """Besides the likeliest difference in height these are tried: walls alone give it to a metre or two."""
 LEAST_LEAD = 0.1
 """A place whose score is not ahead of every other by such a share of it is ambiguous."""
+_NEAR_M = 0.5
+"""Standing points of two clouds that lie so near may be of one surface."""
+_STANDS_M = 0.5
 _SAME_M = 1.5
 _WINDOW_M = 90.0
 """How far from the middle of what overlaps points are compared, metres."""
@@ -56,8 +60,9 @@ def place_without_prior(points_a: F64, points_b: F64) -> Placed:
 
     MapvoteError if one of them shows nothing that stands.
     """
-    middle_b = np.append(np.median(points_b[:, :2], axis=0), 0.0)
-    local = points_b - middle_b
+    # Each about its own middle: the coordinates of a country reach beyond what a key of a voxel holds.
+    middle_a, middle_b = (np.floor(np.median(points, axis=0)) for points in (points_a, points_b))
+    points_a, local = points_a - middle_a, points_b - middle_b
     (cells_a, weight_a), (cells_b, weight_b) = _weights(points_a), _weights(local)
     if not len(cells_a) or not len(cells_b):
         raise MapvoteError("nothing stands in one of the clouds: two planes of ground cannot be registered")
@@ -69,8 +74,10 @@ def place_without_prior(points_a: F64, points_b: F64) -> Placed:
         for x, y, yaw in _correlate(cells_a, weight_a, tall)
         for dz in _HEIGHTS
     ]
-    score, T, rival = _best_of(_Windows(points_a, local[voxel_downsample(local, 0.5)]), guesses)
-    return Placed(T @ from_xyz_rpy(*(-middle_b)), score, 1.0 - rival / score if score > 0 else 0.0)
+    windows = _Windows(points_a, local[voxel_downsample(local, 0.5)])
+    share, T, rival = best_and_rival(_refined(windows, guesses, _Standing.of(points_a, local)), _SPREAD_RAD)
+    T_a_b = from_xyz_rpy(*middle_a) @ T @ from_xyz_rpy(*(-middle_b))
+    return Placed(T_a_b, windows.score(T, -1), 1.0 - rival / share if share > 0 else 0.0)
 
 
 def _weights(points: F64) -> tuple[I64, F64]:
@@ -154,16 +161,47 @@ def _heights(cloud: F64) -> Callable[[F64], float]:
     return height_over
 
 
-def _best_of(windows: _Windows, guesses: list[F64]) -> tuple[float, F64, float]:
-    """The best of the guesses once refined, see :func:`best_and_rival`. All points move the cloud; what stands ranks
+def _refined(windows: _Windows, guesses: list[F64], standing: _Standing) -> list[tuple[float, F64]]:
+    """(how near they lie, pose) of the likeliest guesses, refined by NDT. All points move the cloud; what stands ranks
     the places, for the ground of one place is like that of any other."""
     ranked = sorted(((windows.score(T, 0), T) for T in guesses), key=lambda one: -one[0])
-    refined: list[tuple[float, F64]] = []
+    out: list[tuple[float, F64]] = []
     for T in distinct((T for _, T in ranked), _SPREAD_RAD, 1.0)[:_REFINED]:
         ndt_map, clouds = windows.around(T)
         found = refine(ndt_map, clouds, T).T_map_lidar
-        refined.append((windows.score(found, -1), found))
-    return best_and_rival(refined, _SPREAD_RAD)
+        out.append((standing.nearness(found), found))
+    return out
+
+
+def stands(points: F64) -> Bool:
+    """(n,) which points (n, 3) lie higher than _STANDS_M above the lowest one of their square metre."""
+    _, cell = np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0, return_inverse=True)
+    lowest = np.full(len(points), np.inf)
+    np.minimum.at(lowest, cell.reshape(-1), points[:, 2])
+    return np.asarray(points[:, 2] > lowest[cell.reshape(-1)] + _STANDS_M)
+
+
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """What stands in two clouds. Distances between its points tell a place from one like it better than distributions
+    of a metre do, which also know the ground at the feet of walls."""
+
+    a: KDTree
+    b: F64
+    """(m, 3)."""
+
+    @classmethod
+    def of(cls, points_a: F64, points_b: F64) -> _Standing:
+        a, b = (points[voxel_downsample(points, _NEAR_M)] for points in (points_a, points_b))
+        b = b[stands(b)]
+        return cls(KDTree(a[stands(a)]), b[np.random.default_rng(0).permutation(len(b))[: 5 * _SAMPLE]])
+
+    def nearness(self, T_a_b: F64) -> float:
+        """Mean over b's points of 1 - (distance / _NEAR_M)^2 to the nearest one of a, 0 beyond _NEAR_M."""
+        if not len(self.b) or not self.a.n:
+            return 0.0
+        distance = self.a.query(transform(T_a_b, self.b), distance_upper_bound=_NEAR_M)[0]
+        return float(np.where(np.isfinite(distance), 1.0 - (distance / _NEAR_M) ** 2, 0.0).mean())
 
 
 class _Windows:

@@ -23,7 +23,7 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
-from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.point_map import PointMap, lattice_of, map_from_points
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
@@ -92,7 +92,7 @@ def build_map(
         drive if w is None else replace(drive, prior_sigma_deg=w.sigma_deg)
         for drive, w in zip(drives, wrong, strict=True)
     ]
-    surveyor = Surveyor(settings, all(drive.has_precise_prior for drive in drives))
+    surveyor = Surveyor(settings, _lattice_of(drives), all(drive.has_precise_prior for drive in drives))
     _go_through(chain.from_iterable(map(surveyor.follow, drives)), progress, 0, 2 * scans)
     tracks, bent_m = settle_poses(surveyor.tracks)
     cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
@@ -148,17 +148,29 @@ def _agreed_heights(track: DriveTrack, point_map: PointMap) -> Heights:
     return heights
 
 
+def _lattice_of(drives: Sequence[Drive]) -> Lattice:
+    """Begins near the first prior, in whose frame the map is built; at (0, 0) where no drive has one."""
+    for drive in drives:
+        if drive.T_map_lidar_prior is not None:
+            positions = drive.T_map_lidar_prior[:, :2, 3]
+            positions = positions[np.isfinite(positions).all(axis=1)]
+            if len(positions):
+                return lattice_of(positions)
+    return Lattice()
+
+
 class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
-    def __init__(self, settings: Settings, all_precise: bool = False) -> None:
-        """``all_precise``: only drives with a surveyor's prior will come; they get no final check."""
+    def __init__(self, settings: Settings, lattice: Lattice, all_precise: bool = False) -> None:
+        """``lattice``: of the map. ``all_precise``: only drives with a surveyor's prior will come; they get no final
+        check."""
         self._all_precise = all_precise
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
         self.ndt_map = NdtMap(np.zeros(3))
         self.fine_map: NdtMap | None = None
         """The same points in narrower distributions, of one level."""
-        self.draft = VoxelCloud(Lattice())
+        self.draft = VoxelCloud(lattice)
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
         self.tracks: list[DriveTrack] = []
         """Of the drives followed so far, in the frame of the draft."""

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from hand_made import save_pcd
-from mapvote.core.point_map import all_fields, all_points, map_from_points
+from mapvote.core.point_map import all_fields, all_points, lattice_of, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_map, stream_cloud, write_map, write_pcd
 from mapvote.formats.maps.autoware import lay_version, stream_autoware, write_autoware
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, lattice_of
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.pcd import read_pcd_table
 from mapvote.formats.maps.ply import write_ply

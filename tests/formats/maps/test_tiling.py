@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hand_made import Say, make_ballot, save_pcd, states_plane, wall
 from mapvote.codec.planes import pack_plane
 from mapvote.config import FuseSettings
-from mapvote.core.point_map import LazyTiles, PointMap, map_from_points
+from mapvote.core.point_map import LazyTiles, PointMap, lattice_of, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, import_cloud, read_map, write_map
 from mapvote.formats.maps import pcd, ply, tiling
-from mapvote.formats.maps.cloud import Cloud, lattice_of
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.mapvote_folder import read_manifest
 from mapvote.formats.maps.pcd import write_pcd

@@ -11,15 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import Brightness
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.field_names import COLOURS, KEPT, known_fields, other_fields
 
 log = logging.getLogger("mapvote.formats")
-
-NEAR_ORIGIN_M = 50_000.0
-"""Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
 
 GROUND, UNCLASSIFIED = 2, 1
 """ASPRS classes."""
@@ -162,17 +158,6 @@ def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     for column, axis in enumerate("xyz"):
         out[:, column] = table[found[axis]]
     return out
-
-
-def lattice_of(points: NDArray[np.floating]) -> Lattice:
-    """The lattice at (0, 0), or for points far from it one that starts at a multiple of a tile's side below them."""
-    low = points[:, :2].min(axis=0).astype(np.float64)
-    high = points[:, :2].max(axis=0).astype(np.float64)
-    if max(np.abs(low).max(), np.abs(high).max()) < NEAR_ORIGIN_M:
-        return Lattice()
-    side = TILE_CELLS * CELL_SIZE
-    x0, y0 = np.floor(low / side) * side
-    return Lattice(round(float(x0), 1), round(float(y0), 1))
 
 
 def warn_of_float32(where: str, cloud: CloudPieces) -> None:

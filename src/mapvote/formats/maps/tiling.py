@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
-from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, in_memory_if_small
+from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, in_memory_if_small, lattice_of
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
-from mapvote.formats.maps.cloud import GROUND, Cloud, joined, lattice_of
+from mapvote.formats.maps.cloud import GROUND, Cloud, joined
 from mapvote.formats.maps.field_names import KEPT
 
 _IN_MEMORY = 64 << 20
