@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from mapvote.core.types import F64
@@ -30,6 +30,12 @@ class Recorder:
         self.bag.open()
         self.topics: dict[str, Any] = {}
 
+    def register(self, definitions: dict[str, str]) -> None:
+        """Types that ROS does not bring, by their definitions."""
+        for name, text in definitions.items():
+            self.store.register(get_types_from_msg(text, name))
+        self.types = dict(self.store.types)
+
     def header(self, ns: int, frame: str) -> Any:
         return self.types["std_msgs/msg/Header"](
             self.types["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9), frame
@@ -49,7 +55,7 @@ class Recorder:
 
     def cloud_of(self, table: NDArray[np.void], ns: int, frame: str = "lidar", cut: int = 0) -> Any:
         """The message of a structured array; the last ``cut`` bytes of its data are missing."""
-        types = {"<f4": 7, "<u4": 6}
+        types = {"|i1": 1, "|u1": 2, "<i2": 3, "<u2": 4, "<i4": 5, "<u4": 6, "<f4": 7, "<f8": 8}
         fields = [
             self.types["sensor_msgs/msg/PointField"](name, offset, types[kind.str], 1)
             for name, (kind, offset, *_) in (table.dtype.fields or {}).items()

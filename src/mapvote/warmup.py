@@ -27,7 +27,7 @@ from mapvote.core.types import F32, F64, Drive, Scan, read_only
 from mapvote.core.voxels import VoxelCloud
 from mapvote.doctor.maps import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
-from mapvote.formats.drives.point_fields import BadPoints, scan_from_fields, spinning_time_s
+from mapvote.formats.drives.point_fields import PointReader, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
 from mapvote.matching.localiser import GivenPoses
@@ -159,8 +159,8 @@ def _drive(street_map: F64, turning: bool) -> Drive:
     def read_scan(i: int) -> Scan:
         points = transform(inverse(poses[i]), street_map).astype(np.float32)
         points = points[np.hypot(points[:, 0], points[:, 1]) > 1.5]
-        table, bad_points = _table(points, _COLUMNS[i % 2]), BadPoints("warmup")
-        scan = scan_from_fields("warmup", i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
+        table = _table(points, _COLUMNS[i % 2])
+        scan = PointReader("warmup").scan("warmup", i, int(stamps_ns[i]), table, sensor)
         return replace(scan, time_s=np.zeros(len(scan.points), dtype=np.float32)) if turning else scan
 
     return Drive(Path("warmup"), "warmup", "warmup", sensor, stamps_ns, read_scan, poses, 0.02, 0.1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.door import client_of, is_url, key_in, map_at
-from mapvote.cli.options import Config, KeyFile, Projector
+from mapvote.cli.options import Config, KeyFile, MotionCompensated, Projector, TimeField
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive
@@ -93,6 +93,8 @@ def drive(
             help="pose of the LiDAR in the odometry's body: x,y,z,roll,pitch,yaw; default: /tf_static",
         ),
     ] = None,
+    motion_compensated: MotionCompensated = None,
+    time_field: TimeField = None,
     send: Annotated[str | None, typer.Option(metavar="URL", help="send the ballots to this server")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="write the ballots into this folder")] = None,
     key_file: KeyFile = None,
@@ -137,6 +139,7 @@ def drive(
     from mapvote.config import load_settings
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
+    from mapvote.formats.drives.point_times import TimeRules
     from mapvote.live.choice import Voice, Wish, choose_topics
     from mapvote.live.dds import Network
     from mapvote.live.messages import POSE_TOPIC
@@ -181,7 +184,8 @@ def drive(
             return
         listened = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
         print(f"listening to {' and '.join(listened)}", flush=True)
-        topics = Subscriptions(network, chosen, model, names, sim_time=sim_time)
+        rules = TimeRules(motion_compensated, time_field)
+        topics = Subscriptions(network, chosen, model, names, sim_time=sim_time, rules=rules)
         ros = RosStatus(network, vehicle, names.resolve(POSE_TOPIC))
         board = StatusBoard(maps, outbox)
         board.tell(1.0, ros.diagnose)

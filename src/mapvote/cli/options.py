@@ -42,6 +42,17 @@ Topic = Annotated[
     str | None,
     typer.Option(metavar="TOPIC", help="PointCloud2 topic of a bag, several separated by commas; or scene of nuScenes"),
 ]
+MotionCompensated = Annotated[
+    bool | None,
+    typer.Option(
+        "--motion-compensated/--not-motion-compensated",
+        help="points are de-skewed already / are not: without a field of times these follow from the azimuths",
+    ),
+]
+TimeField = Annotated[
+    str | None,
+    typer.Option(metavar="NAME|none", help="the field with the times of points; default: recognised by its content"),
+]
 DRIVE_OPTIONS = {
     "scans": Annotated[
         str | None, typer.Option(metavar="SLICES", help="only these scans, as START:STOP:STEP, e.g. 0:12,24:36")
@@ -71,6 +82,11 @@ DRIVE_OPTIONS = {
     ],
     "dtype": Annotated[
         str | None, typer.Option(metavar="TYPE", help="type of the columns of .bin scans: float32 or float64")
+    ],
+    "motion_compensated": MotionCompensated,
+    "time_field": TimeField,
+    "time_unit": Annotated[
+        str | None, typer.Option(metavar="UNIT", help="its unit: s, ms, us or ns; default: recognised by its content")
     ],
 }
 """Options that describe a drive, by the argument names of ``formats.open_drive``."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -80,6 +80,23 @@ NO_VOTE = 255
 
 
 @dataclass(frozen=True, slots=True)
+class TimesTold:
+    """How the times of a scan's points are known."""
+
+    how: Literal["field", "azimuth", "compensated", "none"]
+    """A field tells them; they follow from the azimuths; points are stated to be motion-compensated; no field tells
+    them, and nothing is stated."""
+    told: str
+    """The field with unit and origin, or the fields that are there."""
+    doubtful: bool = False
+    """Whether somebody should state what was assumed."""
+    fields: tuple[str, ...] = ()
+    """The field that tells them, or those that may."""
+    other_clock: bool = False
+    """Whether the field counts by a clock that is not the stamps'."""
+
+
+@dataclass(frozen=True, slots=True)
 class Scan:
     """One revolution. ``stamp_ns`` is the moment in whose lidar frame the points are, once de-skewed."""
 
@@ -97,6 +114,8 @@ class Scan:
 
     others: tuple[tuple[int, F64], ...] = ()
     """Of a sweep of several LiDARs: from which point on the next LiDAR's follow, and where (3,) their rays begin."""
+    times: TimesTold | None = None
+    """How ``time_s`` is known, if it was read; of a sweep, of the LiDAR that says least."""
 
     @classmethod
     def sweep(cls, stamp_ns: int, scans: Sequence[Scan]) -> Scan:
@@ -120,6 +139,7 @@ class Scan:
             np.concatenate(ring) if len(ring) == len(scans) else None,
             scans[0].origin,
             tuple(zip(starts, origins[1:], strict=True)),
+            next((s.times for s in scans if s.times is not None and s.times.how == "none"), scans[0].times),
         )
 
     def by_lidar(self) -> list[tuple[slice, Scan]]:

@@ -13,7 +13,7 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor import Finding, Severity
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_options
 from mapvote.formats.drives.rosbag import (
-    CLOUD,
+    CLOUDS,
     GNSS,
     POSES,
     Bag,
@@ -36,7 +36,7 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
     """Topics, rates, clocks and frames of the bag at ``path``; nothing of what its scans show."""
     try:
         bag = Bag(path)
-        times = {topic: stamps_of(bag, topic) for topic in bag.topics(CLOUD, *POSES, *GNSS)}
+        times = {topic: stamps_of(bag, topic) for topic in bag.topics(*CLOUDS, *POSES, *GNSS)}
         orders = {topic: in_order_of_stamps(*rows.T) for topic, rows in times.items()}
         files = [Finding("warning", what) for what in bag.mended]
         poses = _poses(bag, orders, drive_options(path, **said))
@@ -48,13 +48,13 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
 def _topics(bag: Bag, times: _Times) -> Iterator[Finding]:
     others = []
     for name, topic in sorted(bag.reader.topics.items()):
-        if topic.msgtype not in (CLOUD, *POSES, *GNSS):
+        if topic.msgtype not in (*CLOUDS, *POSES, *GNSS):
             others.append(f"{name} ({topic.msgcount})")
             continue
         seconds = float(np.ptp(times[name][:, 1])) * 1e-9 if len(times[name]) else 0.0
         rate = f"{(len(times[name]) - 1) / seconds:.1f} Hz" if seconds > 0 else "no rate"
         yield Finding("note", f"{name}: {topic.msgcount} messages of {topic.msgtype}, {rate}")
-        if topic.msgtype == CLOUD and topic.msgcount == 0:
+        if topic.msgtype in CLOUDS and topic.msgcount == 0:
             yield Finding("warning", f"{name} holds no message", "did the driver run? Record it again")
     if others:
         yield Finding("note", f"other topics: {', '.join(others)}")
@@ -65,7 +65,7 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
     for topic, order in orders.items():
         mend = "the drive is read so; record again with `use_sim_time` alike for all nodes, and one pass a bag"
         yield from (Finding("warning", f"{topic} {what}", mend) for what in order.told)
-    for topic in bag.topics(CLOUD):
+    for topic in bag.topics(*CLOUDS):
         stamps, received = times[topic][orders[topic].chosen].T
         if len(stamps) < 3 or not stamps.any():
             continue
@@ -78,7 +78,7 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
 
 def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding]:
     """Which topics may serve as prior, whether they span the scans, and how far the LiDAR sits from what they track."""
-    clouds, poses = list(bag.topics(CLOUD)), list(bag.topics(*POSES, *GNSS))
+    clouds, poses = list(bag.topics(*CLOUDS)), list(bag.topics(*POSES, *GNSS))
     if not clouds:
         return
     if not poses:

@@ -7,6 +7,7 @@ import takes longer than a look.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.mount import mount_of_prior
-from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan, TimesTold
 from mapvote.doctor import Finding, Severity, any_error, usable
 from mapvote.doctor.lean import check_lean
 from mapvote.formats.drives.options import source_of_times
@@ -50,6 +51,11 @@ NO_PRIOR = Finding(
     "no prior: the vehicle must find itself in the map",
     "give poses with --prior: a file (3 x 4 rows T_map_lidar, TUM, CSV) or a topic of a bag; or give the first pose",
 )
+_UNTOLD = {
+    True: TimesTold("field", "times of points"),
+    False: TimesTold("none", "of a scan that was not read from fields"),
+}
+"""Of scans that no reader made."""
 _LOOK = np.dtype(
     [
         ("index", "i8"),  # which scan
@@ -74,7 +80,8 @@ class Looks:
 
     rows: NDArray[np.void]
     """(m,) of ``_LOOK``: of every scan that could be read, in their order."""
-    has_times: bool
+    times: Counter[TimesTold]
+    """How the times of points are known, and of how many scans."""
     has_intensity: bool
     refused: dict[int, str]
     """Why a scan could not be read."""
@@ -110,7 +117,8 @@ class Looking:
         self._R = None if mount is None else mount.C[:3, :3].astype(np.float32)
         self._rows: dict[int, np.void] = {}
         self._refused: dict[int, str] = {}
-        self._times = self._intensity = False
+        self._times: Counter[TimesTold] = Counter()
+        self._intensity = False
 
     def _read(self, i: int) -> Scan:
         try:
@@ -120,7 +128,7 @@ class Looking:
             raise
         if i not in self._rows:
             self._rows[i] = _look(i, scan.points, self._R)
-            self._times |= scan.time_s is not None
+            self._times[scan.times or _UNTOLD[scan.time_s is not None]] += 1
             self._intensity |= scan.intensity is not None
         return scan
 
@@ -134,7 +142,7 @@ class Looking:
             if progress is not None:
                 progress(done + 1, len(left))
         rows = np.array([self._rows[i] for i in sorted(self._rows)], dtype=_LOOK)
-        return Looks(rows, self._times, self._intensity, dict(self._refused))
+        return Looks(rows, Counter(self._times), self._intensity, dict(self._refused))
 
     def warnings(self, progress: Callable[[int, int], None] | None = None) -> list[Finding]:
         """The findings of all scans, read or not; MapvoteError with the first error, if there is one."""
@@ -304,11 +312,34 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
     if coarse:
         what = f"coordinates are rounded to {coarse[0]:g} m"
         yield Finding("error" if coarse[0] > 0.2 else "warning", what, "write them in millimetres or as float32")
-    if not looks.has_times:
-        what = "points carry no times: scans are taken as motion-compensated"
-        yield Finding("note", what, "if they are not, set motion_compensated = false in drive.toml")
+    yield from _times_of_points(looks.times)
     if not looks.has_intensity:
         yield Finding("note", "no intensity field", "the method does not need it")
+
+
+def _times_of_points(times: Counter[TimesTold]) -> Iterator[Finding]:
+    """What was assumed of the times of points, where nothing was stated."""
+    state = "if they are not, set motion_compensated = false in drive.toml; if they are, true"
+    for told in times:
+        named = " or ".join(told.fields)
+        if told.how == "none" and told.fields:
+            what = f"no field has the name of a time of points, but {named} lasts about one revolution"
+            yield Finding(
+                "warning", what, f'set time_field = "{told.fields[0]}" in drive.toml, or "none" if it is no time'
+            )
+        elif told.how == "none":
+            what = f"points carry no times: scans are taken as motion-compensated ({told.told})"
+            yield Finding("warning" if told.doubtful else "note", what, state)
+        elif told.doubtful:
+            what = f"the times of points are taken from {told.told}: it lasts one revolution, its name is not known"
+            yield Finding("warning", what, f'set time_field = "{named}" in drive.toml, or "none" if it is no time')
+        elif told.other_clock:
+            what = f"the times of points ({told.told}) and the stamps of scans are of two clocks"
+            yield Finding("note", what, "the first point is taken to lie at the stamp")
+    without = sum(n for told, n in times.items() if told.how == "none")
+    if 0 < without < times.total():
+        what = f"{without} of {times.total()} scans, or one of several LiDARs, carry no times of points, the others do"
+        yield Finding("warning", what, "record all of them in the same way, or state motion_compensated")
 
 
 def _severity(spoilt: int, scans: int) -> Severity:

@@ -50,7 +50,8 @@ def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
     or "none". ``rate_hz``, ``sensor``, ``vehicle`` and ``mount`` (T_base_lidar: 12 numbers, or x, y, z, roll, pitch,
     yaw in metres and degrees) win over drive.toml. ``topic``: the PointCloud2 topic of a bag (several
     with commas), the scene of a nuScenes folder. ``columns``, ``dtype``: of .bin and .npy scans, "x,y,z,intensity,ring"
-    and "float32". ``frame``: the map's, into which latitudes and longitudes of a prior go.
+    and "float32". ``motion_compensated``, ``time_field`` (or "none"), ``time_unit``: what is known of the times of
+    points. ``frame``: the map's, into which latitudes and longitudes of a prior go.
 
     Raises MapvoteError if there is no drive at ``path`` or it cannot be used as it is, saying why.
     """

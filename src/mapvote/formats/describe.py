@@ -12,7 +12,7 @@ from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import SOURCES, PointMap
 from mapvote.core.sensor_height import check_heights
-from mapvote.core.types import CellState, Drive, MapvoteError
+from mapvote.core.types import CellState, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import is_map_folder
@@ -105,7 +105,7 @@ def _drive(drive: Drive) -> Rows:
         ("sensor is", drive.sensor_told),
         ("scans", f"{len(drive)} in {seconds:.1f} s, the first with {len(first.points):,} points"),
         ("starts", f"{start:%Y-%m-%d %H:%M:%S} UTC" if start.year > 1990 else "time of day unknown"),
-        ("point times", "none: taken as motion-compensated" if first.time_s is None else "yes: scans are de-skewed"),
+        ("point times", _times(first)),
         ("mounted at", ", ".join(f"{v:.2f}" for v in drive.T_base_lidar[:3, 3]) + " m (T_base_lidar)"),
     ]
     if T is None:
@@ -114,6 +114,12 @@ def _drive(drive: Drive) -> Rows:
     about = f"{length_m:.0f} m driven, sigma {drive.prior_sigma_m:g} m and {drive.prior_sigma_deg:g} deg"
     ends = " to ".join("({:.1f}, {:.1f}, {:.1f})".format(*T[i, :3, 3]) for i in (0, -1))
     return [*rows, ("prior", about), ("from", ends)]
+
+
+def _times(scan: Scan) -> str:
+    """How the times of the points are known."""
+    told = "" if scan.times is None else f" ({scan.times.told})"
+    return f"none: taken as motion-compensated{told}" if scan.time_s is None else f"yes: scans are de-skewed{told}"
 
 
 def _foundation(ballot: Ballot) -> str:

@@ -8,14 +8,15 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
-from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
+from mapvote.formats.drives.point_times import TimeRules
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.live.choice import Chosen
 from mapvote.live.dds import Network
@@ -58,6 +59,11 @@ class Sweeps:
         self._open: list[Cloud] = []
         self._firsts: deque[int] = deque(maxlen=20)
         """Stamps of the first LiDAR, which give its period."""
+
+    @property
+    def step_s(self) -> float | None:
+        """Between two clouds of the first LiDAR (median), seconds; None before the third."""
+        return float(np.median(np.diff(sorted(self._firsts)))) * 1e-9 if len(self._firsts) > 2 else None
 
     def add(self, clouds: Iterable[Cloud]) -> list[list[Cloud]]:
         """Clouds that arrived together, in any order. Returns the scans that are whole by now, each in order of
@@ -134,9 +140,11 @@ class Subscriptions:
         names: RosNames | None = None,
         *,
         sim_time: bool = False,
+        rules: TimeRules = TimeRules(),  # noqa: B008 - frozen
     ) -> None:
         """``sensor``: of the first LiDAR; None: it is measured in the first scans. ``names`` resolves tf, tf_static and
-        clock. ``sim_time``: the time is that of the clock's topic."""
+        clock. ``sim_time``: the time is that of the clock's topic. ``rules``: what is stated of the
+        times of points."""
         self.network, self.chosen, self.sensor = network, chosen, sensor
         self.names = names or RosNames()
         self.sensor_told = "stated" if sensor is not None else ""
@@ -151,6 +159,7 @@ class Subscriptions:
         self.last_unusable = ""
         """Why the last message could not be used."""
         self._repeated = Repeated(log.warning)
+        self._readers = [PointReader(one.topic, rules) for one in chosen.points]
         self._sweeps = Sweeps(len(chosen.points))
         self._points, self._odometry = (
             [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
@@ -279,7 +288,8 @@ class Subscriptions:
         if self.sensor is None and len(firsts) >= _MEASURED:
             steps_ns = np.diff([cloud.stamp_ns for cloud in firsts])
             rate_hz = round(1e9 / float(np.median(steps_ns)), 1)
-            read = [scan_from_point_cloud2(cloud.message, UNKNOWN) for cloud in firsts[:_MEASURED]]
+            unknown = replace(UNKNOWN, rate_hz=rate_hz)
+            read = [scan_from_point_cloud2(c.message, unknown, self._readers[0]) for c in firsts[:_MEASURED]]
             found = estimate_sensor(read, rate_hz)
             self.sensor, self.sensor_told = found.sensor, found.told
         return self.sensor is not None
@@ -293,7 +303,9 @@ class Subscriptions:
         assert sensor is not None
         scans = []
         for cloud in clouds:
-            scan = scan_from_point_cloud2(cloud.message, sensor)
+            reader = self._readers[cloud.lidar]
+            reader.step_s = self._sweeps.step_s
+            scan = scan_from_point_cloud2(cloud.message, sensor, reader)
             if cloud.lidar:
                 if mounts is None:
                     raise MapvoteError(f"no frame says where {self.lidar_frames[cloud.lidar]} sits")

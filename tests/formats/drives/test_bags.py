@@ -5,22 +5,18 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tomli_w
-from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial import cKDTree
 
 from bag_recorder import CLOUD, START, Recorder
 from mapvote.core import geometry
-from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, MapvoteError
 from mapvote.formats import open_drive
-from mapvote.formats.drives.point_fields import point_times_s
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.messages import blank_message, header_of, to_cdr
 
@@ -125,25 +121,6 @@ def test_an_orientation_that_nobody_set_is_no_pose(tmp_path: Path) -> None:
     with pytest.raises(MapvoteError, match=r"/odom holds a quaternion of zeros, .*--prior TOPIC or --prior none"):
         open_drive(tmp_path / "bag", sensor="hdl32e", prior="/odom")
     assert len(open_drive(tmp_path / "bag", sensor="hdl32e")) == 1
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6, 1e-9])
-@pytest.mark.parametrize("absolute", [False, True])
-def test_point_times_are_understood_in_every_unit(unit: float, absolute: bool) -> None:
-    truth_s = np.linspace(-0.05, 0.049, 100)
-    if unit == 1e-9:
-        raw: NDArray[Any] = np.round(truth_s * 1e9).astype(np.int64) + (STAMPS[0] if absolute else 0)
-    else:
-        raw = (truth_s + (STAMPS[0] * 1e-9 if absolute else 0.0)) / unit
-    time_s = point_times_s("scan", raw, STAMPS[0], SENSORS["hdl32e"])
-    assert time_s is not None
-    assert np.allclose(time_s, truth_s, atol=1e-6)
-
-
-def test_point_times_that_cannot_be() -> None:
-    assert point_times_s("scan", np.zeros(9), STAMPS[0], SENSORS["hdl32e"]) is None
-    with pytest.raises(MapvoteError, match="two clocks"):
-        point_times_s("scan", 1e9 + np.linspace(0, 0.1, 9), STAMPS[0], SENSORS["hdl32e"])
 
 
 def two_lidars(path: Path, *, static: bool = True, late_ns: int = 4 * 10**7, lost: int = -1) -> Path:

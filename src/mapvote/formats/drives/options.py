@@ -18,6 +18,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
+from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
@@ -37,6 +38,9 @@ class SaidOfDrive(TypedDict, total=False):
     topic: str | None
     columns: str | None
     dtype: str | None
+    motion_compensated: bool | None
+    time_field: str | None
+    time_unit: str | None
     frame: MapFrame | None
 
 
@@ -55,7 +59,10 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
     prior_sigma_deg: float = 1.0
     T_base_lidar: list[float] | None = None
     """12 numbers, the rows of the 3 x 4 matrix; or 6: x, y, z in metres, roll, pitch, yaw in degrees."""
-    motion_compensated: bool = True
+    motion_compensated: bool | None = None
+    time_field: str | None = None
+    """The field with the times of points, or "none"."""
+    time_unit: str | None = None
     topic: str | None = None
     """The PointCloud2 topic of a bag."""
     origin: list[float] | None = None
@@ -70,6 +77,12 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
     """``T_base_lidar`` as the command line gives it."""
     frame: MapFrame | None = None
     """The map's frame, into which latitudes and longitudes go."""
+
+    @property
+    def time_rules(self) -> TimeRules:
+        """What is said of the times of points."""
+        rate = self.rate_hz is not None or (isinstance(self.sensor, dict) and "rate_hz" in self.sensor)
+        return TimeRules(self.motion_compensated, self.time_field, self.time_unit, rate)
 
 
 _NOT_IN_FILE = ("scans", "mount", "frame")
@@ -107,7 +120,10 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
         raise MapvoteError(f"{file}: {error}") from error
     if options.prior_sigma_m <= 0 or options.prior_sigma_deg <= 0:
         raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive")
-    return structs.replace(options, **{name: value for name, value in said.items() if value is not None})
+    options = structs.replace(options, **{name: value for name, value in said.items() if value is not None})
+    if options.time_unit not in (None, *UNITS_NS):
+        raise MapvoteError(f"{file}: time_unit is {options.time_unit!r}; it must be {', '.join(UNITS_NS)}")
+    return options
 
 
 def read_mount(numbers: list[float] | str, where: str) -> F64:
@@ -157,6 +173,11 @@ def map_frame(options: DriveOptions) -> MapFrame | None:
     if len(options.origin) != 3:
         raise MapvoteError("drive.toml: origin must be latitude, longitude, altitude")
     return enu_frame(*options.origin)
+
+
+def step_of(stamps_ns: I64) -> float | None:
+    """Seconds between two scans (median) of stamps (n,); None of one scan."""
+    return float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else None
 
 
 def parse_scans(scans: str | None, n: int, where: str) -> I64:

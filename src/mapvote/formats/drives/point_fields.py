@@ -6,6 +6,7 @@ Points that are no measurements are dropped, counted and reported.
 from __future__ import annotations
 
 import logging
+import struct
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +17,17 @@ from mapvote.core.brightness import unit_intensity
 from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, I32, U16, MapvoteError, Scan
+from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
+from mapvote.formats.drives.point_times import (
+    ANOTHER,
+    Clocks,
+    FieldTimes,
+    FoundTimes,
+    TimeRules,
+    find_times,
+    known_time_field,
+    no_times,
+)
 from mapvote.formats.maps.cloud import xyz_view
 
 log = logging.getLogger("mapvote.formats")
@@ -26,16 +37,12 @@ MAX_BAD_SHARE = 0.05
 FAR_M = 2000.0
 """No LiDAR of ours measures farther; float64 or integers read as float32 do."""
 _BLOCK = 512
-TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "offset_time", "point_time_offset")
-"""Ouster, Velodyne, Hesai and Livox, Autoware, Livox: what drivers call the time of a point."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")
 RING_FIELDS = ("ring", "channel", "laser_id", "laser_number", "line", "laserid")
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
-_UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-_DAY_NS = 86_400e9
-_TIMES_BLOCK = 8192
-"""Points whose times are worked out at once: as float64 they stay in the processor's cache."""
+_USUAL_RATES_HZ = 8.0, 34.0
+"""Scans that come so often are one revolution each; where they come less often some may have been left out."""
 
 
 @dataclass(slots=True)
@@ -43,6 +50,7 @@ class BadPoints:
     """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: noticed, without a flood."""
 
     where: str
+    what: str = f"are not finite or beyond {FAR_M:.0f} m"
     points: int = 0
     seen: set[int] = field(default_factory=set)
 
@@ -52,58 +60,147 @@ class BadPoints:
         self.seen.add(index)
         self.points += n
         if len(self.seen) & (len(self.seen) - 1) == 0:
-            what = "%s: dropped %d points that are not finite or beyond %.0f m, in %d scans so far"
-            log.warning(what, self.where, self.points, FAR_M, len(self.seen))
+            message = "%s: dropped %d points that %s, in %d scans so far"
+            log.warning(message, self.where, self.points, self.what, len(self.seen))
 
 
-def scan_from_fields(
-    where: str,
-    index: int,
-    stamp_ns: int,
-    table: NDArray[np.void],
-    *,
-    sensor: Sensor,
-    bad_points: BadPoints,
-    zero_is_no_return: bool = True,
-    spinning: bool = False,
-) -> Scan:
-    """A Scan of the usable points of a structured array (n,), in their order.
+@dataclass(slots=True)
+class PointReader:
+    """Makes scans of points with named fields, for one drive or one LiDAR, whatever its format."""
 
-    Dropped without a message, as the format defines: rays without return (not finite or exactly at the sensor, if
-    ``zero_is_no_return``; else they are defects), and points nearer than the sensor can measure. Dropped and counted:
-    not finite, or beyond 2 km. ``spinning``: points without times get them from their azimuth.
-    MapvoteError if the counted ones are more than 5 %, or if nothing is left.
-    """
-    points = xyz_view(where, table).astype(np.float32, copy=False)
-    names = table.dtype.names or ()
-    intensity, ring, time = (
-        next((name for name in known if name in names), None) for known in (INTENSITY_FIELDS, RING_FIELDS, TIME_FIELDS)
-    )
-    time_s = None if time is None else point_times_s(f"{where}: {time}", table[time], stamp_ns, sensor)
-    if time_s is None and spinning:
-        time_s = spinning_time_s(points, sensor.rate_hz, clockwise=sensor.clockwise)
-    near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
-    usable, copied = np.empty(len(points), np.int32), np.empty((len(points), 3), np.float32)
-    n, measured, bad = _sort_out(points, zero_is_no_return, near_m, FAR_M, usable, copied)
-    if bad > MAX_BAD_SHARE * max(measured, 1):
-        raise MapvoteError(
-            f"{where}: {bad} of {measured} points are not finite or beyond {FAR_M:.0f} m, more than "
-            f"{MAX_BAD_SHARE:.0%}: {_likely_cause(points)}"
+    where: str
+    rules: TimeRules = field(default_factory=TimeRules)
+    step_s: float | None = None
+    """Between two scans (median), seconds, if known."""
+    zero_is_no_return: bool = True
+    """Whether a point exactly at the sensor is a ray without return; else it is a defect."""
+    bad_points: BadPoints = field(init=False)
+    bad_times: BadPoints = field(init=False)
+    clocks: Clocks = field(default_factory=Clocks)
+
+    def __post_init__(self) -> None:
+        self.bad_points = BadPoints(self.where)
+        self.bad_times = BadPoints(self.where, "hold no time of their scan")
+
+    def scan(self, where: str, index: int, stamp_ns: int, table: NDArray[np.void], sensor: Sensor) -> Scan:
+        """A Scan of the usable points of a structured array (n,), in their order.
+
+        Dropped without a message, as the format defines: rays without return (not finite or exactly at the sensor), and
+        points nearer than the sensor can measure. Dropped and counted: not finite, beyond 2 km, or with a time that is
+        none of this scan. MapvoteError if the counted ones are more than 5 %, if nothing is left, or if a field that
+        should hold times does not.
+        """
+        points = xyz_view(where, table).astype(np.float32, copy=False)
+        names = table.dtype.names or ()
+        intensity = next((name for name in INTENSITY_FIELDS if name in names), None)
+        ring = next((name for name in RING_FIELDS if name in names), None)
+        # Points that are measurements.
+        near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
+        usable = np.empty(len(points), np.int32)
+        copied = np.empty((len(points), 3), np.float32)
+        n, measured, bad = _sort_out(points, self.zero_is_no_return, near_m, FAR_M, usable, copied)
+        if bad > MAX_BAD_SHARE * max(measured, 1):
+            raise MapvoteError(
+                f"{where}: {bad} of {measured} points are not finite or beyond {FAR_M:.0f} m, more than "
+                f"{MAX_BAD_SHARE:.0%}: {_likely_cause(points)}"
+            )
+        self.bad_points.count(index, bad)
+        if n == 0:
+            raise MapvoteError(
+                f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: are they metres? "
+                "Else leave this scan out with --scans"
+            )
+        keep: slice | I32 = slice(None) if n == len(points) else usable[:n]
+        # Their times; where a point has none it is dropped.
+        time_s, told = self._times(where, index, stamp_ns, table, keep, copied[:n], sensor)
+        xyz = copied[:n]
+        if time_s is not None and not np.isfinite(time_s).all():
+            good = np.isfinite(time_s)
+            keep = np.arange(len(points), dtype=np.int32)[keep][good]
+            xyz = np.ascontiguousarray(xyz[good])
+            time_s = time_s[good]
+        return Scan(
+            stamp_ns=stamp_ns,
+            points=xyz,
+            time_s=time_s,
+            intensity=None if intensity is None else unit_intensity(table[intensity][keep]),
+            ring=None if ring is None else _ring(table[ring][keep]),
+            times=told,
         )
-    bad_points.count(index, bad)
-    if n == 0:
-        raise MapvoteError(
-            f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: are they metres? "
-            "Else leave this scan out with --scans"
-        )
-    keep = slice(None) if n == len(points) else usable[:n]
-    return Scan(
-        stamp_ns=stamp_ns,
-        points=copied[:n],
-        time_s=None if time_s is None else np.ascontiguousarray(time_s[keep], dtype=np.float32),
-        intensity=None if intensity is None else unit_intensity(table[intensity][keep]),
-        ring=None if ring is None else _ring(table[ring][keep]),
-    )
+
+    def _times(
+        self,
+        where: str,
+        index: int,
+        stamp_ns: int,
+        table: NDArray[np.void],
+        keep: slice | I32,
+        points: F32,
+        sensor: Sensor,
+    ) -> tuple[F32 | None, TimesTold]:
+        """(seconds after the stamp of the kept points (n, 3), NaN where there is none; how they are known)."""
+        names = table.dtype.names or ()
+        if self.rules.motion_compensated:
+            return None, TimesTold("compensated", "stated: points are motion-compensated")
+        columns = {name: table[name][keep] for name in names if name not in "xyz" and table.dtype[name].shape == ()}
+        try:
+            found = find_times(columns, points, stamp_ns, self._rate_hz(sensor), self.rules)
+        except MapvoteError as error:
+            raise MapvoteError(f"{where}: {error}") from error
+        if found.times is not None:
+            return self._from_field(where, index, found.times, found.surprising)
+        self._refuse_known(where, found)
+        if self.rules.motion_compensated is False:
+            rate_hz = self._turning_rate_hz(where, sensor)
+            time_s = spinning_time_s(points, rate_hz, clockwise=sensor.clockwise)
+            return time_s, TimesTold("azimuth", f"from the azimuths, at {rate_hz:g} Hz")
+        doubtful = bool(found.candidates) or any(refusal.varies for refusal in found.refused.values())
+        return None, TimesTold("none", no_times(found, names), doubtful, found.candidates)
+
+    def _from_field(self, where: str, index: int, times: FieldTimes, surprising: bool) -> tuple[F32, TimesTold]:
+        lost = int(np.isnan(times.after_stamp).sum())
+        if lost > MAX_BAD_SHARE * len(times.after_stamp):
+            raise MapvoteError(
+                f"{where}: {lost} of {len(times.after_stamp)} points hold no time of this scan in the field "
+                f"{times.name}, more than {MAX_BAD_SHARE:.0%}; record it again, leave the scan out with --scans, or "
+                f'drop the field (time_field = "none" in drive.toml)'
+            )
+        self.clocks.check(where, index, times)
+        self.bad_times.count(index, lost)
+        doubtful = surprising and self.rules.time_field is None
+        told = TimesTold("field", times.told, doubtful, (times.name,), other_clock=times.origin == ANOTHER)
+        return times.after_stamp.astype(np.float32), told
+
+    def _refuse_known(self, where: str, found: FoundTimes) -> None:
+        """MapvoteError if a field with the name of a time holds something else."""
+        name = known_time_field(found)
+        if name is not None and self.rules.time_field is None:
+            raise MapvoteError(
+                f"{where}: the field {name} {found.refused[name].why}. In drive.toml name the field with the times "
+                f'(time_field = "NAME"), or "none" if there is none'
+            )
+
+    def _rate_hz(self, sensor: Sensor) -> float:
+        """Revolutions per second: as stated, else as scans come, else the sensor's."""
+        if self.rules.rate_stated or not self.step_s:
+            return sensor.rate_hz
+        return float(np.clip(1.0 / self.step_s, 0.1, 100.0))
+
+    def _turning_rate_hz(self, where: str, sensor: Sensor) -> float:
+        """The same, for times from azimuths. MapvoteError if scans may have been left out, or the sensor does not
+        spin."""
+        rate_hz = self._rate_hz(sensor)
+        if not sensor.rings:
+            raise MapvoteError(
+                f"{where}: motion_compensated = false, but no field tells the times of the points, and azimuths do "
+                f"not: the points lie on no rings. Record the times, or describe the sensor in drive.toml"
+            )
+        if not self.rules.rate_stated and not _USUAL_RATES_HZ[0] <= rate_hz <= _USUAL_RATES_HZ[1]:
+            raise MapvoteError(
+                f"{where}: motion_compensated = false, and scans come every {1.0 / rate_hz:.3g} s: state how often the "
+                f"sensor turns (rate_hz in drive.toml), for scans may have been left out"
+            )
+        return rate_hz
 
 
 def _ring(values: NDArray[np.number]) -> U16:
@@ -198,59 +295,64 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
+_LIVOX_FIELDS = {
+    "offset_time": ("<u4", 0),
+    "x": ("<f4", 4),
+    "y": ("<f4", 8),
+    "z": ("<f4", 12),
+    "reflectivity": ("u1", 16),
+    "tag": ("u1", 17),
+    "line": ("u1", 18),
+}
+"""Of a CustomPoint: type and place in its 19 bytes."""
+
+
+def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
+    """The points (n,) of a serialised CustomMsg of Livox's drivers: offset_time in ns since the stamp, x, y, z,
+    reflectivity, tag, line.
+
+    Before them stand header, timebase (uint64), number of points (uint32), lidar_id (uint8) and rsvd (uint8[3]). CDR
+    (ROS 2) pads each point to 20 bytes; ROS 1 has 19. MapvoteError if the message is cut off.
+    """
+    try:
+        # header.frame_id, after the stamp; CDR counts its alignment from the fifth byte
+        length = struct.unpack_from("<I", data, 12)[0]
+        at = 16 + length
+        if ros2:
+            at = 4 + -(-(at - 4) // 8) * 8
+        count = struct.unpack_from("<I", data, at + 16)[0]
+    except struct.error as error:
+        raise MapvoteError(f"{where}: a CustomMsg of {len(data)} bytes has no header; copy the bag again") from error
+    size = 20 if ros2 else 19
+    start = at + 20
+    if len(data) - start < count * size - (size - 19 if count else 0):
+        raise MapvoteError(f"{where}: {len(data)} bytes for {count} points: the message is cut off; copy the bag again")
+    record = np.dtype(
+        {
+            "names": list(_LIVOX_FIELDS),
+            "formats": [kind for kind, _ in _LIVOX_FIELDS.values()],
+            "offsets": [offset for _, offset in _LIVOX_FIELDS.values()],
+            "itemsize": size,
+        }
+    )
+    whole = bytes(data[start : start + count * size]).ljust(count * size, b"\0")
+    return np.frombuffer(whole, dtype=record)
+
+
 def stamp_of(message: Any) -> int:
     """Nanoseconds of the stamp in a message's header."""
     stamp = message.header.stamp
     return int(getattr(stamp, "sec", 0)) * 10**9 + int(getattr(stamp, "nanosec", 0))
 
 
-def scan_from_point_cloud2(message: Any, sensor: Sensor) -> Scan:
+def scan_from_point_cloud2(message: Any, sensor: Sensor, reader: PointReader | None = None) -> Scan:
     """A live sensor_msgs/PointCloud2 as a Scan: of rclpy, rosbags, or any object with its fields.
 
-    Its stamp is the message's; a field of times (``TIME_FIELDS``) makes it be de-skewed, ``intensity`` and ``ring`` are
-    kept. MapvoteError if the message is cut off, has no x, y, z, or holds no usable point.
+    Its stamp is the message's; a field of times makes it be de-skewed, ``intensity`` and ``ring`` are kept. ``reader``:
+    of the LiDAR, with what is stated of its times. MapvoteError if the message is cut off, has no x, y, z, or holds no
+    usable point.
     """
     stamp_ns = stamp_of(message)
     where = f"PointCloud2 in {message.header.frame_id or 'no frame'} at {stamp_ns}"
     table = point_cloud_table(where, message)
-    return scan_from_fields(where, 0, stamp_ns, table, sensor=sensor, bad_points=BadPoints(where))
-
-
-def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: Sensor) -> F32 | None:
-    """Times (n,) relative to ``stamp_ns`` from a field of any unit; None if all are equal: no times were recorded.
-
-    The unit is the one of s, ms, us, ns in which the scan lasts nearest to one revolution; values beyond a day are
-    absolute (since 1970), others count from the stamp. MapvoteError if no unit makes a revolution of it.
-    """
-    raw = known = np.ascontiguousarray(raw)
-    start: Any
-    start, end = (raw.min(), raw.max()) if len(raw) else (np.nan, np.nan)
-    if not np.isfinite(float(end) - float(start)):
-        known = raw[np.isfinite(raw.astype(np.float64))]
-        start, end = (known.min(), known.max()) if len(known) else (0.0, 0.0)
-    if start == end:
-        return None
-    span = float(end - start)
-    revolution_ns = 1e9 / sensor.rate_hz
-    unit = min(_UNITS_NS, key=lambda u: abs(np.log(span * _UNITS_NS[u] / revolution_ns)))
-    if not revolution_ns / 20 < span * _UNITS_NS[unit] < revolution_ns * 20:
-        raise MapvoteError(
-            f"{where}: spans {span:g}, which is a revolution in no unit at {sensor.rate_hz:g} Hz; check --rate, "
-            f"or drop the field"
-        )
-    # Exact for 64-bit nanoseconds: the scan's start is subtracted before anything becomes a float.
-    start_ns = int(start) if raw.dtype.kind in "iu" and unit == "ns" else round(float(start) * _UNITS_NS[unit])
-    offset_ns = start_ns - stamp_ns if abs(start_ns) > _DAY_NS else start_ns
-    if abs(offset_ns) > 1e9:
-        raise MapvoteError(
-            f"{where}: points were measured {offset_ns / 1e9:.3f} s away from their scan's stamp: "
-            f"two clocks are mixed; correct the stamps, or drop the field"
-        )
-    out = np.empty(len(raw), np.float32)
-    for k in range(0, len(raw), _TIMES_BLOCK):
-        part = (raw[k : k + _TIMES_BLOCK] - start).astype(np.float64)
-        part *= _UNITS_NS[unit]
-        part += offset_ns
-        part *= 1e-9
-        out[k : k + _TIMES_BLOCK] = part
-    return out
+    return (reader or PointReader(where)).scan(where, stamp_ns, stamp_ns, table, sensor)

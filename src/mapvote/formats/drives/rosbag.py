@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
-from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, read_mount
-from mapvote.formats.drives.point_fields import BadPoints, log, point_cloud_table, scan_from_fields, stamp_of
+from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, read_mount, step_of
+from mapvote.formats.drives.point_fields import PointReader, livox_table, log, point_cloud_table, stamp_of
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Trajectory, prior_of
 from mapvote.formats.extras import first_line, require
@@ -29,7 +30,10 @@ from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
 CLOUD = "sensor_msgs/msg/PointCloud2"
 _SWEEP = 0.55
 """Revolutions within which the scans of several LiDARs are one sweep: they may turn at opposite phases."""
-PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan", "CustomMsg")
+LIVOX = "livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"
+"""Clouds of Livox's drivers: decoded points, each with its time."""
+CLOUDS = (CLOUD, *LIVOX)
+PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
 """Parts of the names of messages in which drivers record what came over the wire."""
 POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 GNSS = ("sensor_msgs/msg/NavSatFix",)
@@ -92,6 +96,18 @@ class Bag:
         for connection, time_ns, data in self.raw(topic, **window):
             yield time_ns, self.decode(connection, data)
 
+    def points(self, where: str, connection: Any, data: bytes) -> NDArray[np.void]:
+        """The points (n,) of a serialised PointCloud2 or CustomMsg, with their fields."""
+        if connection.msgtype in LIVOX:
+            return livox_table(where, data, ros2=self.reader.is2)
+        return point_cloud_table(where, self.decode(connection, data))
+
+    def frame_id(self, data: bytes) -> str:
+        """The frame in the header of a serialised message, without reading the rest."""
+        order = "<" if not self.reader.is2 or data[1] & 1 else ">"
+        length = struct.unpack_from(f"{order}I", data, 12)[0] if len(data) >= 16 else 0
+        return bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+
     def stamp_ns(self, data: bytes) -> int:
         """The stamp in the header of a serialised message, without reading the rest."""
         order = "<" if not self.reader.is2 or data[1] & 1 else ">"
@@ -117,15 +133,15 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     sweeps = _sweeps(bag, topics)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
     T_prior, frame = _prior(bag, options, stamps_ns, own)
-    bad_points = BadPoints(str(path))
+    readers = [PointReader(f"{path} {topic}", options.time_rules, step_of(stamps_ns)) for topic in topics]
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
         start, topic = message.received_ns, topics[message.topic]
         where = f"{path} {topic}, scan {i}"
         for connection, _, data in bag.raw(topic, start=start, stop=start + 1):
             if bag.stamp_ns(data) == message.header_ns:
-                table = point_cloud_table(where, bag.decode(connection, data))
-                scan = scan_from_fields(where, i, message.stamp_ns, table, sensor=sensor, bad_points=bad_points)
+                table = bag.points(where, connection, data)
+                scan = readers[message.topic].scan(where, i, message.stamp_ns, table, sensor)
                 return scan if message.topic == 0 else scan.seen_from(mounts[message.topic])
         raise MapvoteError(f"{where}: gone; the bag changed while it was read")
 
@@ -158,7 +174,7 @@ def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64, mount: F64 | None) -
 
 
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
-    topics = bag.topics(CLOUD)
+    topics = bag.topics(*CLOUDS)
     listed = ", ".join(f"{name} ({n})" for name, n in topics.items())
     packets = sorted(
         n for n, t in bag.reader.topics.items() if t.msgtype and any(word in t.msgtype for word in PACKETS)
@@ -167,7 +183,7 @@ def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
         raise MapvoteError(f"{bag.path}: raw packets only ({', '.join(packets)}): decode with your driver first")
     if not topics:
         others = ", ".join(sorted(bag.reader.topics)) or "none"
-        raise MapvoteError(f"{bag.path}: no topic of {CLOUD}; topics: {others}")
+        raise MapvoteError(f"{bag.path}: no topic of {CLOUD} or Livox's CustomMsg; topics: {others}")
     if wanted is None and len(topics) > 1:
         raise MapvoteError(
             f"{bag.path}: several PointCloud2 topics; choose with --topic or drive.toml, several LiDARs of one vehicle "
@@ -316,10 +332,9 @@ def T_from(edges: Edges, source: str) -> dict[str, F64]:
 
 def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:
     """The frame of a topic's first message; ``child``: what an Odometry tracks, "" where the message does not say."""
-    for _, message in bag.messages(topic):
-        name = getattr(message, "child_frame_id", "") if child else message.header.frame_id
-        return str(name).strip("/")
-    return ""
+    if child:
+        return next((str(getattr(m, "child_frame_id", "")).strip("/") for _, m in bag.messages(topic)), "")
+    return next((bag.frame_id(data).strip("/") for _, _, data in bag.raw(topic)), "")
 
 
 def _matrix(bag: Bag, topic: str, p: Any, q: Any) -> F64:

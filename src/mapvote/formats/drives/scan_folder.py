@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.options import DriveOptions, make_drive
-from mapvote.formats.drives.point_fields import BadPoints, log, scan_from_fields
+from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
+from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans, prior_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.maps.autoware import is_autoware
-from mapvote.formats.maps.cloud import Cloud, joined, table_of, xyz
+from mapvote.formats.maps.cloud import table_of, xyz
 from mapvote.formats.maps.field_names import known_fields
 from mapvote.formats.maps.las import stream_las
 from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
-from mapvote.formats.maps.ply import stream_ply
+from mapvote.formats.maps.ply import stream_ply_tables
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
@@ -103,28 +103,17 @@ class ScanFolder:
     T_base_lidar: F64 | None = None
     """The layout's own mount."""
     zero_is_no_return: bool = True
-    spinning: bool = False
-    """Points without times get them from their azimuth, unless drive.toml says motion_compensated."""
 
 
 def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
     """The drive of a folder; scans are read one by one. MapvoteError says what is missing or does not fit."""
-    bad_points = BadPoints(str(path))
+    reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
     own = folder.prior, folder.prior_name, folder.T_base_lidar
     T_prior, frame = prior_of(path, options, folder.files, folder.stamps_ns, *own)
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
         file = folder.files[i]
-        return scan_from_fields(
-            str(file),
-            i,
-            int(folder.stamps_ns[i]),
-            folder.read_table(file),
-            sensor=sensor,
-            bad_points=bad_points,
-            zero_is_no_return=folder.zero_is_no_return,
-            spinning=folder.spinning and not options.motion_compensated,
-        )
+        return reader.scan(str(file), i, int(folder.stamps_ns[i]), folder.read_table(file), sensor)
 
     return make_drive(
         path,
@@ -212,7 +201,7 @@ def open_kitti(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; KITTI odometry's sequences as they come, their camera poses converted with calib.txt."""
     files = scan_files(path / "velodyne", ".bin")
     read, stamps_ns = layout_of(files, options).read, read_stamps(path, files, options)
-    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, read, zero_is_no_return=False, spinning=True))
+    return open_scan_folder(path, options, ScanFolder(files, stamps_ns, read, zero_is_no_return=False))
 
 
 def cloud_scans(path: Path) -> tuple[Path, str] | None:
@@ -230,19 +219,22 @@ def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
     assert found is not None
     files = scan_files(*found)
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
-        ".ply": lambda file: _table(stream_ply(file)),
-        ".las": lambda file: _table(without_marked(file, stream_las(file))),
-        ".laz": lambda file: _table(without_marked(file, stream_las(file))),
+        ".ply": lambda file: np.concatenate(list(stream_ply_tables(file))),
+        ".las": _read_las,
+        ".laz": _read_las,
         ".npy": lambda file: _read_npy(file, options.columns),
     }
     read = readers.get(found[1]) or layout_of(files, options).read
     return open_scan_folder(path, options, ScanFolder(files, read_stamps(path, files, options), read))
 
 
-def _table(pieces: Iterable[Cloud]) -> NDArray[np.void]:
-    cloud = joined(pieces)
-    fields = [(name, column.dtype) for name, column in cloud.fields.items()]
-    return table_of(cloud, [*((axis, cloud.points.dtype) for axis in "xyz"), *fields])
+def _read_las(file: Path) -> NDArray[np.void]:
+    """The points (n,) of a LAS or LAZ file that it does not mark as none, with every number that it holds of them."""
+    tables = []
+    for piece in without_marked(file, stream_las(file, extra=True)):
+        fields = [(name, column.dtype) for name, column in piece.fields.items()]
+        tables.append(table_of(piece, [*((axis, piece.points.dtype) for axis in "xyz"), *fields]))
+    return np.concatenate(tables)
 
 
 def _read_npy(file: Path, columns: str | None) -> NDArray[np.void]:
@@ -339,7 +331,7 @@ class DriveWriter:
     prior_sigma_deg: float = 1.0
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
     motion_compensated: bool = True
-    """False: the loader sets Scan.time_s by the spinning-sensor rule."""
+    """False: the times of points follow from their azimuths."""
 
     @property
     def _partial(self) -> Path:

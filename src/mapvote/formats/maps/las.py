@@ -69,18 +69,19 @@ MAX_POINTS_PER_BYTE = 16
 _HEAD = msgspec.json.Decoder(Head)
 
 
-def stream_las(path: Path) -> Iterator[Cloud]:
+def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
     """The points of a LAS, LAZ or COPC file as float64, piece by piece, in the coordinate system that it names.
 
-    One piece without points if the file has none. MapvoteError if it is damaged or cut off.
+    One piece without points if the file has none. ``extra``: with the columns that the file defines itself.
+    MapvoteError if it is damaged or cut off.
     """
     laspy = require("laspy", "las", str(path))
     with reading(path, "LAS or LAZ file"):
         if _check_counts(path):
-            yield from _apart(path)
+            yield from _apart(path, extra=extra)
         else:
             with laspy.open(path) as file:
-                head = read_head(file)
+                head = read_head(file, extra=extra)
                 yield from _clouds(path, head, read_pieces(file, head))
 
 
@@ -115,9 +116,9 @@ def _known(where: str, crs: str) -> str:
     return crs
 
 
-def _apart(path: Path) -> Iterator[Cloud]:
+def _apart(path: Path, *, extra: bool) -> Iterator[Cloud]:
     """What the file holds, read by a process of its own, which a damaged LAZ file may end; ValueError if it does."""
-    command = [sys.executable, laz_subprocess.__file__, str(path)]
+    command = [sys.executable, laz_subprocess.__file__, str(path), *(["extra"] if extra else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
         try:
@@ -147,7 +148,7 @@ def _pieces_of(stream: io.BufferedReader, head: Head) -> Iterator[Piece]:
         n = int(line)
         if n == 0:
             return
-        points, fields = np.empty((n, 3)), {name: np.empty(n, dtype=FIELDS[name]) for name in head.fields}
+        points, fields = np.empty((n, 3)), {name: np.empty(n, dtype=kind) for name, kind in head.fields.items()}
         for column in (points.reshape(-1), *fields.values()):
             if stream.readinto(column.data.cast("B")) != column.nbytes:
                 raise ValueError("the LAZ reader stopped half way; is there enough memory?")

@@ -1,6 +1,7 @@
 """Read a LAS or LAZ file with laspy, piece by piece; as a script, in a process that a damaged file may end.
 
-    python laz_subprocess.py FILE   # a line of JSON (Head), then pieces: a line with the number of points, the columns
+    python laz_subprocess.py FILE [extra]   # a line of JSON (Head), then pieces: a line with the number of points, the
+                                            # columns; "extra": those that the file defines itself (extra bytes) too
 
 lazrs panics on some damaged files, and aborts its process when a chunk table makes it ask for terabytes. So that the
 process starts fast, nothing of mapvote is imported here.
@@ -54,19 +55,22 @@ class Head(msgspec.Struct):
     geo_keys: dict[int, int] = {}
     """GeoTIFF keys that hold a number."""
     refusal: str = ""
+    extra: dict[str, str] = {}
+    """Numbers of a point that the file defines itself, by name and type; empty unless they were asked for."""
 
     @property
-    def fields(self) -> list[str]:
-        """The columns that follow x, y, z in every piece."""
-        return [name for name in FIELDS if name in self.dimensions or name == "las_flags"]
+    def fields(self) -> dict[str, str]:
+        """The columns that follow x, y, z in every piece, with their types."""
+        known = {name: kind for name, kind in FIELDS.items() if name in self.dimensions or name == "las_flags"}
+        return known | self.extra
 
 
 Piece = tuple[NDArray[np.float64], dict[str, NDArray[Any]]]
 """Points (n, 3) and the columns (n,) of ``Head.fields``."""
 
 
-def read_head(file: Any) -> Head:
-    """The head of an opened LAS file."""
+def read_head(file: Any, *, extra: bool = False) -> Head:
+    """The head of an opened LAS file; ``extra``: with what it defines of a point itself."""
     vlrs = [*file.header.vlrs, *(file.header.evlrs or ())]
     wkt = [v.string for v in vlrs if type(v).__name__ == "WktCoordinateSystemVlr"]
     keys = {
@@ -79,7 +83,17 @@ def read_head(file: Any) -> Head:
     names = tuple(file.header.point_format.dimension_names)
     text = wkt[0].replace("\0", "").strip() if wkt else ""
     adjusted = int(file.header.global_encoding.gps_time_type) == 1
-    return Head(file.header.point_count, None, file.header.point_format.id, adjusted, names, text, {} if text else keys)
+    form = file.header.point_format
+    own = {d.name: np.dtype(d.dtype).str for d in form.extra_dimensions if extra and np.dtype(d.dtype).shape == ()}
+    return Head(
+        promised=file.header.point_count,
+        point_format=form.id,
+        adjusted_time=adjusted,
+        dimensions=names,
+        wkt=text,
+        geo_keys={} if text else keys,
+        extra=own,
+    )
 
 
 def read_pieces(file: Any, head: Head) -> Iterator[Piece]:
@@ -87,7 +101,7 @@ def read_pieces(file: Any, head: Head) -> Iterator[Piece]:
     stored = [name for name in head.fields if name != "las_flags"]
     for chunk in file.chunk_iterator(CHUNK):
         points = np.column_stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)])
-        fields = {name: np.array(chunk[name], dtype=FIELDS[name]) for name in stored}
+        fields = {name: np.array(chunk[name], dtype=head.fields[name]) for name in stored}
         flags = np.zeros(len(points), np.uint8)
         for name, bit in FLAGS.items():
             if name in head.dimensions:
@@ -130,7 +144,7 @@ def main() -> None:
         import laspy
 
         with laspy.open(sys.argv[1]) as file:
-            head = read_head(file)
+            head = read_head(file, extra="extra" in sys.argv[2:])
             with suppress(Exception):  # a file without chunk table, which lazrs reads all the same
                 head.held = points_in_chunks(sys.argv[1], file.header.offset_to_point_data)
             out.write(msgspec.json.encode(head) + b"\n")

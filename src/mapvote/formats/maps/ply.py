@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
@@ -24,8 +25,16 @@ _MEND = "correct the numbers of elements in the header, or export it again"
 
 
 def stream_ply(path: Path) -> Iterator[Cloud]:
-    """The vertices of a PLY file, ascii or binary, float or double; faces are ignored. Binary vertices without lists
-    stay on disk until their piece is read. MapvoteError if the file is damaged or holds no element "vertex"."""
+    """The vertices of a PLY file with the fields that a map keeps, piece by piece. MapvoteError as
+    :func:`stream_ply_tables`."""
+    for table in stream_ply_tables(path):
+        yield cloud_of_table(str(path), table)
+
+
+def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
+    """The vertices of a PLY file, ascii or binary, float or double, as structured arrays with every property; faces are
+    ignored. Binary vertices without lists stay on disk until their piece is read. MapvoteError if the file is damaged
+    or holds no element "vertex"."""
     library = require("plyfile", "ply", str(path))
     with reading(path, "PLY file of vertices"):
         with path.open("rb") as stream:
@@ -42,8 +51,7 @@ def stream_ply(path: Path) -> Iterator[Cloud]:
         vertices = vertices[[name for name in vertices.dtype.names if not vertices.dtype[name].hasobject]]  # no lists
         for start in range(0, max(len(vertices), 1), _BLOCK):
             part = np.array(vertices[start : start + _BLOCK])
-            part = part.astype(part.dtype.newbyteorder("="))
-            yield cloud_of_table(str(path), part)
+            yield part.astype(part.dtype.newbyteorder("="))
 
 
 def _full_lines(stream: BinaryIO) -> io.StringIO:
