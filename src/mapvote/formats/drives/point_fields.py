@@ -20,7 +20,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
 from mapvote.formats.drives.point_times import (
     ANOTHER,
-    Clocks,
+    ClockDifference,
     FieldTimes,
     FoundTimes,
     TimeRules,
@@ -76,7 +76,7 @@ class PointReader:
     """Whether a point exactly at the sensor is a ray without return; else it is a defect."""
     bad_points: BadPoints = field(init=False)
     bad_times: BadPoints = field(init=False)
-    clocks: Clocks = field(default_factory=Clocks)
+    clocks: ClockDifference = field(default_factory=ClockDifference)
 
     def __post_init__(self) -> None:
         self.bad_points = BadPoints(self.where)

@@ -105,7 +105,7 @@ class TimeRules:
 
 
 @dataclass(slots=True)
-class Clocks:
+class ClockDifference:
     """By how much the clock of the points is off that of the stamps; the same during a whole drive."""
 
     off_ns: int | None = None
@@ -187,6 +187,8 @@ def read_times(
     steps = _minus(raw, reference)
     some = np.flatnonzero(finite)[:: max(1, int(finite.sum()) // JUDGEMENT.sample)]
     values = len(np.unique(steps[some]))
+    if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
+        return Refusal(f"holds times since 1970 as {raw.dtype.name}, which cannot tell points apart; record {_LOSSLESS}")
     if values < JUDGEMENT.least_values:
         return Refusal(f"holds {values} different value{'s' if values > 1 else ''} in a scan", varies=False)
     # The median and twice the interquartile range: what they say holds whatever a quarter of the points say.
@@ -223,6 +225,17 @@ def read_times(
     after[~good] = np.nan
     clock_off_ns = value_ns + starts_ns - stamp_ns if origin == ANOTHER else 0
     return FieldTimes(name, chosen, after, origin, clock_off_ns, wraps_ns, turn is not None, turns)
+
+
+_LOSSLESS = "float64, or times since the stamp"
+
+
+def _is_lost(raw: NDArray[Any], reference: Any, stamp_ns: int) -> bool:
+    """Whether values that hardly differ are times by the stamp's clock, rounded by their type."""
+    if raw.dtype.kind != "f" or raw.dtype.itemsize > 4 or abs(float(reference)) < 2.0**17:
+        return False
+    step = float(np.spacing(np.float32(reference)))
+    return any(abs(float(reference) * ns - stamp_ns) <= step * ns + 1e9 for ns in UNITS_NS.values())
 
 
 def _minus(raw: NDArray[Any], reference: Any) -> F64:
