@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import F32, F64, MapvoteError
+from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
 
 TIME_FIELDS = (
     "t",
@@ -60,6 +60,9 @@ class TimeJudgement:
 
     least_values: int = 16
     """Different values a scan has at least."""
+    shared: float = 0.01
+    """A value that a larger share of the points has, and ``shared_ratio`` times as many as any other, is no time."""
+    shared_ratio: float = 5.0
     sample: int = 4096
     """Points whose values and azimuths are looked at."""
     shortest_turn_s: float = 0.03
@@ -165,6 +168,49 @@ class Refusal:
     """Whether its values differ from point to point: such a field has a meaning that is not understood."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """The values of a field, ready to be judged."""
+
+    reference: Any
+    """One of them."""
+    steps: F64
+    """(n,) all of them less that one."""
+    known: Bool
+    """(n,) whether it is a number, and not the one that stands for unknown."""
+    some: I64
+    """Indices of those that are looked at."""
+
+
+def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
+    """The values (n,) of a field, or why they hold nothing about single points."""
+    if raw.ndim != 1 or raw.dtype.kind not in "iuf":
+        return Refusal("holds no numbers", varies=False)
+    # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
+    known = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
+    if not known.any():
+        return Refusal("holds no number", varies=False)
+    reference = raw[known][int(known.sum()) // 2]
+    steps = _minus(raw, reference)
+    some = np.flatnonzero(known)[:: max(1, int(known.sum()) // JUDGEMENT.sample)]
+    distinct, counts = np.unique(steps[some], return_counts=True)
+    values = len(distinct)
+    if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
+        return Refusal(
+            f"holds times since 1970 as {raw.dtype.name}, which cannot tell points apart; record {_LOSSLESS}"
+        )
+    if values < JUDGEMENT.least_values:
+        return Refusal(f"holds {values} different value{'s' if values > 1 else ''} in a scan", varies=False)
+    # A value that many points share stands for "unknown".
+    most = np.argsort(counts)[-2:]
+    if counts[most[1]] > max(JUDGEMENT.shared * len(some), JUDGEMENT.shared_ratio * counts[most[0]]):
+        known &= steps != distinct[most[1]]
+        some = some[known[some]]
+        if len(some) < JUDGEMENT.least_values:
+            return Refusal("has one value in nearly all points", varies=False)
+    return _Values(reference, steps, known, some)
+
+
 def read_times(
     name: str,
     raw: NDArray[Any],
@@ -177,20 +223,12 @@ def read_times(
 
     ``unit``: stated, then only the origin is found out. Integers stay exact: nanoseconds since 1970 have 61 bits.
     """
-    if raw.ndim != 1 or raw.dtype.kind not in "iuf":
-        return Refusal("holds no numbers", varies=False)
-    # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
-    finite = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
-    if not finite.any():
-        return Refusal("holds no number", varies=False)
-    reference = raw[finite][int(finite.sum()) // 2]
-    steps = _minus(raw, reference)
-    some = np.flatnonzero(finite)[:: max(1, int(finite.sum()) // JUDGEMENT.sample)]
-    values = len(np.unique(steps[some]))
-    if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
-        return Refusal(f"holds times since 1970 as {raw.dtype.name}, which cannot tell points apart; record {_LOSSLESS}")
-    if values < JUDGEMENT.least_values:
-        return Refusal(f"holds {values} different value{'s' if values > 1 else ''} in a scan", varies=False)
+    values = _values(raw, stamp_ns)
+    if isinstance(values, Refusal):
+        return values
+    reference = values.reference
+    steps = values.steps
+    some = values.some
     # The median and twice the interquartile range: what they say holds whatever a quarter of the points say.
     median = float(np.partition(steps[some], len(some) // 2)[len(some) // 2])
     low, high = np.quantile(steps[some], (0.25, 0.75))
@@ -202,11 +240,11 @@ def read_times(
     turn = _turn(steps[near], np.arctan2(points[near, 1], points[near, 0]))
     chosen = unit or _unit_of(spread, turn, rate_hz)
     if chosen is None:
-        return Refusal(f"grows by {turn:g} in a revolution, which is a LiDAR's in no unit")
+        return Refusal(f"grows by {turn:.4g} in a revolution, which is a LiDAR's in no unit")
     to_s = UNITS_NS[chosen] * 1e-9
     # Outliers, by what a scan lasts at most.
     reach = JUDGEMENT.reach * max(1.0 / rate_hz / to_s if turn is None else turn, spread)
-    good = finite & (np.abs(steps - median) <= reach)
+    good = values.known & (np.abs(steps - median) <= reach)
     length_s = float(np.ptp(steps[good])) * to_s
     turns = (length_s if turn is None else turn * to_s) * rate_hz
     one_turn = abs(turns - 1.0) <= JUDGEMENT.off_rate and (turn is not None or chosen == "ms")
