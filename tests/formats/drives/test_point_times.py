@@ -227,7 +227,7 @@ def test_times_of_some_points_only_are_times_of_these(caplog: pytest.LogCaptureF
         read(t=np.where(np.arange(len(TIMES)) % 2, TIMES, 0.0))
 
 
-@pytest.mark.parametrize("name", ["time_offset_ns", "relative_timestamp", "T", "GpsTime", "dt", "a", "delta"])
+@pytest.mark.parametrize("name", ["time_offset_ns", "relative_timestamp", "T", "scalar_GpsTime", "dt", "a", "delta"])
 def test_a_field_of_any_name_that_lasts_a_revolution_is_taken_for_the_times(name: str) -> None:
     ring = np.tile(np.arange(8), len(TIMES) // 8).astype("u2")
     other = {"azimuth": np.degrees(np.arctan2(POINTS[:, 1], POINTS[:, 0])), "ring": ring, "range": POINTS[:, 0] + 50.0}
@@ -236,7 +236,7 @@ def test_a_field_of_any_name_that_lasts_a_revolution_is_taken_for_the_times(name
     assert np.allclose(scan.time_s, TIMES, atol=1e-6)
     assert scan.times is not None
     assert scan.times.fields == (name,)
-    assert scan.times.doubtful == (name not in ("T",))
+    assert scan.times.doubtful == (name not in ("T", "scalar_GpsTime"))
     assert read(others=other).time_s is None  # the azimuth itself is no time
 
 

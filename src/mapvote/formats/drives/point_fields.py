@@ -29,6 +29,7 @@ from mapvote.formats.drives.point_times import (
     no_times,
 )
 from mapvote.formats.maps.cloud import xyz_view
+from mapvote.formats.maps.field_names import known_fields, plain
 
 log = logging.getLogger("mapvote.formats")
 
@@ -37,8 +38,8 @@ MAX_BAD_SHARE = 0.05
 FAR_M = 2000.0
 """No LiDAR of ours measures farther; float64 or integers read as float32 do."""
 _BLOCK = 512
-INTENSITY_FIELDS = ("intensity", "reflectivity", "i")
-RING_FIELDS = ("ring", "channel", "laser_id", "laser_number", "line", "laserid")
+_RINGS = ("ring", "channel", "laserid", "lasernumber", "line")
+"""Names of the number of a beam, plainly spelled."""
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
 _USUAL_RATES_HZ = 8.0, 34.0
@@ -92,8 +93,9 @@ class PointReader:
         """
         points = xyz_view(where, table).astype(np.float32, copy=False)
         names = table.dtype.names or ()
-        intensity = next((name for name in INTENSITY_FIELDS if name in names), None)
-        ring = next((name for name in RING_FIELDS if name in names), None)
+        spelled = {plain(name): name for name in reversed(names)}
+        intensity = known_fields(names).get("intensity", spelled.get("i"))
+        ring = next((spelled[name] for name in _RINGS if name in spelled), None)
         # Points that are measurements.
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
         usable = np.empty(len(points), np.int32)
@@ -142,7 +144,8 @@ class PointReader:
         names = table.dtype.names or ()
         if self.rules.motion_compensated:
             return None, TimesTold("compensated", "stated: points are motion-compensated")
-        columns = {name: table[name][keep] for name in names if name not in "xyz" and table.dtype[name].shape == ()}
+        axes = {name for axis, name in known_fields(names).items() if axis in "xyz"}
+        columns = {name: table[name][keep] for name in names if name not in axes and table.dtype[name].shape == ()}
         try:
             found = find_times(columns, points, stamp_ns, self._rate_hz(sensor), self.rules)
         except MapvoteError as error:

@@ -25,24 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
+from mapvote.formats.maps.field_names import plain
 
-TIME_FIELDS = (
-    "t",
-    "time",
-    "timestamp",
-    "time_stamp",
-    "stamp",
-    "offset_time",
-    "point_time_offset",
-    "time_offset",
-    "gps_time",
-)
-"""Names that drivers give the time of a point: Ouster, Velodyne, Hesai and RoboSense, Autoware, Livox, LAS."""
+TIME_FIELDS = ("t", "time", "timestamp", "stamp", "offsettime", "pointtimeoffset", "timeoffset", "gpstime")
+"""Names that drivers give the time of a point, plainly spelled: Ouster, Velodyne, Hesai and RoboSense, Autoware, Livox,
+LAS."""
 _LIKE_TIME = re.compile(r"time|stamp|(^|_)(t|dt|sec|nsec|usec|nanosec)(_|$)")
 _OTHER_FIELDS = re.compile(
-    r"^(x|y|z|w|i|rgba?|r|g|b|red|green|blue|alpha|nir|ambient|intensity|reflectiv.*|reflectance|remission|ring|channel|"
+    r"^(x|y|z|w|i|rgba?|r|g|b|red|green|blue|.*(red|green|blue)|alpha|nir|ambient|intensity|reflectiv.*|reflectance|remission|ring|channel|"
     r"laser.*|line|row|col|column|range|distance|depth|azimuth|elevation|theta|phi|normal.*|n[xyz]|curvature|label|"
-    r"class.*|instance|object.*|tag|return.*|number_of_returns|noise|confidence|near_ir|user_data|scan_angle.*|"
+    r"class.*|instance|object.*|tag|return.*|number_of_returns|noise|confidence|near_ir|las_flags|user_data|scan_angle.*|"
     r"point_source_id|scanner_channel|key_point|synthetic|withheld|overlap|edge_of_flight_line|scan_direction_flag)$"
 )
 """Names of fields that are no times, lower case."""
@@ -400,7 +392,7 @@ def find_times(
         refused[name] = read
     candidates = []
     for name in whole:
-        if name in refused or _OTHER_FIELDS.match(name.lower()):
+        if name in refused or _OTHER_FIELDS.match(_lower(name)):
             continue
         read = read_times(name, whole[name], points, stamp_ns, rate_hz)
         if isinstance(read, Refusal) or abs(read.turns - 1.0) > JUDGEMENT.off_rate:
@@ -429,10 +421,15 @@ def _stated(
 
 def _named_like_times(columns: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """(fields whose names are known, in the order of ``TIME_FIELDS``; others whose names look like a time)."""
-    lower = {name.lower(): name for name in reversed(list(columns))}
-    known = [lower[name] for name in TIME_FIELDS if name in lower]
-    alike = [name for name in columns if name not in known and _LIKE_TIME.search(name.lower())]
+    spelled = {plain(name): name for name in reversed(list(columns))}
+    known = [spelled[name] for name in TIME_FIELDS if name in spelled]
+    alike = [name for name in columns if name not in known and _LIKE_TIME.search(_lower(name))]
     return known, alike
+
+
+def _lower(name: str) -> str:
+    """A name in small letters, with underscores for blanks, without CloudCompare's prefix."""
+    return name.lower().removeprefix("scalar_").replace(" ", "_")
 
 
 def _joined(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -474,4 +471,4 @@ def no_times(found: FoundTimes, fields: tuple[str, ...]) -> str:
 
 def known_time_field(found: FoundTimes) -> str | None:
     """The first field whose name is known and whose values differ from point to point, but are no times."""
-    return next((name for name, why in found.refused.items() if name.lower() in TIME_FIELDS and why.varies), None)
+    return next((name for name, why in found.refused.items() if plain(name) in TIME_FIELDS and why.varies), None)
