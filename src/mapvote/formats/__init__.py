@@ -19,15 +19,25 @@ from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
 from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
-from mapvote.formats.geo.frame import LOCAL, PROJECTOR, MapFrame, autoware_frame, frame_of, frame_wanted
-from mapvote.formats.geo.units import Convert, settle
+from mapvote.formats.geo.frame import (
+    ENU,
+    LOCAL,
+    PROJECTOR,
+    MapFrame,
+    autoware_frame,
+    frame_of,
+    frame_wanted,
+    read_crs,
+    utm_of,
+)
+from mapvote.formats.geo.units import Convert, settle_out
 from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import KEPT
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.marked_points import DROPPED, MarkedPoints, without_marked
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import GPS_TIMES, Look, in_map_metres, map_of
-from mapvote.formats.registry import DRIVES, MAPS, WRITERS, drive_format
+from mapvote.formats.registry import DRIVES, MAPS, WRITERS, MapWriter, drive_format
 
 __all__ = [
     "DriveWriter",
@@ -154,6 +164,10 @@ def export_map(
     Returns the format's name and the frame of what was written.
     """
     path = Path(path)
+    if path.name.lower().endswith((".copc.laz", ".copc.las")):
+        raise MapvoteError(
+            f"{path}: COPC is not written; name it .laz, and make COPC of that: pdal translate A.laz {path}"
+        )
     writer = WRITERS.get(path.suffix.lower())
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
@@ -165,7 +179,8 @@ def export_map(
             raise MapvoteError(f"{path}: Autoware takes no --crs, but --projector")
     else:
         wanted = frame_wanted(crs, projector)
-    frame, convert = settle(str(path), stated, wanted, corners, sure=True)
+    frame, convert = settle_out(str(path), stated, wanted, corners)
+    _check_degrees(path, frame, convert(corners).astype(np.float64), writer, offset)
     if any(offset):
         x, y, z = (float(a + b) for a, b in zip(frame.offset_m, offset, strict=True))
         frame = MapFrame(frame.crs, (x, y, z), frame.heights)
@@ -173,11 +188,26 @@ def export_map(
     return writer.name, frame
 
 
+def _check_degrees(path: Path, frame: MapFrame, corners: F64, writer: MapWriter, offset: Offset) -> None:
+    """MapvoteError if degrees are wanted in float32, which holds them to some decimetres, or less an offset in metres.
+    ``corners`` (2, 3): what the file would hold."""
+    if frame.is_local or frame.crs.startswith(ENU) or not read_crs(frame.crs).is_geographic:
+        return
+    if writer.single:
+        zone = utm_of(float(corners[0, 0]), float(corners[0, 1]))
+        raise MapvoteError(
+            f"{path}: a {writer.name} holds float32, which rounds degrees to 0.1 m and more; write .las, .laz or .ply, "
+            f"or project: --crs {zone}"
+        )
+    if any(offset):
+        raise MapvoteError(f"{path}: --offset is in metres, and the file would be in degrees; leave it out")
+
+
 def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) -> CloudPieces:
     """A map's points in a frame that Autoware supports: ``projector``'s, else the one that ``folder`` has already."""
     stated, corners, chosen = frame_of(point_map.georeference), _corners(folder, point_map), folder / PROJECTOR
     wanted = projector or (str(chosen) if chosen.is_file() and not stated.is_local else None)
-    frame, convert = settle(str(folder), stated, autoware_frame(stated, corners, wanted), corners, sure=True)
+    frame, convert = settle_out(str(folder), stated, autoware_frame(stated, corners, wanted), corners)
     return _pieces(point_map, frame, convert)
 
 

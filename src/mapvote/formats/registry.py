@@ -40,6 +40,8 @@ class MapWriter:
     """Whole or not at all."""
     classes: bool = False
     """Whether the format has a place for ASPRS classes."""
+    single: bool = False
+    """Whether it holds coordinates in float32."""
 
 
 def _file(*suffixes: str) -> Callable[[Path], bool]:
@@ -83,10 +85,10 @@ MAPS: dict[str, MapFormat] = {
 """Maps that are only points, in the order in which they are tried."""
 
 WRITERS: dict[str, MapWriter] = {
-    ".pcd": MapWriter("PCD file", pcd.write_pcd),
+    ".pcd": MapWriter("PCD file", pcd.write_pcd, single=True),
     ".las": MapWriter("LAS file", las.write_las, classes=True),
     ".laz": MapWriter("LAZ file", las.write_las, classes=True),
     ".ply": MapWriter("PLY file", ply.write_ply),
-    "": MapWriter("Autoware tile folder", autoware.write_autoware),
+    "": MapWriter("Autoware tile folder", autoware.write_autoware, single=True),
 }
 """By the suffix of the path; a folder has none."""

@@ -67,13 +67,19 @@ class MapFrame:
         return {name: text for name, text in texts.items() if text}
 
     def told(self) -> str:
-        """In words: the coordinate system, what is subtracted, what heights count from."""
+        """In words: the coordinate system, its unit if not metres, what is subtracted, what heights count from."""
         if self.is_local:
             name = "local metres (place on Earth unknown)"
         elif self.crs.startswith(ENU):
             name = f"a plane at latitude, longitude, height {self.crs.removeprefix(ENU)}"
         else:
-            name = f"{read_crs(self.crs).name} ({self.crs})" if len(self.crs) < 20 else str(read_crs(self.crs).name)
+            crs = read_crs(self.crs)
+            name = f"{crs.name} ({self.crs})" if len(self.crs) < 20 else str(crs.name)
+            unit = crs.axis_info[0].unit_name if crs.axis_info else "metre"
+            if crs.is_geographic:
+                name += ", x longitude, y latitude, degrees"
+            elif unit != "metre":
+                name += f", {unit}"
         offset = f", minus ({', '.join(f'{v:.3f}' for v in self.offset_m)})" if any(self.offset_m) else ""
         return f"{name}{offset}" + (f"; heights: {self.heights}" if self.heights else "")
 

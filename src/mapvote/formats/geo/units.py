@@ -1,4 +1,5 @@
-"""From the coordinates of a file to map metres: units converted, degrees refused, another frame where one is wanted."""
+"""From the coordinates of a file to map metres and back: units converted, degrees refused on the way in, another frame
+where one is wanted."""
 
 from __future__ import annotations
 
@@ -35,10 +36,13 @@ def settle(
     ``stated``: the file's own frame, in any unit. ``wanted``: the requested frame (``--crs``,
     ``--projector``), None to stay where the file is. ``first``: some points (n, 3) of the file, to name the UTM zone.
     ``sure``: the user stated that the file is in local metres.
-    MapvoteError if the file is in degrees, or geocentric, and no frame is requested.
+    MapvoteError if the file is in degrees, or geocentric, and no frame is requested, or if the requested frame is not
+    in metres.
     """
     if stated.refusal:
         raise MapvoteError(stated.refusal)
+    if wanted is not None and not stated.is_local:
+        wanted = _in_metres(where, wanted)
     if stated.is_local:
         if wanted is None or wanted.is_local:
             if not sure:
@@ -58,7 +62,7 @@ def settle(
         if wanted is None or wanted.is_local:
             raise MapvoteError(_degrees(where, horizontal, first))
         return _from_degrees(where, horizontal, replace(wanted, heights=wanted.heights or heights))
-    to_m, z_to_m = _units(where, crs)
+    to_m, z_to_m = _units_of_file(where, crs)
     metric = replace(stated, crs=_short(stated.crs), heights=heights)
     if (to_m, z_to_m) != (1.0, 1.0):
         in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
@@ -69,6 +73,51 @@ def settle(
     if (scale == 1.0).all():
         return frame, move
     return frame, lambda points: move(points.astype(np.float64) * scale)
+
+
+def settle_out(
+    where: str, stated: MapFrame, wanted: MapFrame | None, points: NDArray[np.floating]
+) -> tuple[MapFrame, Convert]:
+    """(frame of the file, how a map's points get there): as :func:`settle`, the other way.
+
+    x and y are in the unit of the file's coordinate system, degrees too: x east or longitude, y north or latitude. z is
+    in the unit that the system names for heights, else in that of x and y, but never in degrees.
+    MapvoteError if a map whose place is unknown is wanted in degrees, or for a geocentric system.
+    """
+    if wanted is None or wanted.is_local or wanted.crs.startswith(ENU):
+        return settle(where, stated, wanted, points, sure=True)
+    crs = read_crs(wanted.crs)
+    if crs.is_geocentric or (stated.is_local and crs.is_geographic):
+        cause = "geocentric metres have no heights" if crs.is_geocentric else "the map's place on Earth is unknown"
+        raise MapvoteError(f"{where}: {cause}; give --crs a projection in metres or feet, such as EPSG:32654")
+    to_m, z_to_m = _units(crs)
+    if crs.is_geographic:
+        z_to_m = z_to_m if _up(crs) else 1.0
+    if stated.is_local:
+        log.warning("%s: the map names no coordinate system: the requested one is assumed", where)
+        scale = np.array([to_m, to_m, z_to_m])
+        return wanted, lambda points: points.astype(np.float64) / scale
+    frame, move = _moved(stated, wanted)
+    if z_to_m == 1.0:
+        return frame, move
+    return frame, lambda points: move(points) / np.array([1.0, 1.0, z_to_m])
+
+
+def _in_metres(where: str, wanted: MapFrame) -> MapFrame:
+    """A requested frame of a map, its projection in metres; MapvoteError for degrees."""
+    if wanted.is_local or wanted.crs.startswith(ENU):
+        return wanted
+    crs = read_crs(wanted.crs)
+    if crs.is_geographic or crs.is_geocentric:
+        raise MapvoteError(
+            f"{where}: a map needs metres, but {crs.name} is none of a projection; give --crs EPSG:326zz"
+        )
+    if _units(crs) == (1.0, 1.0):
+        return wanted
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
+    log.warning("%s: a map is in metres: %s is taken so", where, horizontal.name)
+    return replace(wanted, crs=_short(in_metres.to_wkt()))
 
 
 def _moved(stated: MapFrame, wanted: MapFrame | None) -> tuple[MapFrame, Convert]:
@@ -124,14 +173,25 @@ def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
         )
 
 
-def _units(where: str, crs: Any) -> tuple[float, float]:
-    """Metres in one unit of x and y, and of z. A file that names no unit for heights has them in that of x and y."""
+def _units(crs: Any) -> tuple[float, float]:
+    """Metres in one unit of x and y, and of z. Heights without a unit have that of x and y."""
     plane = [a for a in crs.axis_info if a.direction.lower() not in ("up", "down")]
-    up = [a for a in crs.axis_info if a.direction.lower() in ("up", "down")]
     to_m = float(plane[0].unit_conversion_factor) if plane else 1.0
+    up = _up(crs)
+    return to_m, float(up[0].unit_conversion_factor) if up else to_m
+
+
+def _up(crs: Any) -> list[Any]:
+    """The axis of heights, if the system names one."""
+    return [a for a in crs.axis_info if a.direction.lower() in ("up", "down")]
+
+
+def _units_of_file(where: str, crs: Any) -> tuple[float, float]:
+    """:func:`_units`, with a message where the unit of heights is assumed. MapvoteError if z counts downwards."""
+    up = _up(crs)
     if up and up[0].direction.lower() == "down":
         raise MapvoteError(f"{where}: z counts downwards ({crs.name}); negate z first")
-    z_to_m = float(up[0].unit_conversion_factor) if up else to_m
+    to_m, z_to_m = _units(crs)
     if not up and to_m != 1.0:
         log.warning("%s: names no unit for heights: taken to be that of x and y", where)
     return to_m, z_to_m

@@ -24,7 +24,7 @@ from mapvote.core.brightness import Brightness, shares
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading, require
-from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
+from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
@@ -86,6 +86,9 @@ def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
 
 
 def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
+    if head.held is not None:
+        _check_held(path, head.promised, head.held)
+        _check_whole(path, head.promised, min(head.held, head.promised))
     frame = _frame(str(path), head)
     others = tuple(name for name in other_fields(head.dimensions) if name not in (*FLAGS, *"XYZ"))
     times = "" if "gps_time" not in head.dimensions else "adjusted standard" if head.adjusted_time else "week"
@@ -93,9 +96,7 @@ def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
     for points, fields in pieces:
         done += len(points)
         yield Cloud(points, others, frame, fields, times)
-    _check_held(path, head.promised, head.held or 0)
-    if done != head.promised:
-        raise MapvoteError(f"{path}: cut off: {done} points, but its header says {head.promised}; copy it again")
+    _check_whole(path, head.promised, done)
     if not done:
         yield Cloud(np.empty((0, 3)), others, frame)
 
@@ -199,6 +200,12 @@ def _check_held(path: Path, promised: int, held: int) -> None:
         )
 
 
+def _check_whole(path: Path, promised: int, held: int) -> None:
+    """MapvoteError if a file holds fewer points than its header counts."""
+    if held != promised:
+        raise MapvoteError(f"{path}: cut off: {held} points, but its header says {promised}; copy it again")
+
+
 def _as_las(name: str, values: NDArray[Any], brightness: Brightness) -> NDArray[Any]:
     """A column as LAS holds it. Whole numbers from 0 to 65,535 stay as they are; other brightness is scaled so that
     full becomes 65,535; 8-bit colours too, for LAS's colours have 16 bits."""
@@ -230,8 +237,8 @@ class LasSteps:
 
     length: float = 1e-4
     """Metres, or feet: exact to 0.05 mm over 400 km."""
-    degree: float = 1e-12
-    """Degrees: float64 as they are computed, to 0.1 micrometres."""
+    degree: float = 1e-13
+    """Degrees, at least; else the finest that 32 bits hold, for a longitude is no short decimal."""
     largest: int = 2**31 - 1
     """Steps from the offset that 32 bits hold."""
 
@@ -240,14 +247,25 @@ STEPS = LasSteps()
 
 
 def steps_and_offsets(corners: F64, *, degrees: bool) -> tuple[F64, F64]:
-    """((3,) steps, (3,) offsets) for coordinates within ``corners`` (2, 3); ``degrees``: of x and y. Powers of ten,
-    the finest wanted that 32 bits hold over the whole extent."""
+    """((3,) steps, (3,) offsets) for coordinates within ``corners`` (2, 3); ``degrees``: of x and y. No coordinate
+    takes more than 32 bits: steps grow with the extent, in two decimal digits."""
+    decimals = [6, 6, 0] if degrees else [0, 0, 0]
+    middle = 0.5 * (corners[0] + corners[1])
+    offsets = np.array([np.round(value, digits) for value, digits in zip(middle, decimals, strict=True)])
+    needed = np.maximum(np.abs(corners - offsets).max(axis=0), 1e-9) / STEPS.largest
+    digit = 10.0 ** (np.floor(np.log10(needed)) - 1)
+    held = (np.floor(needed / digit) + 1.0) * digit
     wanted = np.array([STEPS.degree if degrees else STEPS.length] * 2 + [STEPS.length])
-    half = 0.5 * (corners[1] - corners[0])
-    needed = 10.0 ** np.ceil(np.log10(np.maximum(1.001 * half, 1e-30) / STEPS.largest))
-    offsets = 0.5 * (corners[0] + corners[1])
-    digits = np.where([degrees, degrees, False], 6, 0)
-    return np.maximum(wanted, needed), np.array([np.round(o, d) for o, d in zip(offsets, digits, strict=True)])
+    return np.where(held > wanted, held, wanted), offsets
+
+
+def _wkt(crs: Any) -> str:
+    """A coordinate system in the WKT of LAS 1.4; of one with ellipsoidal heights, which that WKT cannot say, the plane
+    part."""
+    try:
+        return str(crs.to_wkt("WKT1_GDAL"))
+    except pyproj().exceptions.CRSError:
+        return str(crs.to_2d().to_wkt("WKT1_GDAL"))
 
 
 def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
@@ -266,7 +284,7 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
         shift = np.array(clouds.frame.offset_m)
         crs = read_crs(clouds.frame.crs)
         geographic = bool(crs.is_geographic)
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(_wkt(crs)))
         header.global_encoding.wkt = True
     adjusted = clouds.gps_times == "adjusted standard"
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
