@@ -10,13 +10,15 @@ from msgspec.structs import replace
 from scipy.spatial import cKDTree
 
 from command_line import typed
+from faults import sound_street
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
-from mapvote.core.point_map import all_points
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, CellState, MapvoteError
-from mapvote.formats import DriveWriter, read_map, write_pcd
+from mapvote.formats import DriveWriter, read_map, write_map, write_pcd
 from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.las import write_las
 from stores import NewStore
 
 
@@ -43,6 +45,41 @@ def test_import_then_info_then_export_keeps_every_point(tmp_path: Path) -> None:
         typed("export", tmp_path / "m", tmp_path / "c.pcd", "--offset", "1,2")
     typed("export", tmp_path / "m", tmp_path / "c.ply", "--offset", "100,0,0")
     assert all_points(read_map(tmp_path / "c.ply"))[:, 0].max() < 0
+
+
+def test_points_that_a_guess_refuses_are_imported_unchecked_and_then_taken_by_every_verb(tmp_path: Path) -> None:
+    """A street hanging from a ceiling, half of whose points are not finite."""
+    points = sound_street((0, 100), (-25, 25), 50, (8, 22), longest=10, slope=0.01) * [1, -1, -1]
+    write_pcd(tmp_path / "a.pcd", Cloud(points))
+    with pytest.raises(MapvoteError, match=r"upside down.* mapvote import '.*a\.pcd' MAP --unchecked"):
+        typed("import", tmp_path / "a.pcd", tmp_path / "m")
+    with pytest.raises(MapvoteError, match="--unchecked"):
+        typed("export", tmp_path / "a.pcd", tmp_path / "a.ply")
+    assert "upside down" in typed("import", tmp_path / "a.pcd", tmp_path / "m", "--unchecked")
+    assert f"{len(points)} points" in typed("export", tmp_path / "m", tmp_path / "a.ply")
+    write_map(map_from_points(points), tmp_path / "by hand")
+    with pytest.raises(MapvoteError, match="--unchecked"):
+        typed("export", tmp_path / "by hand", tmp_path / "b.ply")
+    typed("import", tmp_path / "by hand", tmp_path / "taken", "--unchecked")
+    typed("export", tmp_path / "taken", tmp_path / "b.ply")
+    points[::2] = np.nan
+    write_pcd(tmp_path / "b.pcd", Cloud(points))
+    with pytest.raises(MapvoteError, match=r"not finite, more than 5%.* --unchecked"):
+        typed("import", tmp_path / "b.pcd", tmp_path / "n")
+    typed("import", tmp_path / "b.pcd", tmp_path / "n", "--unchecked")
+
+
+def test_marks_of_points_are_dropped_as_asked(tmp_path: Path) -> None:
+    flags = np.where(np.arange(4000) < 500, 4, 8).astype(np.uint8)
+    write_las(tmp_path / "a.las", Cloud(cloud(), fields={"las_flags": flags}))
+    told = typed("import", tmp_path / "a.las", tmp_path / "m")
+    assert "3500 points" in told
+    assert "dropped: 500 points that the file marks as withheld" in told
+    assert "kept: 3500 points that the file marks as overlap" in told
+    assert "4000 points" in typed("import", tmp_path / "a.las", tmp_path / "n", "--drop", "none")
+    assert "500 points" in typed("import", tmp_path / "a.las", tmp_path / "o", "--drop", "overlap")
+    with pytest.raises(MapvoteError, match="'walls' is no mark of points"):
+        typed("import", tmp_path / "a.las", tmp_path / "p", "--drop", "walls")
 
 
 def test_info_of_a_drive_and_doctor(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from faults import kinds_of, moved, serious, sound_street, verdict
+from faults import UP, kinds_of, moved, serious, sound_street, verdict
 from hand_made import save_pcd
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
@@ -121,3 +122,31 @@ def test_examine_takes_map_folders_and_ballots(tmp_path: Path, sound: PointMap) 
     assert any("local metres" in f.what for f in found)
     (tmp_path / "b.ballot").write_bytes(b"no ballot")
     assert [f.severity for f in diagnose(tmp_path / "b.ballot").findings] == ["error"]
+
+
+def city(seed: int = 3) -> tuple[F64, NDArray[np.uint8]]:
+    """Houses of 4 by 4 m with flat roofs, 6 m apart, as an aircraft sees them: dense roofs, fronts, little of the
+    ground between; ASPRS classes 2 (ground) and 6 (building)."""
+    rng = np.random.default_rng(seed)
+    corner = 6.0 * np.stack(np.meshgrid(np.arange(14), np.arange(14)), axis=-1).reshape(-1, 2)
+    roofs, fronts, ground = (corner[rng.integers(0, len(corner), n)] for n in (60_000, 180_000, 20_000))
+    along = rng.uniform(0, 4, (len(fronts), 2))
+    side = rng.integers(0, 2, len(fronts))
+    along[np.arange(len(fronts)), side] = 4.0 * rng.integers(0, 2, len(fronts))
+    points = np.concatenate([
+        np.column_stack([roofs + rng.uniform(0, 4, roofs.shape), rng.normal(12, 0.02, len(roofs))]),
+        np.column_stack([fronts + along, rng.uniform(0.3, 12, len(fronts))]),
+        np.column_stack([ground + rng.uniform([4.5, 0], [5.5, 6], ground.shape), rng.normal(0, 0.02, len(ground))]),
+    ])  # fmt: skip
+    return points, np.repeat([6, 6, 2], [len(roofs), len(fronts), len(ground)]).astype(np.uint8)
+
+
+def test_the_classification_says_which_way_is_up() -> None:
+    """Of a city of flat roofs the sheet of points is above; the file says where the ground is."""
+    points, classes = city()
+    guessed = serious(check_cloud(in_memory(points)))
+    assert any(re.search(UP, what) for what in guessed), "else the case is none"
+    fields = {"classification": classes}
+    assert not [what for what in serious(examine_points("city", Cloud(points, fields=fields))[0]) if " up" in what]
+    turned = examine_points("city", Cloud(points * [1, -1, -1], fields=fields))[0]
+    assert any(re.search(UP, what) for what in serious(turned))

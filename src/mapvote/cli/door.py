@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mapvote.core.types import Drive
     from mapvote.doctor import Finding
     from mapvote.doctor.scans import Looking
-    from mapvote.formats.maps.tiling import Look
+    from mapvote.formats.maps.tiling import Look, Pieces
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -201,12 +201,21 @@ def sound_map(path: Path | str) -> PointMap:
     return read_map(path, look_at_points(str(path)))
 
 
-def look_at_points(path: str) -> Look:
-    """The check of a map's points before the ground is computed: MapvoteError if they cannot be used."""
+def look_at_points(path: str, *, unchecked: bool = False) -> Look:
+    """The check of a map's points before the ground is computed: MapvoteError, with the way past, if they cannot be
+    used; ``unchecked``: what is wrong is only told."""
     from mapvote.doctor import usable
     from mapvote.doctor.maps import check_cloud
 
-    return lambda pieces: _warn(path, usable(path, check_cloud(pieces)))
+    def look(pieces: Pieces, ground: Pieces) -> None:
+        found = check_cloud(pieces, ground)
+        try:
+            _warn(path, found if unchecked else usable(path, found))
+        except MapvoteError as error:
+            way = f"if they are right as they are: mapvote import '{path}' MAP --unchecked"
+            raise MapvoteError(f"{error}; {way}") from None
+
+    return look
 
 
 def _warn(path: str, found: list[Finding]) -> None:

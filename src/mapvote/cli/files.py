@@ -171,6 +171,16 @@ def import_map(
         ),
     ] = None,
     clean: Annotated[bool, typer.Option("--clean", help="drop points above the ground that touch no other")] = False,
+    drop: Annotated[
+        str,
+        typer.Option(
+            metavar="MARKS",
+            help="points to leave out: withheld, noise, synthetic, key_point, overlap; or none",
+        ),
+    ] = "withheld,noise",
+    unchecked: Annotated[
+        bool, typer.Option("--unchecked", help="import points that a check refuses; the map says so to other verbs")
+    ] = False,
 ) -> None:
     """Make a mapvote map of a point cloud: in metres, cut into tiles, ground measured. Reports what it drops.
 
@@ -179,10 +189,13 @@ def import_map(
     from mapvote.formats import import_cloud, write_map
     from mapvote.formats.atomic import folder_beside
     from mapvote.formats.geo.frame import frame_wanted
+    from mapvote.formats.maps.marked_points import marks_in
 
     with waiting(f"reading {source}"):
         wanted = frame_wanted(crs, projector)
-        point_map, told = import_cloud(source, wanted, from_crs, folder_beside(out), look_at_points(str(source)))
+        look = look_at_points(str(source), unchecked=unchecked)
+        beside = folder_beside(out)
+        point_map, told = import_cloud(source, wanted, from_crs, beside, look, marks_in(drop), unchecked=unchecked)
     if clean:
         from mapvote.survey.clean_map import without_lone_points
 

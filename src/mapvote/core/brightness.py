@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, U8
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class BrightnessRule:
     """Numbers of the rule."""

@@ -6,7 +6,7 @@ there twice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,30 +21,23 @@ from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor import Finding, any_error, in_order
+from mapvote.doctor.which_way_up import which_way_up
 from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.marked_points import without_marked
-from mapvote.formats.maps.tiling import in_map_metres, map_of
+from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of
 from mapvote.survey.clean_map import lone_points
 
-Pieces = Callable[[], Iterator[NDArray[np.floating]]]
-"""The points (n, 3) of a map from the start, piece by piece: as often as it is called."""
 _SOME, _NEAR = 400_000, 100_000
 _FEW = 1000
 """Fewer points show nothing."""
-_COLUMN_M = 2.0
-_SHEET_M = 0.2
 _STRAY_M = 300.0
 """Farther off they make the map larger than it is; nearer ones are reflections."""
 _HIGHEST_M = 3000.0
 """No map of streets is higher."""
-_SLENDER = 2.0
-"""Times as high as it is wide a street may be."""
-_LEAST_SHEET = 0.09
-"""Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less, up is unknown."""
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
 _ALOFT_M = 100.0
@@ -87,15 +80,25 @@ def tile_by_tile(point_map: PointMap) -> Pieces:
     return lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles))
 
 
-def check_cloud(pieces: Pieces) -> list[Finding]:
-    """Of points in map metres, as somebody's file holds them."""
+def ground_of(point_map: PointMap) -> Pieces:
+    """Those points of a map that its file classifies as ground."""
+    tiles = point_map.tiles
+    return lambda: (grounded(tiles[index].fields, tiles[index].points_map) for index in sorted(tiles))
+
+
+def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
+    """Of points in map metres, as somebody's file holds them. ``ground``: those of them that it classifies as such."""
     n = sum(map(len, pieces()))
     if n < _FEW:
         return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
     some = _every(pieces, max(1, n // _SOME))
     low, high = np.quantile(some, (0.001, 0.999), axis=0)
     apart_m = spacing(pieces, some)
-    found = [*_strays(pieces, n, low, high), *(list(_units(high - low, apart_m)) or _axes(some, high - low))]
+    units = list(_units(high - low, apart_m))
+    found = [*_strays(pieces, n, low, high), *units]
+    if not units:
+        classified = np.empty((0, 3)) if ground is None else _every(ground, max(1, n // _SOME))
+        found += which_way_up(some, high - low, classified)
     twice = float((apart_m < 1e-6).mean())
     if twice >= 0.05:
         found.append(
@@ -181,47 +184,6 @@ def _units(wide: F64, apart: F64) -> Iterator[Finding]:
         yield Finding("warning", what, "a map needs a point every 0.3 m or so")
 
 
-def _axes(some: F64, wide: F64) -> Iterator[Finding]:
-    """Which way is up: a street is a sheet of ground with things on it, none below, and not higher than it is wide:
-    rows of house fronts behind each other are no ground. ``wide`` (3,): the extent of the points."""
-    share = {sign + axis: 0.0 for axis in "xyz" for sign in "+-"}
-    for axis, name in enumerate("xyz"):
-        if wide[axis] <= _SLENDER * wide[2]:
-            share["+" + name], share["-" + name] = _sheet_shares(some, axis)
-    best = max(share, key=lambda name: share[name])
-    opposite = ("-" if best[0] == "+" else "+") + best[1]
-    # Between two walls, as much lies at one end of an axis as at the other: that is no ground.
-    if best == "+z" or share[best] < max(_LEAST_SHEET, 1.3 * share["+z"], 1.3 * share[opposite]):
-        return
-    if best == "-z":
-        mend = "negate y and z of every point (only z, if right and left are right already)"
-        yield Finding("error", "the map is upside down: things hang below the ground", mend)
-    else:
-        mend = "turn the points so that z is up (x east, y north)"
-        yield Finding("error", f"the map's axis {best} points up, not z", mend)
-
-
-def _sheet_shares(points: F64, axis: int) -> tuple[float, float]:
-    """Share of the points that lie within 0.2 m of the lowest of their column of 2 m along ``axis``; and of the highest
-    one, the lowest along its opposite."""
-    others = [a for a in range(3) if a != axis]
-    cells = np.floor((points[:, others] - points[:, others].min(axis=0)) / _COLUMN_M).astype(np.int64)
-    key = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    order = np.argsort(points[:, axis])
-    key = key[order]  # short numbers are sorted without comparing them
-    columns = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
-    key, height = key[columns], points[order[columns], axis]
-    starts = np.flatnonzero(np.diff(key, prepend=-1))
-    counts = np.diff(np.append(starts, len(key)))
-    ends = starts + counts - 1
-    tall = np.repeat(height[ends] - height[starts] > 1.5, counts)
-
-    def share(sheet: F64) -> float:
-        return float(((np.abs(height - np.repeat(sheet, counts)) < _SHEET_M) & tall).mean())
-
-    return share(height[starts + counts // 20]), share(height[ends - counts // 20])
-
-
 def _rounded(some: F64) -> Iterator[Finding]:
     some = some[:: max(1, len(some) // 20_000)]
     for axis, name in enumerate("xyz"):
@@ -242,7 +204,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
-    return in_order([*check_cloud(tile_by_tile(point_map)), *check_map(point_map)]), point_map
+    return in_order([*check_cloud(tile_by_tile(point_map), ground_of(point_map)), *check_map(point_map)]), point_map
 
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
@@ -258,7 +220,7 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
         found.append(Finding("note", f"{what}: import leaves them out"))
     fields = {name: column[finite] for name, column in cloud.fields.items()}
     (cloud,) = in_map_metres(where, iter([replace(cloud, points=cloud.points[finite], fields=fields)]))
-    found += check_cloud(in_memory(cloud.points))
+    found += check_cloud(in_memory(cloud.points), in_memory(grounded(cloud.fields, cloud.points)))
     if any_error(found):
         return in_order(found), None
     try:

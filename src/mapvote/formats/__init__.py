@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
+from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.geo.frame import (
@@ -36,7 +37,7 @@ from mapvote.formats.maps.field_names import KEPT
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.marked_points import DROPPED, MarkedPoints, without_marked
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.tiling import GPS_TIMES, Look, in_map_metres, map_of
+from mapvote.formats.maps.tiling import GPS_TIMES, UNCHECKED, Look, grounded, in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS, MapWriter, drive_format
 
 __all__ = [
@@ -89,8 +90,12 @@ def read_map(path: Path | str, look: Look | None = None) -> PointMap:
     path = Path(path)
     if is_map_folder(path):
         point_map = read_map_folder(path)
-        if look is not None:
-            look(lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles)))
+        if look is not None and UNCHECKED not in point_map.georeference:
+            tiles = sorted(point_map.tiles)
+            look(
+                lambda: (point_map.tiles[index].points_map for index in tiles),
+                lambda: (grounded(point_map.tiles[index].fields, point_map.tiles[index].points_map) for index in tiles),
+            )
         return point_map
     sound = without_marked(path, stream_cloud(path))
     return map_of(str(path), in_map_metres(str(path), sound), look=look)
@@ -122,13 +127,22 @@ def import_cloud(
     folder: Path | None = None,
     look: Look | None = None,
     drop: Collection[str] = DROPPED,
+    *,
+    unchecked: bool = False,
 ) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
     ``wanted``: the frame to project to. ``from_crs``: the file's coordinate system, where the file states none or a
     wrong one. ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of
-    them. ``drop``: of ``MARKS`` those whose points are left out.
+    them. ``drop``: of ``MARKS`` those whose points are left out. ``unchecked``: the points are right whatever they look
+    like; the map says so to every verb that checks maps.
     """
+    if is_map_folder(path):
+        if wanted is not None or from_crs is not None or not unchecked:
+            raise MapvoteError(f"{path}: is a mapvote map already; mapvote export writes it in another system")
+        point_map = read_map_folder(path)
+        about = {**point_map.georeference, UNCHECKED: "import"}
+        return replace(point_map, georeference=about), ["its points are not checked any more"]
     pieces = stream_cloud(path)
     if from_crs is not None:
         said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
@@ -142,7 +156,9 @@ def import_cloud(
             dropped.update(dict.fromkeys(piece.dropped))
             yield piece
 
-    point_map = map_of(str(path), kept(), folder, look)
+    point_map = map_of(str(path), kept(), folder, look, 1.0 if unchecked else MAX_BAD_SHARE)
+    if unchecked:
+        point_map = replace(point_map, georeference={**point_map.georeference, UNCHECKED: "import"})
     told = [f"coordinates: {frame_of(point_map.georeference).told()}", *sieve.told()]
     if dropped:
         told.append(f"dropped fields: {', '.join(dropped)}")

@@ -62,7 +62,7 @@ def test_pieces_make_the_same_bytes_as_the_whole(
 
 
 def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def look(pieces: Any) -> None:
+    def look(pieces: Any, ground: Any) -> None:
         seen.extend(pieces())
         raise MapvoteError("these are millimetres")
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import Brightness, shares
+from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading, require
@@ -231,6 +232,7 @@ def _tell_of_brightness(path: Path, clouds: CloudPieces) -> None:
             log.warning("%s: %s from 0 to %g is written as 0 to 65535", path, name, values.full)
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class LasSteps:
     """Resolution of coordinates in LAS files, which are whole multiples of a step from the file's offset."""

@@ -90,8 +90,12 @@ _XYZ = "xyz"
 GPS_TIMES = "gps_times"
 """What a map says of its points' times among its georeference, as ``Cloud.gps_times``."""
 
-Look = Callable[[Callable[[], Iterator[NDArray[np.floating]]]], None]
-"""Given the points (n, 3) of a map, metres, piece by piece, repeatable; raises MapvoteError to stop."""
+Pieces = Callable[[], Iterator[NDArray[np.floating]]]
+"""Points (n, 3) of a map, metres, from the start, piece by piece: as often as it is called."""
+Look = Callable[[Pieces, Pieces], None]
+"""Given all points of a map, and those that the file classifies as ground; raises MapvoteError to stop."""
+UNCHECKED = "unchecked"
+"""What a map says among its georeference if its points were taken although a check refused them."""
 
 
 def in_map_metres(
@@ -110,20 +114,35 @@ def in_map_metres(
         yield replace(piece, points=convert(piece.points), frame=frame)
 
 
-def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look: Look | None = None) -> PointMap:
+def grounded(columns: Mapping[str, NDArray[Any]], points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Those of a block's ``points`` (n, 3) that its file classifies as ground; none if it has no classes."""
+    classes = columns.get("classification")
+    return points[:0] if classes is None else points[classes == GROUND]
+
+
+def map_of(
+    where: str,
+    pieces: Iterable[Cloud],
+    folder: Path | None = None,
+    look: Look | None = None,
+    most_bad: float = MAX_BAD_SHARE,
+) -> PointMap:
     """The map of a cloud in pieces: tiles cut, ground computed, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
 
     ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
     ``look`` gets the points before tiles are cut and the ground is computed.
-    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
+    MapvoteError if the cloud is empty or more than ``most_bad`` of it is not finite.
     """
-    taken = _Taken(where, Spill(folder))
+    taken = _Taken(where, Spill(folder), most_bad)
     for piece in pieces:
         taken.take(piece)
     lattice = taken.lattice()
     if look is not None:
-        look(lambda: (block[_XYZ] for block in taken.blocks()))
+        look(
+            lambda: (block[_XYZ] for block in taken.blocks()),
+            lambda: (grounded(block, block[_XYZ]) for block in taken.blocks()),
+        )
     parts = _Parts(lattice, Spill(folder))
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
     done = 0
@@ -145,6 +164,7 @@ class _Taken:
 
     where: str
     spill: Spill
+    most_bad: float = MAX_BAD_SHARE
     frame: MapFrame = field(default_factory=MapFrame)
     total: int = 0
     bad: int = 0
@@ -182,10 +202,10 @@ class _Taken:
         """Where the map's cells lie. MapvoteError if no map can be made of what was taken."""
         if not self.total:
             raise MapvoteError(f"{self.where}: holds no points; a map needs some")
-        if self.bad > MAX_BAD_SHARE * self.total:
+        if self.bad == self.total or self.bad > self.most_bad * self.total:
             raise MapvoteError(
-                f"{self.where}: {self.bad} of {self.total} points are not finite, more than {MAX_BAD_SHARE:.0%}; "
-                "export the file again"
+                f"{self.where}: {self.bad} of {self.total} points are not finite, more than {self.most_bad:.0%}; "
+                f"export the file again, or leave them out: mapvote import '{self.where}' MAP --unchecked"
             )
         if self.bad:
             log.warning("%s: dropped %d of %d points that are not finite", self.where, self.bad, self.total)
