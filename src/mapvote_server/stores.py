@@ -21,7 +21,7 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.doctor import Finding, in_order
-from mapvote.doctor.maps import check_cloud, check_map, ground_of, tile_by_tile
+from mapvote.doctor.maps import check_cloud, check_map, classified_ground, tile_by_tile
 from mapvote_server.api.app import URL, in_process
 from mapvote_server.gate import gate_by
 from mapvote_server.questions.history import overview
@@ -143,6 +143,6 @@ def check_store(store: Store) -> list[Finding]:
         found.append(Finding("warning", what, "mapvote keys STORE issue NAME --role operator"))
     try:
         newest = store.point_map()
-        return in_order([*found, *check_cloud(tile_by_tile(newest), ground_of(newest)), *check_map(newest)])
+        return in_order([*found, *check_cloud(tile_by_tile(newest), classified_ground(newest)), *check_map(newest)])
     except MapvoteError as error:
         return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])

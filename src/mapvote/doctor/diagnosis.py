@@ -22,7 +22,7 @@ from mapvote.doctor.bags import check_bag
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
-from mapvote.doctor.maps import check_cloud, check_map, examine_map, ground_of, tile_by_tile
+from mapvote.doctor.maps import check_cloud, check_map, classified_ground, examine_map, tile_by_tile
 from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
 from mapvote.formats import is_cloud, open_drive_on
@@ -118,7 +118,7 @@ def _with_map(
     found: list[Finding], drive: Drive | None, T: F64 | None, point_map: PointMap, progress: Progress | None
 ) -> tuple[list[Finding], F64 | None]:
     """(also what is wrong with the map, and with the drive on it; the poses (n, 4, 4) as they lie on the map)."""
-    of_points = [f for f in check_cloud(tile_by_tile(point_map), ground_of(point_map)) if f.severity != "note"]
+    of_points = [f for f in check_cloud(tile_by_tile(point_map), classified_ground(point_map)) if f.severity != "note"]
     of_map = of_points + [f for f in check_map(point_map) if f.severity != "note"]
     named = [replace(f, what=f"the map: {f.what}") for f in of_map]
     if drive is None or T is None or any_error(found):

@@ -80,7 +80,7 @@ def tile_by_tile(point_map: PointMap) -> Pieces:
     return lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles))
 
 
-def ground_of(point_map: PointMap) -> Pieces:
+def classified_ground(point_map: PointMap) -> Pieces:
     """Those points of a map that its file classifies as ground."""
     tiles = point_map.tiles
     return lambda: (grounded(tiles[index].fields, tiles[index].points_map) for index in sorted(tiles))
@@ -204,7 +204,9 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
-    return in_order([*check_cloud(tile_by_tile(point_map), ground_of(point_map)), *check_map(point_map)]), point_map
+    return in_order(
+        [*check_cloud(tile_by_tile(point_map), classified_ground(point_map)), *check_map(point_map)]
+    ), point_map
 
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
