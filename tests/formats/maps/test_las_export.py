@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
+from mapvote.core.point_map import PointMap, all_fields, all_points, lattice_of, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, import_cloud, read_map, stream_cloud, write_map
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud, joined, lattice_of
+from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.las import steps_and_offsets, write_las
 from mapvote.formats.maps.marked_points import marks_in
 from mapvote.formats.maps.pcd import write_pcd

@@ -88,7 +88,7 @@ def bag_files(path: Path) -> BagFiles:
 def mend_of(path: Path) -> str:
     """The command that repairs the files at ``path``, of whatever storage."""
     files = [path] if path.is_file() else _beside(path)
-    compressed = [file for file in path.glob("*") if file.suffix in _COMPRESSED] if path.is_dir() else []
+    compressed = [file for file in path.glob("*") if _suffix(file) in _COMPRESSED] if path.is_dir() else []
     if compressed and not files:
         return f"zstd -d {compressed[0]}"
     if not files:

@@ -50,6 +50,7 @@ from mapvote.formats.drives.trajectory import (
 )
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, utm_of
+from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.pcd import read_pcd_table
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
@@ -69,7 +70,7 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
     KITTI-360 its poses.
     """
     files = scan_files(path / "velodyne_points" / "data", ".bin")
-    table = path / "velodyne_points" / "timestamps.txt"
+    table = entry(path, "velodyne_points/timestamps.txt")
     if not table.is_file():
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
     stamps_ns: I64 = of_scans(read_times_ns(table), files, table)
@@ -88,7 +89,7 @@ def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
 
 def _oxts_prior(path: Path, files: list[Path], stamps_ns: I64, options: DriveOptions) -> Trajectory | None:
     folder = path / "oxts" / "data"
-    calib = next((f for d in (path, path.parent) if (f := d / "calib_imu_to_velo.txt").is_file()), None)
+    calib = next((f for d in (path, path.parent) if (f := entry(d, "calib_imu_to_velo.txt")).is_file()), None)
     if calib is None or not folder.is_dir():
         message = f"{path}: no prior: {'oxts/data' if calib else 'calib_imu_to_velo.txt'} is missing"
         if options.prior == "oxts":
@@ -113,8 +114,8 @@ def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajector
     rows = read_numbers(file, 13)
     T_world_imu = rigid_motions(rows[:, 1:], str(file))
     folder = file.parents[2] / "calibration"  # from the IMU to the LiDAR through camera 0
-    calib = read_calib(folder / "calib_cam_to_pose.txt")
-    velo = read_numbers(folder / "calib_cam_to_velo.txt", 12).ravel()
+    calib = read_calib(entry(folder, "calib_cam_to_pose.txt"))
+    velo = read_numbers(entry(folder, "calib_cam_to_velo.txt"), 12).ravel()
     if "image_00" not in calib or calib["image_00"].size != 12 or velo.size != 12:
         raise MapvoteError(f"{folder}: calib_cam_to_pose.txt (image_00) and calib_cam_to_velo.txt need 12 numbers each")
     T_imu_camera, T_lidar_camera = rigid_motions(np.stack([calib["image_00"], velo]), str(folder))
@@ -128,7 +129,7 @@ def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajector
 
 
 def is_nuscenes(path: Path) -> bool:
-    return any((path / folder).is_dir() for folder in _LIDAR_TOP) or (path.is_dir() and any(path.glob("*.pcd.bin")))
+    return any((path / folder).is_dir() for folder in _LIDAR_TOP) or bool(files_like(path, "*.pcd.bin"))
 
 
 def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
@@ -142,8 +143,8 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
         return table
 
     if tables is None:
-        folders = [path / folder for folder in _LIDAR_TOP] if not any(path.glob("*.pcd.bin")) else [path]
-        files = sorted((f for folder in folders for f in folder.glob("*.pcd.bin")), key=stamp_in_name_ns)
+        folders = [path / folder for folder in _LIDAR_TOP] if not files_like(path, "*.pcd.bin") else [path]
+        files = sorted((f for folder in folders for f in files_like(folder, "*.pcd.bin")), key=stamp_in_name_ns)
         if not files:
             raise MapvoteError(f"{path}: no *.pcd.bin scans in {', '.join(_LIDAR_TOP)}")
         log.warning("%s: no tables v1.0-*, so no poses: only the scans are read", path)
@@ -209,13 +210,13 @@ class Dataset:
     """A folder that distinguishes it from others."""
 
     def recognised(self, path: Path) -> bool:
-        return (path / self.beside).is_dir() and any(any(path.glob(pattern)) for pattern in self.scans)
+        return (path / self.beside).is_dir() and any(files_like(path, pattern) for pattern in self.scans)
 
     def open(self, path: Path, options: DriveOptions) -> Drive:
         """The drive in ``path``. MapvoteError says what is missing or does not fit."""
-        files = sorted((file for pattern in self.scans for file in path.glob(pattern)), key=self.stamp_ns)
+        files = sorted((file for pattern in self.scans for file in files_like(path, pattern)), key=self.stamp_ns)
         stamps_ns = np.array([self.stamp_ns(file) for file in files], dtype=np.int64)
-        table = path / self.poses
+        table = entry(path, self.poses)
 
         def prior() -> Trajectory | None:
             if table.is_file():
@@ -279,7 +280,7 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
     name = options.topic or there[0]
     if name not in there:
         raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
-    mount, T_base_lidar = path / "extrinsics" / f"{name}.txt", None
+    mount, T_base_lidar = entry(path, f"extrinsics/{name}.txt"), None
     if mount.is_file():
         T_base_lidar = _OXFORD_AXES @ motions_of_rpy(read_numbers(mount, 6))[0] @ _OXFORD_AXES
     elif options.mount is None and options.T_base_lidar is None:

@@ -22,6 +22,7 @@ from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
+from mapvote.formats.listing import entry
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -96,7 +97,7 @@ def beside(drive: Path) -> Path:
 def source_of_times(drive: Path) -> str:
     """Where the times of a drive's scans stand, as advice names it."""
     for name in ("times.txt", "velodyne_points/timestamps.txt"):
-        if (drive / name).is_file():
+        if entry(drive, name).is_file():
             return name
     in_messages = not drive.is_dir() or is_bag(drive) or is_bag_without_metadata(drive)
     return "the stamps of its messages" if in_messages else "the names of its scans"
@@ -105,7 +106,7 @@ def source_of_times(drive: Path) -> str:
 def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
     """drive.toml in ``folder``, or beside a drive that is one file, and over it what is ``said``. MapvoteError names an
     unknown key or a wrong value."""
-    file = beside(folder) / "drive.toml"
+    file = entry(beside(folder), "drive.toml")
     try:
         table = tomllib.loads(read_text(file)) if file.is_file() else {}
     except tomllib.TOMLDecodeError as error:

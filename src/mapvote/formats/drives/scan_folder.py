@@ -31,6 +31,7 @@ from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans, prior_of
 from mapvote.formats.extras import read_text
+from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import table_of, xyz
 from mapvote.formats.maps.field_names import known_fields
@@ -44,7 +45,7 @@ _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
     """The files ``folder``/*``suffix`` in the natural order of their names; MapvoteError if none."""
-    files = [f for f in folder.glob(f"*{suffix}") if not f.name.startswith(".")]
+    files = files_like(folder, f"*{suffix}")
     if not files:
         raise MapvoteError(f"{folder}: no scans (*{suffix}) here; a drive needs at least one")
     return in_natural_order(files)
@@ -76,7 +77,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
 
     MapvoteError if there is none of them.
     """
-    table = folder / "times.txt"
+    table = entry(folder, "times.txt")
     if table.is_file():
         return options.start_ns + of_scans(read_times_ns(table), files, table)
     stamps_ns = None if options.rate_hz is not None else stamps_of_names_ns(files)
@@ -208,8 +209,9 @@ def cloud_scans(path: Path) -> tuple[Path, str] | None:
     """(folder, suffix) of two or more scans of one kind; a single file is a map, not a drive."""
     for name in _FOLDERS:
         for suffix in _SUFFIXES:
-            if path.is_dir() and len([*(path / name).glob(f"*{suffix}")][:2]) == 2:
-                return path / name, suffix
+            files = files_like(path / name, f"*{suffix}")
+            if len(files) >= 2:
+                return files[0].parent, suffix
     return None
 
 
@@ -260,7 +262,7 @@ def pcd_scans(path: Path) -> Path | None:
     """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive, but a map."""
     if not path.is_dir() or is_autoware(path) or is_pcd_tiles(path):
         return None
-    return next((folder for folder in (path / "pcd", path) if any(folder.glob("*.pcd"))), None)
+    return next((folder for folder in (path / "pcd", path) if files_like(folder, "*.pcd")), None)
 
 
 def open_pcd_scans(path: Path, options: DriveOptions) -> Drive:

@@ -21,6 +21,7 @@ from mapvote.formats.drives.options import DriveOptions, beside, map_frame, moun
 from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
+from mapvote.formats.listing import entry
 
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
@@ -139,9 +140,9 @@ def read_T_map_lidar(file: Path, folder: Path) -> F64:
     they are a MapvoteError.
     """
     poses = read_poses(file)
-    calib = folder / "calib.txt"
+    calib = entry(folder, "calib.txt")
     axis = _travels_along(poses)
-    if axis == "+z" or (calib.is_file() and axis == "" and file.name != "prior.txt"):
+    if axis == "+z" or (calib.is_file() and axis == "" and file.name.lower() != "prior.txt"):
         if not calib.is_file():
             raise MapvoteError(
                 f"{file}: these are camera poses (the vehicle moves along z, not x); put KITTI's calib.txt into "
@@ -361,7 +362,7 @@ def prior_of(
     if said is not None and said.lower() == "none":
         return None, MapFrame()
     home = beside(path)
-    places = (home / "prior.txt",) if said is None else () if said == own_name else (Path(said), home / said)
+    places = (entry(home, "prior.txt"),) if said is None else () if said == own_name else (Path(said), home / said)
     file = next((place for place in places if place.is_file()), None)
     if file is None and said not in (None, own_name):
         raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")

@@ -25,6 +25,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import folder_beside, whole_file, whole_folder, write_whole
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
+from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
 from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
@@ -69,7 +70,7 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     frame = _frame(path)
     _warn_of_unlisted(path, set(corners))
     for name, corner in corners.items():
-        tile = next((f for f in (path / name, path / TILES / name) if f.is_file()), None)
+        tile = next((f for f in (entry(path, name), entry(path / TILES, name)) if f.is_file()), None)
         if tile is None:
             raise MapvoteError(f"{path / name}: missing, but {METADATA} lists it; copy the map again")
         cloud = joined(stream_pcd(tile))
@@ -84,8 +85,9 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
 
 def _warn_of_unlisted(path: Path, listed: set[str]) -> None:
     kept = (path / HISTORY).is_file()
-    there = {file.name for folder in (path, path / TILES) for file in folder.glob("*.pcd") if file.is_file()}
-    unlisted = sorted(name for name in there - listed if not (kept and FOLLOWED.fullmatch(name)))
+    there = {file.name for folder in (path, path / TILES) for file in files_like(folder, "*.pcd")}
+    lower = {name.lower() for name in listed}
+    unlisted = sorted(name for name in there if name.lower() not in lower and not (kept and FOLLOWED.fullmatch(name)))
     if unlisted:
         what = "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out"
         log.warning(what, path, METADATA, len(unlisted), unlisted[0])

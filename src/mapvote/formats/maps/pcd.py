@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import reading
+from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, log, table_of, warn_of_float32
 from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
 
@@ -43,13 +44,13 @@ def is_pcd_tiles(path: Path) -> bool:
     X_Y.pcd are tiles by their names; with coordinates of six or seven digits, or with a word before them, they are if
     their points lie side by side.
     """
-    names = [file.stem for file in path.glob("*.pcd")] if path.is_dir() else []
-    recorded = any((path / name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
+    names = [file.stem for file in files_like(path, "*.pcd")]
+    recorded = any(entry(path, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
     if not names or recorded:
         return False
     if all(_GRID_TILE.fullmatch(name) for name in names):
         return True
-    return all(_PLACE_TILE.fullmatch(name) for name in names) and _lie_side_by_side(sorted(path.glob("*.pcd")))
+    return all(_PLACE_TILE.fullmatch(name) for name in names) and _lie_side_by_side(files_like(path, "*.pcd"))
 
 
 def _lie_side_by_side(files: list[Path]) -> bool:
@@ -74,7 +75,7 @@ def _lie_side_by_side(files: list[Path]) -> bool:
 
 def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
     """The points of all tiles, one file after the other: points are in map metres, names say nothing about places."""
-    for file in sorted(path.glob("*.pcd")):
+    for file in files_like(path, "*.pcd"):
         yield from stream_pcd(file)
 
 

@@ -1,0 +1,39 @@
+"""Files in a folder, found by names in whatever case: ``10_0.PCD`` lies beside ``0_0.pcd``, and ``CALIB.TXT`` is
+``calib.txt``."""
+
+from __future__ import annotations
+
+import os
+import re
+from fnmatch import translate
+from pathlib import Path
+
+
+def entry(folder: Path, name: str) -> Path:
+    """What lies at ``folder``/``name`` ("times.txt", "gps/ins.csv"), the exact name before one in another case; that
+    path itself if nothing does."""
+    place = folder / name
+    if place.exists():
+        return place
+    for part in name.split("/"):
+        try:
+            alike = sorted(found for found in os.listdir(folder) if found.lower() == part.lower())
+        except OSError:
+            return place
+        if not alike:
+            return place
+        folder = folder / alike[0]
+    return folder
+
+
+def files_like(folder: Path, pattern: str) -> list[Path]:
+    """The files that match ``pattern`` ("*.pcd", "lidar/*.bin") below ``folder``, by name; hidden files are none."""
+    room, _, last = pattern.rpartition("/")
+    place = entry(folder, room) if room else folder
+    matches = re.compile(translate(last), re.IGNORECASE).match
+    try:
+        with os.scandir(place) as entries:
+            names = [e.name for e in entries if matches(e.name) and not e.name.startswith(".") and e.is_file()]
+    except OSError:
+        return []
+    return [place / name for name in sorted(names)]
