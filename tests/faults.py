@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -144,6 +146,52 @@ def lines(name: str, change: Callable[[list[str]], list[str]]) -> Files:
 def cut_in_a_point(folder: Path) -> None:
     files = sorted((folder / "velodyne").iterdir())
     files[len(files) // 2].write_bytes(files[len(files) // 2].read_bytes()[:-7])
+
+
+def timed(name: str, of: Callable[[F64, float], Any], *, bent: bool = False, **toml: Any) -> Files:
+    """The scans as npy files with a field more: ``of`` the times of points after the stamp, as a sensor has them that
+    spins clockwise ten times a second, and the stamp, seconds. Nothing but ``toml`` is stated of them. ``bent``: the
+    points lie as the sensor saw them at those times."""
+
+    def edit(folder: Path) -> None:
+        stamps_s = np.loadtxt(folder / "times.txt")
+        T = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+        T[:, :3] = np.loadtxt(folder / "prior.txt").reshape(-1, 3, 4)
+        step = inverse(T[0]) @ T[1]
+        way_mps = step[:3, 3] / (stamps_s[1] - stamps_s[0])
+        turn_radps = np.arctan2(step[1, 0], step[0, 0]) / (stamps_s[1] - stamps_s[0])
+        (folder / "scans").mkdir()
+        for file, stamp_s in zip(sorted((folder / "velodyne").iterdir()), stamps_s.tolist(), strict=True):
+            scan = np.fromfile(file, dtype="<f4").reshape(-1, 4)
+            time_s = -np.arctan2(scan[:, 1], scan[:, 0]).astype(np.float64) / (20.0 * np.pi)
+            values = of(time_s.copy(), stamp_s)
+            if bent:
+                x, y, z = (scan[:, :3] - time_s[:, None] * way_mps).T
+                c, s = np.cos(turn_radps * time_s), np.sin(turn_radps * time_s)
+                scan[:, :3] = np.column_stack([c * x + s * y, c * y - s * x, z])
+            kinds = [*((column, "<f4") for column in ("x", "y", "z", "intensity")), (name, values.dtype)]
+            table = np.zeros(len(scan), dtype=kinds)
+            for k, column in enumerate(("x", "y", "z", "intensity")):
+                table[column] = scan[:, k]
+            table[name] = values
+            np.save(folder / "scans" / f"{file.stem}.npy", table)
+        shutil.rmtree(folder / "velodyne")
+        state(folder, motion_compensated=None, **toml)
+
+    return Files(edit)
+
+
+def state(folder: Path, **toml: Any) -> None:
+    """Write these keys into drive.toml; None takes one away."""
+    file = folder / "drive.toml"
+    table = {**tomllib.loads(file.read_text()), **toml}
+    file.write_text(tomli_w.dumps({key: value for key, value in table.items() if value is not None}))
+
+
+def few(values: Any, wrong: float, share: float) -> Any:
+    """With the ``wrong`` value in a share of the points."""
+    values[rng(6).random(len(values)) < share] = wrong
+    return values
 
 
 def turn(**deg: float) -> F64:
@@ -327,7 +375,38 @@ DRIVES: list[tuple[str, str, Break | Files]] = [
      times(lambda t: np.where(np.arange(len(t)) > len(t) // 2, t + 8.0, t))),
     ("one time missing", "lines for|one line a scan", lines("times.txt", lambda t: t[:-1])),
     ("one time not a number", "not a time", lines("times.txt", lambda t: [*t[:3], "n/a", *t[4:]])),
+    ("times of points under an unknown name", "times of points are taken from delta, s since the stamp",
+     timed("delta", lambda t, _: t, bent=True)),
+    ("nanoseconds of points under an unknown name", "are taken from time_offset_ns, ns since the stamp",
+     timed("time_offset_ns", lambda t, _: np.rint(1e9 * t).astype("i4"), bent=True)),
+    ("times of points that are a counter", "timestamp holds whole numbers one after the other",
+     timed("timestamp", lambda t, _: np.arange(len(t), dtype="u4"))),
+    ("times of points that are columns", "t grows by 1024 in a revolution",
+     timed("t", lambda t, _: np.rint(10240 * (t + 0.05)).astype("u2"))),
+    ("times of points as float32 since 1970", "time holds times since 1970 as float32",
+     timed("time", lambda t, s: (1.7e9 + s + t).astype("f4"), start_ns=17 * 10**17)),
+    ("times of points that last 0.69 of a revolution", "a revolution takes 0.069 s, but scans come every 0.1 s",
+     timed("t", lambda t, _: 0.69 * t)),
+    ("a tenth of the times of points wrong", "hold no time of this scan in the field t",
+     timed("t", lambda t, _: few(t, 99.0, 0.1))),
+    ("a tenth of the times of points not a number", "hold no time of this scan in the field t",
+     timed("t", lambda t, _: few(t, np.nan, 0.1))),
+    ("scans that are not those of their stamps", "stamps and points belong to different scans",
+     timed("t", lambda t, s: 1.7e9 + (2.0 if s > 1.0 else 0.0) + s + t)),
 ]  # fmt: skip
+
+
+TIME_MENDS: dict[str, dict[str, Any]] = {
+    "times of points under an unknown name": {"time_field": "delta"},
+    "nanoseconds of points under an unknown name": {"time_field": "time_offset_ns"},
+    "times of points that are a counter": {"time_field": "none"},
+    "times of points that are columns": {"time_field": "none"},
+    "times of points as float32 since 1970": {"time_field": "none"},
+    "times of points that last 0.69 of a revolution": {"time_unit": "s"},
+    "a tenth of the times of points wrong": {"time_field": "none"},
+    "scans that are not those of their stamps": {"time_field": "none"},
+}
+"""What the doctor says to write into drive.toml, by fault: after it the drive is sound."""
 
 
 def moved(scale: float = 1.0, **pose: float) -> Change:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from faults import Recording, broken, kinds_of, mounted, serious, sound_street, verdict
+from faults import TIME_MENDS, Recording, broken, kinds_of, mounted, serious, sound_street, state, verdict
 from mapvote.core import geometry
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
@@ -105,7 +105,8 @@ FAST = {
     "one scan full of NaN", "inverse poses", "rotations transposed", "prior in camera axes",
     "heading as a compass bearing", "positions in kilometres", "spikes of 25 m", "the prior does not move",
     "times in milliseconds", "times divided by 1000", "rotations scaled", "headings off by 20 deg + positions in feet",
-    "one scan empty + rotations transposed",
+    "one scan empty + rotations transposed", "nanoseconds of points under an unknown name",
+    "times of points that are columns", "scans that are not those of their stamps",
 }  # fmt: skip
 LESS = {
     "as it is": "sound",
@@ -128,6 +129,22 @@ def test_what_is_wrong_with_a_drive_is_named_one_fault_and_two(tmp_path: Path, s
     rights, change = kinds_of("drives")[kind]
     found = diagnose(broken(sound, change, tmp_path / "drive")).findings
     assert verdict(rights, found) == LESS.get(kind, "right"), found
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [k if k.startswith(("nano", "times of points that are a c")) else pytest.param(k, marks=pytest.mark.slow)
+     for k in TIME_MENDS],
+)  # fmt: skip
+def test_what_the_doctor_says_of_times_of_points_mends_them(tmp_path: Path, sound: Recording, kind: str) -> None:
+    _, change = kinds_of("drives")[kind]
+    folder = broken(sound, change, tmp_path / "drive")
+    (key, value), *_ = TIME_MENDS[kind].items()
+    said = " ".join(f"{f.what} {f.mend}" for f in diagnose(folder).findings)
+    assert key in said
+    assert str(value) in said
+    state(folder, **TIME_MENDS[kind])
+    assert serious(diagnose(folder).findings) == []
 
 
 LIES = {
