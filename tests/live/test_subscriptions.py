@@ -15,6 +15,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
+from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
 from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
@@ -108,11 +109,34 @@ class Vehicle:
         until(lambda: all(out.readers for out in self._out.values()))
 
 
-def subscriptions(domain: int, points: list[str]) -> Subscriptions:
+def subscriptions(domain: int, points: list[str], rules: TimeRules | None = None) -> Subscriptions:
     network = Network(domain)
     chosen = choose_topics(network, Wish(tuple(points)), Voice(print), lambda: False, 60.0)
     assert chosen is not None
-    return Subscriptions(network, chosen, SENSORS["hdl32e"])
+    return Subscriptions(network, chosen, SENSORS["hdl32e"], rules=rules or TimeRules())
+
+
+@pytest.mark.parametrize("compensated", [None, True, False])
+def test_a_live_topic_obeys_what_is_stated_of_motion(domain: int, compensated: bool | None) -> None:
+    """Clouds without times, 20 times a second, of a sensor whose data sheet says ten."""
+    seen = np.array([[10, 0, 0], [0, 10, 0], [0, -10, 0]], dtype=np.float32)
+    vehicle = Vehicle(domain, (POINTS, CLOUD))
+    topics, scans = subscriptions(domain, [], TimeRules(motion_compensated=compensated)), list[list[Cloud]]()
+    vehicle.until_subscribed()
+    for i in range(5):
+        vehicle.send(POINTS, cloud_message(Scan(START + i * STEP // 2, seen)))
+
+    def all_came() -> bool:
+        scans.extend(topics.take_scans())
+        return len(scans) == 5
+
+    until(all_came)
+    time_s = topics.waiting(scans[-1]).read().time_s
+    if compensated is False:
+        assert time_s is not None
+        assert np.allclose(time_s, [0.0, -0.0125, 0.0125])
+    else:
+        assert time_s is None
 
 
 def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(domain: int) -> None:
