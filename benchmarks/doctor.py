@@ -2,6 +2,7 @@
 
     python benchmarks/doctor.py drives --source NAME=DRIVE ... --out results/doctor_drives.csv
     python benchmarks/doctor.py maps --source NAME=DRIVE+MAP ... --out results/doctor_maps.csv
+    python benchmarks/doctor.py files --source NAME=MAP ...                       # broken files, and each one mended
     python benchmarks/doctor.py healthy --source NAME=DRIVE[+MAP] ...             # unseen drives: no alarm is right
 
 A source is a sound drive with a prior of its own, for maps with a map of the same street. DRIVE@START:STOP:STEP takes
@@ -24,15 +25,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from faults import Recording, broken, kinds_of, verdict
+from faults import MAP_FILES, Bytes, Recording, broken, kinds_of, verdict
 from mapvote.core.point_map import all_points
 from mapvote.core.types import Drive
 from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.map_fit import check_on_map
-from mapvote.doctor.maps import examine_points
+from mapvote.doctor.maps import examine_map, examine_points
 from mapvote.formats import open_drive, read_map
-from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.cloud import Cloud, CloudPieces
+from mapvote.formats.registry import WRITERS
 
 Case = tuple[str, list[str], Callable[[], list[Finding]]]
 """A kind, the patterns that name its faults, and what gives the findings."""
@@ -74,9 +76,28 @@ def maps(where: str) -> Iterator[Case]:
         yield kind, rights, lambda change=change: findings(change)
 
 
+def files(where: str) -> Iterator[Case]:
+    """4,000 points around the middle of a map as files, broken, and mended as the doctor advises (then "sound")."""
+    points = all_points(read_map(where))
+    away = np.abs(points - np.median(points, axis=0)).max(axis=1)
+    cloud = Cloud(points[np.sort(np.argsort(away)[:4000])])
+
+    def findings(suffix: str, *changes: Bytes) -> list[Finding]:
+        with tempfile.TemporaryDirectory() as scratch:
+            file = Path(scratch) / f"map{suffix}"
+            WRITERS[suffix].write(file, CloudPieces.of(cloud))
+            for change in changes:
+                file.write_bytes(change(file.read_bytes()))
+            return [finding for finding in examine_map(file)[0] if finding.severity == "error"]
+
+    for kind, suffix, right, change, mend in MAP_FILES:
+        yield kind, [right], lambda suffix=suffix, change=change: findings(suffix, change)
+        yield f"{kind}, mended", [], lambda suffix=suffix, change=change, mend=mend: findings(suffix, change, mend)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("drives", "maps", "healthy"))
+    parser.add_argument("what", choices=("drives", "maps", "files", "healthy"))
     parser.add_argument("--source", action="append", required=True, metavar="NAME=DRIVE[@SCANS][+MAP]")
     parser.add_argument("--kinds", default="", help="only those whose name matches this regular expression")
     parser.add_argument("--out", type=Path, help="CSV, written anew")
@@ -90,7 +111,7 @@ def main() -> None:
             print(name, [f"{f.severity}: {f.what}" for f in found if f.severity != "note"] or "sound", flush=True)
             continue
         counts: dict[bool, Counter[str]] = {False: Counter(), True: Counter()}
-        for kind, rights, judge in drives(where) if asked.what == "drives" else maps(where):
+        for kind, rights, judge in {"drives": drives, "maps": maps, "files": files}[asked.what](where):
             if not re.search(asked.kinds, kind):
                 continue
             started = time.process_time()

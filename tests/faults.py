@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -473,6 +474,44 @@ MAPS: list[tuple[str, str, Change]] = [
      lambda p: p + (rng(3).random(len(p)) < 0.05)[:, None] * [0, 0, 200.0]),
     ("flat", "flat", lambda p: p * [1, 1, 0]),
     ("joined with itself", TWICE, lambda p: np.concatenate([p, p])),
+]  # fmt: skip
+
+
+def counted_as(points: int) -> Callable[[bytes], bytes]:
+    """A LAS file whose header counts so many points: 107 (to 1.3), 247 (1.4)."""
+
+    def change(data: bytes) -> bytes:
+        out = bytearray(data)
+        out[247:255] = struct.pack("<Q", points)
+        return bytes(out)
+
+    return change
+
+
+def in_header(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    return lambda data: data.replace(old, new, 1)
+
+
+Bytes = Callable[[bytes], bytes]
+FEWER, MORE = "counts 3000 points, but data for 1000 more", "cut off|not a whole"
+# name, suffix, what names it rightly, what is done to the bytes of a file of 4,000 points, and what the mend does
+MAP_FILES: list[tuple[str, str, str, Bytes, Bytes]] = [
+    ("LAS header counts too few", ".las", FEWER, counted_as(3000), counted_as(4000)),
+    ("LAZ header counts too few", ".laz", FEWER, counted_as(3000), counted_as(4000)),
+    ("LAS header counts too many", ".las", MORE, counted_as(5000), counted_as(4000)),
+    ("LAZ header counts too many", ".laz", "cut off: 4000 points", counted_as(5000), counted_as(4000)),
+    ("PLY header counts too few", ".ply", "data follow the elements that its header counts .3000 vertex",
+     in_header(b"vertex 4000", b"vertex 3000"), in_header(b"vertex 3000", b"vertex 4000")),
+    ("PCD header counts too few", ".pcd", "says 3000 points, but data for 1000 more follow",
+     lambda data: data.replace(b"4000", b"3000", 2), lambda data: data.replace(b"3000", b"4000", 2)),
+    ("PCD WIDTH is wrong", ".pcd", ":10: POINTS .* WIDTH 3000 times HEIGHT 1 is not POINTS 4000",
+     in_header(b"WIDTH 4000", b"WIDTH 3000"), in_header(b"WIDTH 3000", b"WIDTH 4000")),
+    ("PCD has a word too few", ".pcd", ":5: TYPE .* one for each of the 3 FIELDS",
+     in_header(b"TYPE F F F", b"TYPE F F"), in_header(b"TYPE F F", b"TYPE F F F")),
+    ("PCD without DATA", ".pcd", "no line DATA",
+     in_header(b"DATA binary\n", b""), in_header(b"POINTS 4000\n", b"POINTS 4000\nDATA binary\n")),
+    ("PCD in an unknown encoding", ".pcd", ":11: DATA .* is no encoding; write ascii",
+     in_header(b"binary\n", b"base64\n"), in_header(b"base64\n", b"binary\n")),
 ]  # fmt: skip
 TWO_AT_ONCE = {
     "drives": [

@@ -27,7 +27,7 @@ from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
-from mapvote.formats.maps.marked_points import without_marked
+from mapvote.formats.maps.marked_points import MarkedPoints
 from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of
 from mapvote.survey.clean_map import lone_points
 
@@ -200,7 +200,9 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
     """(findings, errors first; the map, if one can be made of it) of a map in any format."""
     try:
         if not is_map_folder(path):
-            return examine_points(str(path), joined(without_marked(path, stream_cloud(path))))
+            sieve = MarkedPoints()
+            findings, made = examine_points(str(path), joined(sieve.without(stream_cloud(path))))
+            return in_order([*findings, *(Finding("note", line) for line in sieve.told())]), made
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None

@@ -43,7 +43,7 @@ def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
             source = _full_lines(stream) if is_text else stream
             file = library.PlyData.read(source)
             more = source.read() if is_text else stream.read().strip(b"\0\r\n ")
-        if more:
+        if more and file.elements[-1].name == "vertex":  # faces too many are nothing to a map
             raise MapvoteError(f"{path}: data follow the elements that its header counts ({_counts(file)}); {_MEND}")
         if "vertex" not in file:
             raise ValueError("it holds no element vertex")
