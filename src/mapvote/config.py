@@ -190,6 +190,18 @@ class FuseSettings(Section):
         le=1e9,
         description="hold a version with a connected change larger than this",
     )
+    newcomer_days: float = Field(
+        default=7.0,
+        ge=0,
+        le=36_500,
+        description="tell of changes that lack the quorum without vehicles whose first ballot came within so many "
+        "days, once others voted before. 0 disables this",
+    )
+    hold_newcomers: bool = Field(default=False, description="hold a version that rests on such vehicles")
+    hold_overturned: bool = Field(
+        default=False,
+        description="hold a version with a change that no more vehicles vote for than said otherwise before",
+    )
     max_freed_share: float = Field(
         default=0.5,
         ge=0,

@@ -134,8 +134,10 @@ def _print_outcome(answer: Mapping[str, Any], otherwise: str) -> None:
     tiles = f" in tiles {'; '.join(answer['tiles'])}" if answer["tiles"] else ""
     changed = f"{answer['points_added']} points added, {answer['points_deleted']} deleted"
     print(f"version {answer['version']} ({what}): {changed}{tiles}")
-    if answer.get("waits"):
+    if answer["waits"]:
         print(answer["waits"])
+    for doubt in answer["doubts"]:
+        print(f"look: {doubt}")
     for reason in answer["held"]:
         print(f"hold: {reason}")
 

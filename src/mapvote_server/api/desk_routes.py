@@ -58,7 +58,13 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
     found = await _look(parts)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
-        answer = {"version": found.version, "held": found.held, "waits": found.waits, "pending": found.pending}
+        answer = {
+            "version": found.version,
+            "held": found.held,
+            "doubts": found.doubts,
+            "waits": found.waits,
+            "pending": found.pending,
+        }
         tiles = {tile_key(index): _hashes(*made) for index, made in found.edited.items()}
         return as_json(answer | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
     listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}

@@ -135,6 +135,7 @@ def _as_answer(done: Outcome, waits: str = "") -> Published:
         points_added=done.added,
         points_deleted=done.deleted,
         held=list(done.held),
+        doubts=list(done.doubts),
         waits=waits,
     )
 

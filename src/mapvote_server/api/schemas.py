@@ -181,6 +181,7 @@ class Published(Answer):
     points_added: int
     points_deleted: int
     held: list[str]
+    doubts: list[str] = Field(description="what an operator should know about the voters")
     waits: str = Field(default="", description="changes that lack only the quorum, if nothing was published")
 
 
@@ -292,6 +293,7 @@ class DeskAnswer(Answer):
 
     version: int
     held: list[str] = Field(description="why the policy would hold the version")
+    doubts: list[str] = Field(description="what a reviewer should know about the voters")
     waits: str = Field(description="changes that lack only the quorum, if nothing is pending")
     pending: Pending
     waiting: list[PendingFeature]

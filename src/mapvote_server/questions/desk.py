@@ -24,7 +24,7 @@ from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.coverage import waiting_votes
 from mapvote_server.store.fusion_jobs import Fused
-from mapvote_server.store.publish import Gate, Round, edited_tile, reasons_to_hold, round_at
+from mapvote_server.store.publish import Gate, Round, doubts_of, edited_tile, reasons_to_hold, round_at
 from mapvote_server.store.queries import load_tile, tile_of
 from mapvote_server.store.reviews import Review, Verdict, decide, standing
 from mapvote_server.store.store import Store
@@ -41,6 +41,8 @@ class Desk:
     """The newest, on which a publish would build."""
     held: list[str]
     """The policy's reasons to hold the version."""
+    doubts: list[str]
+    """What a reviewer should know about the voters."""
     waits: str
     """Changes that lack only the quorum, if a publish would change nothing; else ""."""
     pending: dict[str, Any]
@@ -99,7 +101,8 @@ def _desk_of(store: Store, found: Round) -> Desk:
     waiting = _waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
     lacking = None if found.changed else waiting_votes(store)
     waits = "" if lacking is None else str(lacking)
-    return Desk(version, [], waits, pending, waiting, left_out, cells, edited, clouds)
+    doubts = doubts_of(store, found).told(found.asked.settings)
+    return Desk(version, [], doubts, waits, pending, waiting, left_out, cells, edited, clouds)
 
 
 def review(

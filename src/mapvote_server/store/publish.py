@@ -31,6 +31,7 @@ from mapvote.fusion.decision_record import Record
 from mapvote_server.errors import Conflict, Held
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of, insert_rows
+from mapvote_server.store.doubts import Doubts, doubts_about
 from mapvote_server.store.fusion_jobs import Fused, Task, fuse_round
 from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote_server.store.policy import GatePolicy
@@ -50,6 +51,9 @@ from mapvote_server.store.retention import clear
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
 
+_MOST_DETAIL = 400
+"""Characters of an event."""
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -65,6 +69,8 @@ class Outcome:
     held: Sequence[str]
     """Why the policy would hold it back, or what the operator overrode."""
     fused: Sequence[Fused] = field(default=(), repr=False)
+    doubts: Sequence[str] = ()
+    """What an operator should know about the voters (store/doubts.py)."""
 
 
 def preview(
@@ -117,7 +123,7 @@ def publish(
     newest, made_by = found.newest.number, policy.model_dump(mode="json")
     version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
     tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
-    write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused)
+    write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused, doubts=outcome.doubts)
     if policy.keep.automatic:
         clear(store, by=by, dry_run=False)
     return replace(outcome, version=version.number, published=True)
@@ -138,7 +144,8 @@ def _outcome(
         raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
     held, fused = reasons_to_hold(store, found, gate), list(found.decided.values())
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
-    return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused)
+    doubts = doubts_of(store, found).told(found.asked.settings)
+    return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused, doubts)
 
 
 def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:
@@ -156,12 +163,13 @@ def write_version(
     planes: Iterable[Mapping[str, bytes]],
     decided: Iterable[Fused] = (),
     unvoted: str | None = None,
+    doubts: Sequence[str] = (),
 ) -> Version:
     """Publish a version that sets ``tiles``, one without points where it has none; Conflict if its parent is the newest
     no more.
 
     ``planes``: all that the store may not hold yet. ``decided``: tiles that do not change too. ``unvoted``: this
-    vehicle's votes are gone.
+    vehicle's votes are gone. ``doubts``: what the log should tell about its voters.
     """
     late = Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
     try:
@@ -173,6 +181,9 @@ def write_version(
             seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
             if version.kind != "publish":
                 version = replace(version, mark=seq)
+            for doubt in doubts:
+                told = f"v{version.number}: {doubt}"
+                log_event(connection, version.created_ns, "doubt", version.published_by, told[:_MOST_DETAIL])
             connection.execute(schema.versions.insert().values(**asdict(version)))
             add_blobs(connection, {digest: data for some in planes for digest, data in some.items()})
             set_tiles(connection, version.number, tiles)
@@ -194,7 +205,7 @@ def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ..
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
 """Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""
-_WITHOUT_EFFECT = "held back", "copy", "key issued"
+_WITHOUT_EFFECT = "held back", "copy", "doubt", "key issued"
 """Kinds of events that change no round."""
 
 
@@ -217,6 +228,17 @@ class Round:
     def changed(self) -> list[Fused]:
         """Tiles that a publish would change."""
         return [fused for fused in self.decided.values() if fused.hashes is not None]
+
+
+_doubts: WeakKeyDictionary[Round, Doubts] = WeakKeyDictionary()
+
+
+def doubts_of(store: Store, found: Round) -> Doubts:
+    """What an operator should know about the voters of a round; worked out once."""
+    if found not in _doubts:
+        every = [*found.decided.values(), *found.beside.values()]
+        _doubts[found] = doubts_about(store, found.newest.number, found.asked, found.changed, every)
+    return _doubts[found]
 
 
 @dataclass(slots=True)
@@ -327,6 +349,7 @@ def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
     """The reasons of the policy, and of its gate, against the version that a round would make."""
     changed, asked = found.changed, found.asked.policy.gate
     held = hold_reasons(changed, found.asked.settings)
+    held += doubts_of(store, found).holding(found.asked.settings)
     if gate is None or not asked.drive or not changed:
         return held
     latest = _latest_of(store)

@@ -24,7 +24,8 @@ export async function showDesk() {
   $("desk-tally").textContent = waiting.length
     ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
     : `No change is pending: a publish would leave version ${version} as it is.${desk.waits ? ` ${desk.waits}.` : ""}`;
-  $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`The policy would hold it: ${reason}`])));
+  const told = [...held.map((reason) => `The policy would hold it: ${reason}`), ...desk.doubts.map((text) => `Look: ${text}`)];
+  $("desk-held").replaceChildren(...told.map((text) => element("li", {}, [text])));
   $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
   const stays = [...(desk.waiting ?? [])].sort((a, b) => size(a) - size(b));
   $("waiting-tally").textContent = stays.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
