@@ -31,6 +31,8 @@ from stores import Clock
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12), (11, 10), (11, 11)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
 HEIGHTS = (0.05, 0.45, 0.75, 1.05)
+BROUGHT = (0.4547, 0.7547)
+"""Heights of points as a ballot carries them, in steps of 9.4 mm: a point that vehicles bring back is another one."""
 VEHICLES = ("a", "b", "c", "d", "e")
 OPEN = {"max_deleted_share": 1.0, "max_freed_share": 1.0}
 START_S = 1_700_000_000
@@ -285,7 +287,7 @@ def say(rng: random.Random, there: bool, mapped: CellMap, masks: bool, has_free:
     state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
     marks = masks and state in (CE, UO) and rng.random() < 0.7
     gone = rng.choice([0b1110, 0b0110, 0b0010, 0b1010, 0b1100, 0b0100, 0]) if marks else 0
-    heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,)]) if state == CO else ()
+    heights = rng.choice([BROUGHT, BROUGHT[:1], BROUGHT[1:]]) if state == CO else ()
     return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 
 
@@ -294,7 +296,7 @@ def held_by(tile: Tile, cell: Cell) -> CellMap:
     heights = tile.points[tile.cells == cell[0] * 256 + cell[1], 2]
     remembered = (int(n) for n in (tile.memory or Memory.none()).planes[:, cell[0], cell[1]])
     free = 0 if tile.free is None else int(tile.free[cell])
-    return CellMap(tuple(round(float(z), 2) for z in heights), free, *remembered)
+    return CellMap(tuple(round(float(z), 4) for z in heights), free, *remembered)
 
 
 @cache

@@ -206,11 +206,11 @@ def test_salt_hides_no_copy_and_makes_none_of_honest_drives(holes: float, island
     assert set(copied([*votes, copy]).items()) & {("copy", "v0"), ("v0", "copy")}
 
 
-def surfaces(seed: int, n: int = 200) -> F32:
-    """Points of a wall as one drive measures them."""
+def surfaces(seed: int, columns: int = 60) -> F32:
+    """Points of a wall, five above each other, as one drive measures them."""
     rng = np.random.default_rng(seed)
-    where = np.column_stack([np.linspace(10.0, 40.0, n), np.full(n, 30.0), rng.uniform(0.5, 4.0, n)])
-    return (where + rng.normal(0.0, 0.02, (n, 3))).astype(np.float32)
+    x, z = (part.reshape(-1) for part in np.meshgrid(np.arange(columns) * 0.3 + 10.15, np.arange(5) * 0.3 + 0.65))
+    return (np.column_stack([x, np.full(len(x), 30.15), z]) + rng.normal(0.0, 0.02, (len(x), 3))).astype(np.float32)
 
 
 def rays(seed: int) -> Words:
@@ -224,7 +224,9 @@ def rays(seed: int) -> Words:
 def test_drives_that_share_points_are_one_wherever_they_lie_and_those_of_one_wall_are_two(cells_moved: int) -> None:
     """Their outlines differ: the copier thinned and cut the recording, or merged it with a drive of its own."""
     away = np.array([cells_moved * CELL_SIZE, -cells_moved * CELL_SIZE, 0.0])
-    merged = np.concatenate([surfaces(1)[::2] + away, surfaces(3)[:100]]).astype(np.float32)
+    half = surfaces(1)[surfaces(1)[:, 0] < 19.0]
+    own = surfaces(3)[surfaces(3)[:, 0] > 22.0]
+    merged = np.concatenate([half + away, own]).astype(np.float32)
     one, other, copy = (
         TileVote(name, i, name, states=drive_along(i), new_points=points)
         for i, (name, points) in enumerate((("one", surfaces(1)), ("other", surfaces(2)), ("copy", merged)))

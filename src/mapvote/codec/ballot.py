@@ -263,7 +263,7 @@ def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
 
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
-_PLACES = 32
+PLACES = 32
 """Places along a voxel's side that a point may have."""
 _POINT_BYTES = 9
 _MAX_POINT_BYTES = CELLS * MAX_POINTS_PER_CELL * _POINT_BYTES
@@ -303,7 +303,7 @@ def _enter_planes(points: F32, voxel: I64, planes: U8) -> None:
             voxel[axis] = int(np.floor(place))
             if axis < 2:
                 voxel[axis] = min(max(voxel[axis], 0), TILE_CELLS - 1)
-            planes[6 + axis, i] = min(max(int((place - voxel[axis]) * _PLACES), 0), _PLACES - 1)
+            planes[6 + axis, i] = min(max(int((place - voxel[axis]) * PLACES), 0), PLACES - 1)
         cell = voxel[1] * TILE_CELLS + voxel[0]
         for k in range(2):
             planes[k, i] = ((cell - last_cell) >> (8 * k)) & 0xFF
@@ -323,8 +323,8 @@ def _placed(planes: U8, points: F32) -> bool:
             way |= np.int64(planes[2 + k, i]) << (8 * k)
         layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
         for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
-            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _PLACES) * CELL_SIZE
-            sound &= planes[6 + axis, i] < _PLACES
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / PLACES) * CELL_SIZE
+            sound &= planes[6 + axis, i] < PLACES
     return sound
 
 

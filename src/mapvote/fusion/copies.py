@@ -11,9 +11,12 @@ determine within one cell, or the other way round. The measure is the share of t
 would differ from itself if it were shifted by three cells (.9 m) north or east. A copy differs in no cell, nor does a
 copy of which every cell was moved by one.
 
-Points. Two drives measure no point of a surface twice at the same 1.2 mm of a voxel. Free space. Two drives pass other
-voxels above a cell: of three neighbouring words that are not all equal and that occur once in a drive, few occur in
-another drive. Both are compared by what does not depend on the place, so that moving by whole cells hides nothing.
+Points. Two drives hardly ever measure two neighbouring points of a column at the same steps of 9.4 mm.
+
+Free space. Two drives pass other voxels above a cell: of three neighbouring words that are not all equal and that occur
+once in a drive, few occur in another drive.
+
+Points and free space are compared by what does not depend on the place, so that moving by whole cells hides nothing.
 Honest drives stay well away from all three bounds (docs/measurements/votes.md).
 
 Of several copies the one counts that agrees best with all others: moved or added cells agree less. At most one of their
@@ -29,6 +32,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mapvote.codec.ballot import PLACES
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
@@ -43,9 +47,9 @@ class CopyRule:
     least_moved: int = 200
     """Cells, in the rows compared. A mask that a shift of three cells changes less is not compared: it is small."""
     shared: float = 1.0 / 3.0
-    """Share of the smaller drive's points, or patterns of free words, that two drives of one recording share."""
+    """Share of the smaller drive's pairs of points, or patterns of free words, that drives of one recording share."""
     least_shared: int = 30
-    """Drives with fewer points or patterns are not compared by these."""
+    """Drives with fewer pairs or patterns are not compared by these."""
     compared_cells: int = 7
     """One of so many cells is compared to find the copy that agrees best with the others."""
 
@@ -56,8 +60,6 @@ _APART = 3
 """Cells by which a mask is shifted; and one of so many rows is compared, which is enough for a share."""
 _RIM = 1
 """Columns on either side that are not compared."""
-_STEPS = 256
-"""Steps of a voxel in which a ballot places its points, 1.2 mm each."""
 _UN = int(CellState.UNDETERMINED)
 
 
@@ -143,13 +145,17 @@ _NO_MARKS = read_only(np.empty(0, dtype=np.uint64))
 
 
 def point_marks(drive: TileVote, least: int) -> U64:
-    """(n,) ascending: the height of each new point, and its place in its voxel, in steps of 1.2 mm; none of fewer than
-    ``least``."""
+    """(n,) ascending: the heights of two new points of a column, the one next above the other, and their places in
+    their voxels, in the steps of a ballot; none of fewer than ``least``."""
     if drive.new_points is None or len(drive.new_points) < least:
         return _NO_MARKS
-    steps = np.floor(drive.new_points.astype(np.float64) / CELL_SIZE * _STEPS).astype(np.int64)
-    marks = (steps[:, 2] << 16) | ((steps[:, 1] % _STEPS) << 8) | (steps[:, 0] % _STEPS)
-    return _enough(np.unique(marks).astype(np.uint64), least)
+    steps = np.floor(drive.new_points.astype(np.float64) / CELL_SIZE * PLACES).astype(np.int64)
+    cells = (steps[:, 1] // PLACES) * TILE_CELLS + steps[:, 0] // PLACES
+    places = ((steps[:, 1] % PLACES) * PLACES + steps[:, 0] % PLACES) + PLACES * PLACES * steps[:, 2]
+    order = np.lexsort((places, cells))
+    above = np.flatnonzero(np.diff(cells[order]) == 0)
+    lower, upper = places[order[above]].astype(np.uint64), places[order[above + 1]].astype(np.uint64)
+    return _enough(np.unique(lower << np.uint64(32) | (upper & np.uint64(0xFFFFFFFF))), least)
 
 
 def free_marks(drive: TileVote, least: int) -> U64:
