@@ -30,6 +30,8 @@ from mapvote.config import Settings
 from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
+from mapvote.doctor import usable
+from mapvote.doctor.bent_scans import check_bent
 from mapvote.doctor.scans import looked_at
 from mapvote.formats import open_drive, read_map
 from mapvote.fusion.fuse import update_map
@@ -133,10 +135,11 @@ def written(case: Case, drive: Drive, folder: Path) -> Path:
 
 
 def voted(path: Path, point_map: PointMap) -> Ballot:
-    """The ballot of a drive that the cheap checks pass."""
+    """The ballot of a drive that the checks of `mapvote vote` pass."""
     looking = looked_at(open_drive(path))
-    ballot = vote_drive(looking.drive, point_map, Settings())[0]
+    ballot, report = vote_drive(looking.drive, point_map, Settings())
     looking.warnings()
+    usable("", list(check_bent(looking.drive, report.T_map_lidar, point_map)))
     return ballot
 
 
@@ -145,7 +148,7 @@ def told(paths: list[Path], point_map: PointMap) -> str:
     try:
         ballots = [voted(path, point_map) for path in paths]
     except MapvoteError as error:
-        return f"error: {re.sub(r'.*: the field', 'the field', str(error).replace(str(paths[0]), ''))[:100]}"
+        return f"error: {re.sub(r'.*: the field', 'the field', str(error).replace(str(paths[0]), '').removeprefix(': '))[:110]}"
     fuse = Settings().fuse
     policy = fuse.model_copy(update={"min_votes": 1}) if len(ballots) == 1 else fuse
     decisions = update_map(point_map, ballots, policy)[1].values()

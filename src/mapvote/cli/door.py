@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mapvote.doctor import Finding
     from mapvote.doctor.scans import Looking
     from mapvote.formats.maps.tiling import Look, Pieces
+    from mapvote.perception.frontend import DriveReport
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -192,6 +193,17 @@ def _warnings_of(watching: list[Looking]) -> list[tuple[str, list[Finding]]]:
         with progress(f"looking at {one.drive.path}") as tell:
             found.append((str(one.drive.path), one.warnings(tell)))
     return found
+
+
+def require_straight(drive: Drive, report: DriveReport, point_map: PointMap, *, unchecked: bool = False) -> None:
+    """MapvoteError for a drive whose scans fit the map better with other times of points: no ballot comes of it.
+    ``unchecked``: a warning."""
+    from mapvote.doctor.bent_scans import check_bent
+
+    for finding in check_bent(drive, report.T_map_lidar, point_map):
+        if finding.severity == "error" and not unchecked:
+            raise MapvoteError(f"{drive.path}: {finding.what}. {finding.mend}; nothing was written")
+        _warn(str(drive.path), [finding])
 
 
 def sound_map(path: Path | str) -> PointMap:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import client_of, key_in, map_at, region_in, usable_drives
+from mapvote.cli.door import client_of, key_in, map_at, region_in, require_straight, usable_drives
 from mapvote.cli.options import Config, KeyFile, with_drive_options
 from mapvote.cli.terminal import print_table, progress, waiting
 from mapvote.core.types import MapvoteError
@@ -202,7 +202,9 @@ def _drive_once(
             raise MapvoteError(f"{drive.path}: {missing}")
         localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
     with usable_drives([drive]) as (drive,), progress("voting") as tell:
-        return vote_drive(drive, point_map, settings, localise=localise, progress=tell)
+        ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
+    require_straight(drive, report, point_map)
+    return ballot, report
 
 
 def _send(url: str, key: str | None, data: bytes) -> None:

@@ -1,0 +1,111 @@
+"""Do the times of points, as they were read, straighten the scans? A map tells: bent scans fit it worse.
+
+At 10 m/s a scan that is not de-skewed is bent by a metre. Whoever reads it as motion-compensated votes walls away that
+stand. Nothing in a file tells that its points are compensated, or that its times run backwards. So some scans along the
+drive are registered once more, each with other times: none, and those of a sensor that spins clockwise or
+counter-clockwise. Of 8 scans of a simulated street at 11 m/s none fits better than with its own times: compensated
+points fit .04 to .08 worse with times from azimuths, others as much better (docs/measurements/point_times.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.doctor import Finding, Severity
+from mapvote.formats.drives.point_fields import spinning_time_s
+from mapvote.matching.ndt import refine
+from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.prepare import Sample, motion_at
+
+
+@dataclass(frozen=True, slots=True)
+class BentScans:
+    """When other times of points fit better."""
+
+    scans: int = 8
+    """Scans that are registered again, evenly along the drive."""
+    least_scans: int = 4
+    """Fewer tell nothing."""
+    least_speed_mps: float = 3.0
+    """A slower sensor hardly bends its scans."""
+    better: float = 1.02
+    """By what factor the median score with other times must exceed the score as read."""
+    share: float = 0.75
+    """Share of the scans that must fit better."""
+
+
+BENT_SCANS = BentScans()
+_AS_READ, _NONE, _CLOCKWISE, _COUNTER = "as read", "none", "clockwise", "counter-clockwise"
+
+
+def check_bent(drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap) -> Iterator[Finding]:
+    """What other times of points fit the map clearly better than those of the drive. ``T_map_lidar``: of its scans, (4,
+    4) each, as localised."""
+    poses = np.array(T_map_lidar)
+    stamps_ns = drive.stamps_ns[: len(poses)]
+    if len(poses) < 3:
+        return
+    around = MapWindow(point_map)
+    scores: dict[str, list[float]] = {}
+    told = None
+    for i in np.unique(np.linspace(1, len(poses) - 2, BENT_SCANS.scans).astype(np.int64)).tolist():
+        twist = motion_at(stamps_ns, poses, i)
+        if np.linalg.norm(twist[:3]) < BENT_SCANS.least_speed_mps:
+            continue
+        try:
+            scan = drive.read_scan(i)
+        except MapvoteError:  # its own finding
+            continue
+        if scan.others or not drive.sensor.rings:
+            return
+        told = scan.times or told
+        ndt_map = around(poses[i, :3, 3])
+        for name, time_s in _readings(scan, drive).items():
+            clouds = Sample(replace(scan, time_s=time_s)).clouds(twist)
+            score = refine(ndt_map, clouds, poses[i], None, len(LEVELS) - 1).score
+            scores.setdefault(name, []).append(score)
+    best = _best(scores)
+    if best is not None:
+        how = "none" if told is None else told.how
+        yield _finding(best, how, np.array(scores[_AS_READ]), np.array(scores[best]))
+
+
+def _readings(scan: Scan, drive: Drive) -> dict[str, F32 | None]:
+    """Times (n,) of the points by the name of each reading."""
+    turned = spinning_time_s(scan.points, drive.sensor.rate_hz)
+    out = {_AS_READ: scan.time_s, _CLOCKWISE: turned, _COUNTER: -turned}
+    return out if scan.time_s is None else {**out, _NONE: None}
+
+
+def _best(scores: dict[str, list[float]]) -> str | None:
+    """The reading that fits clearly better than the one as read, if any does."""
+    if len(scores.get(_AS_READ, ())) < BENT_SCANS.least_scans:
+        return None
+    as_read = np.array(scores[_AS_READ])
+    better = {}
+    for name, fits in scores.items():
+        ratio = np.array(fits) / np.maximum(as_read, 1e-6)
+        if np.median(ratio) > BENT_SCANS.better and (ratio > 1.0).mean() >= BENT_SCANS.share:
+            better[name] = float(np.median(ratio))
+    return max(better, key=lambda name: better[name]) if better else None
+
+
+def _finding(best: str, how: str, as_read: F64, fits: F64) -> Finding:
+    """In words. What somebody stated is only doubted."""
+    shown = f"{(fits > as_read).sum()} of {len(fits)} scans fit the map better ({np.median(fits):.2f}, as read "
+    shown += f"{np.median(as_read):.2f})"
+    grave: Severity = "warning" if how in ("compensated", "azimuth") else "error"
+    if best == _NONE:
+        what = f"the points are motion-compensated already: without their times {shown}"
+        return Finding(grave, what, "set motion_compensated = true in drive.toml")
+    what = f"the points are not motion-compensated: with times of a sensor that spins {best} {shown}"
+    if how == "field":
+        what = f"the times of points do not belong to them: with times of a sensor that spins {best} {shown}"
+    field = 'time_field = "none" and ' if how == "field" else ""
+    spin = "" if best == _CLOCKWISE else ", and clockwise = false in its table [sensor]"
+    return Finding(grave, what, f"set {field}motion_compensated = false in drive.toml{spin}")
