@@ -148,7 +148,8 @@ def told(paths: list[Path], point_map: PointMap) -> str:
     try:
         ballots = [voted(path, point_map) for path in paths]
     except MapvoteError as error:
-        return f"error: {re.sub(r'.*: the field', 'the field', str(error).replace(str(paths[0]), '').removeprefix(': '))[:110]}"
+        why = str(error).replace(str(paths[0]), "").removeprefix(": ")
+        return f"error: {re.sub(r'.*: the field', 'the field', why)[:110]}"
     fuse = Settings().fuse
     policy = fuse.model_copy(update={"min_votes": 1}) if len(ballots) == 1 else fuse
     decisions = update_map(point_map, ballots, policy)[1].values()
