@@ -4,7 +4,7 @@ At 10 m/s a scan that is not de-skewed is bent by a metre. Whoever reads it as m
 stand. Nothing in a file tells that its points are compensated, or that its times run backwards. So some scans along the
 drive are registered once more, each with other times: none, and those of a sensor that spins clockwise or
 counter-clockwise. Of 8 scans of a simulated street at 11 m/s none fits better than with its own times: compensated
-points fit .04 to .08 worse with times from azimuths, others as much better (docs/measurements/point_times.md).
+points fit .04 to .08 worse with times from azimuths, others as much better.
 """
 
 from __future__ import annotations
