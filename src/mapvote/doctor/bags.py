@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import scipy
 
-from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.core.types import F64, I64, Drive, MapvoteError
 from mapvote.doctor import Finding, Severity
+from mapvote.doctor.lidars import check_lidars
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_options
 from mapvote.formats.drives.rosbag import (
     CLOUDS,
     GNSS,
     POSES,
     Bag,
+    T_base_lidars,
     T_from,
     frame_id,
     stamps_of,
@@ -43,6 +45,16 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
         return [*files, *_topics(bag, times), *_clocks(bag, times, orders), *poses]
     except MapvoteError as error:
         return [Finding("error", str(error))]
+
+
+def check_lidars_of_bag(path: Path, drive: Drive, said: Mapping[str, Any]) -> list[Finding]:
+    """Whether the LiDARs of an opened drive sit where the bag at ``path`` says."""
+    options = drive_options(path, **said)
+    topics = [name.strip() for name in (options.topic or "").split(",")]
+    if len(topics) < 2:
+        return []
+    places = T_base_lidars(Bag(path), topics, options.mounts)
+    return list(check_lidars(drive, topics, places))
 
 
 def _topics(bag: Bag, times: _Times) -> Iterator[Finding]:

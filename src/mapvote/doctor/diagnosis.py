@@ -18,7 +18,7 @@ from mapvote.core.mount import mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
 from mapvote.doctor import Finding, Progress, any_error, in_order
-from mapvote.doctor.bags import check_bag
+from mapvote.doctor.bags import check_bag, check_lidars_of_bag
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
@@ -91,10 +91,14 @@ def diagnose(
         return Diagnosis(list(check_ballot(path.read_bytes())))
     options = options or {}
     drive, unopened = _opened(path, options, point_map)
-    found = unopened + (check_bag(path, **options) if layout is not None and layout.open is open_rosbag else [])
+    of_bag = layout is not None and layout.open is open_rosbag
+    found = unopened + (check_bag(path, **options) if of_bag else [])
     T = None
     if drive is not None:
-        more, T = examine_drive(drive, progress)
+        lidars = check_lidars_of_bag(path, drive, options) if of_bag else []
+        found += lidars
+        # Scans put together wrongly fit neither each other nor a prior.
+        more, T = ([], None) if any_error(lidars) else examine_drive(drive, progress)
         # That a prior that could not be read is missing goes without saying.
         found += [f for f in more if not (unopened and f == NO_PRIOR)]
     if point_map is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -298,6 +298,21 @@ def T_first_lidar(bag: Bag, first: str, other: str, mounts: Mapping[str, list[fl
             f"give both in drive.toml (mounts), or choose one LiDAR with --topic"
         )
     return reached[target]
+
+
+def T_base_lidars(bag: Bag, topics: Sequence[str], mounts: Mapping[str, list[float]]) -> F64:
+    """(n, 4, 4) where the LiDARs of PointCloud2 topics sit on the vehicle: by ``mounts``, else by /tf_static from
+    base_link, or from the frame that is nobody's child; MapvoteError if neither says it."""
+    own = [_mount_in(mounts, topic, str(bag.path)) for topic in topics]
+    if all(T is not None for T in own):
+        return np.array(own)
+    edges = static_frames(bag)
+    frames = [frame_id(bag, topic) for topic in topics]
+    base = "base_link" if "base_link" in edges else next(iter(edges), frames[0])
+    reached = T_from(edges, base)
+    if any(frame not in reached for frame in frames):
+        return np.array([np.eye(4), *(T_first_lidar(bag, topics[0], other, mounts) for other in topics[1:])])
+    return np.array([reached[frame] for frame in frames])
 
 
 Edges = dict[str, list[tuple[str, F64]]]

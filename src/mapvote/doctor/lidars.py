@@ -1,0 +1,130 @@
+"""Do the LiDARs of one vehicle see the same street where /tf_static, or drive.toml, says that they sit?
+
+The points of each other LiDAR are matched with those of the first in the same sweep: as stated, and with the places of
+two LiDARs exchanged, which is what exchanged frame ids do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import scipy
+
+from mapvote.core.geometry import exp, inverse, log, transform
+from mapvote.core.types import F32, F64, Drive
+from mapvote.doctor import Finding
+from mapvote.matching.ndt import fitness, refine
+from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.prepare import thin_for_levels
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRules:
+    """When the places of LiDARs are wrong."""
+
+    sweeps: int = 5
+    """Spread over the drive."""
+    window_m: float = 60.0
+    """Half the side of the map of the first LiDAR's points."""
+    better: float = 1.25
+    """Fit of exchanged places, as a multiple of that of the stated ones, from which on they are exchanged."""
+    least_fit: float = 0.3
+    """Mean likelihood below which a LiDAR sees too little of what the first sees."""
+    off_m: float = 0.15
+    off_deg: float = 1.5
+    """A place that the points contradict by more is reported."""
+
+
+RULES = SweepRules()
+
+
+def check_lidars(
+    drive: Drive, topics: Sequence[str], T_base_lidars: F64, rules: SweepRules = RULES
+) -> Iterator[Finding]:
+    """Of a drive of several LiDARs: ``topics``, and where (n, 4, 4) they are stated to sit on the vehicle."""
+    sweeps = list(_sweeps(drive, T_base_lidars, rules))
+    if not sweeps:
+        return
+    stated = _places(T_base_lidars)
+    fits: dict[tuple[int, ...], float] = {(): float(np.median([_fit(one, stated, rules) for one in sweeps]))}
+    for pair in combinations(range(len(topics)), 2):
+        exchanged = _places(_exchanged(T_base_lidars, pair))
+        fits[pair] = float(np.median([_fit(one, exchanged, rules) for one in sweeps]))
+    best = max(fits, key=lambda pair: fits[pair])
+    if best and fits[best] > rules.better * fits[()] and fits[best] > rules.least_fit:
+        a, b = (topics[k] for k in best)
+        what = f"the frames of {a} and {b} are swapped: with their places exchanged the LiDARs see the same street to "
+        what += f"{fits[best]:.0%}, as stated to {fits[()]:.0%}"
+        mend = f"exchange the frame_ids in the drivers, or {_line(topics, _exchanged(T_base_lidars, best))}"
+        yield Finding("error", what, mend)
+    elif fits[()] < rules.least_fit:
+        what = f"the LiDARs see too little in common to say whether they sit as stated ({fits[()]:.0%} of the points)"
+        yield Finding("note", what)
+    else:
+        yield from _measured(sweeps, topics, T_base_lidars, rules)
+
+
+def _line(topics: Sequence[str], T_base_lidars: F64) -> str:
+    """The line of drive.toml that states where the LiDARs sit."""
+    lines = []
+    for topic, T in zip(topics, T_base_lidars, strict=True):
+        rpy_deg = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+        lines.append(f'"{topic}" = [{", ".join(f"{v:.4f}" for v in (*T[:3, 3], *rpy_deg))}]')
+    return f"write into drive.toml: mounts = {{{', '.join(lines)}}}"
+
+
+def _exchanged(T: F64, pair: tuple[int, ...]) -> F64:
+    out = T.copy()
+    out[list(pair)] = T[list(reversed(pair))]
+    return out
+
+
+def _places(T_base_lidars: F64) -> F64:
+    """(n - 1, 4, 4) T_first_other."""
+    return np.asarray(inverse(T_base_lidars[0]) @ T_base_lidars[1:])
+
+
+def _sweeps(drive: Drive, T_base_lidars: F64, rules: SweepRules) -> Iterator[list[F32]]:
+    """The points of each LiDAR, in its own axes, of sweeps in which all took part."""
+    stated = _places(T_base_lidars)
+    for i in np.unique(np.linspace(0, len(drive) - 1, rules.sweeps).astype(np.int64)).tolist():
+        parts = [part.points for _, part in drive.read_scan(i).by_lidar()]
+        if len(parts) == len(T_base_lidars):
+            own = [transform(inverse(T), p).astype(np.float32) for T, p in zip(stated, parts[1:], strict=True)]
+            yield [parts[0], *own]
+
+
+def _map_of(points: F32, rules: SweepRules) -> NdtMap:
+    ndt_map = NdtMap(np.zeros(3), half_window_m=rules.window_m)
+    ndt_map.enter(points.astype(np.float64))
+    return ndt_map
+
+
+def _fit(sweep: list[F32], T_first_others: F64, rules: SweepRules) -> float:
+    """Mean likelihood of the other LiDARs' points among those of the first."""
+    ndt_map = _map_of(sweep[0], rules)
+    pairs = zip(sweep[1:], T_first_others, strict=True)
+    return float(np.mean([fitness(ndt_map, thin_for_levels(points), T) for points, T in pairs]))
+
+
+def _measured(
+    sweeps: list[list[F32]], topics: Sequence[str], T_base_lidars: F64, rules: SweepRules
+) -> Iterator[Finding]:
+    """Where the points lay each other LiDAR, if that is elsewhere by more than matching errs."""
+    stated = _places(T_base_lidars)
+    maps = [_map_of(sweep[0], rules) for sweep in sweeps]
+    for k, T in enumerate(stated):
+        clouds = [thin_for_levels(sweep[k + 1]) for sweep in sweeps]
+        found = [refine(one, cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
+        off = np.median([log(inverse(T) @ T_found) for T_found in found], axis=0)
+        spread = np.median([np.abs(log(inverse(T) @ T_found) - off) for T_found in found], axis=0)
+        off_m, off_deg = float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:])))
+        steady = np.linalg.norm(spread[:3]) < 0.3 * off_m or np.degrees(np.linalg.norm(spread[3:])) < 0.3 * off_deg
+        if steady and (off_m > rules.off_m or off_deg > rules.off_deg):
+            what = f"by its points {topics[k + 1]} sits {off_m:.2f} m and {off_deg:.1f} deg off its stated place"
+            measured = T_base_lidars.copy()
+            measured[k + 1] = T_base_lidars[0] @ T @ exp(off)
+            yield Finding("warning", what, f"{_line(topics, measured)}; or leave it out with --topic")
