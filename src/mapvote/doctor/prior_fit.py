@@ -240,7 +240,10 @@ def _scale_words(m: Number, road: Road) -> tuple[str, str]:
     what = f"the prior's positions are {size} too large"
     if road.is_there and usual and not other:
         return what, f"divide its positions by {m.value:.4f}"
-    mend = "compare with a length that you know; Mercator's metres need a projection (UTM), feet 0.3048"
+    mend = (
+        f"divide its positions by {m.value:.4f}, or multiply the points by that: compare with a length that you know "
+    )
+    mend += "(Mercator's metres need a projection such as UTM, feet 0.3048), or decide by a map (--map)"
     return f"{what}, or the scans that much too small", mend
 
 
