@@ -118,7 +118,7 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     fits += [_fit(_reading_of(number, T, runs, e.road_below), T, runs, special=False) for number in numbers]
     # What the prior's own errors explain is no reason to read it otherwise.
     likely = [h for h in fits if as_it_is.median > _explained_m(drive, h.reading, h.median, length_m)]
-    best = min([as_it_is, *likely], key=lambda h: h.median)
+    best = _named_before(min([as_it_is, *likely], key=lambda h: h.median), likely, drive, length_m)
     floor_m = 0.1 + 0.12 * length_m + 2.0 * min(drive.prior_sigma_m, 1.5)
     if not _clearly_better(best, as_it_is, length_m):
         if as_it_is.median > floor_m:
@@ -163,6 +163,14 @@ def _explained_m(drive: Drive, reading: Reading, left_m: float, length_m: float)
     hardly more than twice that, whatever drive.toml states. A catch-all levels the prior too."""
     tilt_m = LEVER_M * np.radians(2.0 * drive.prior_sigma_deg) if reading.catch_all else 0.0
     return float(1.5 * min(drive.prior_sigma_m, 2.0 * left_m) + tilt_m + 0.01 * length_m)
+
+
+def _named_before(best: _Fit, likely: Sequence[_Fit], drive: Drive, length_m: float) -> _Fit:
+    """A reading whose rest the prior's own errors explain goes before a number, which takes up a part of them."""
+    if best.special or best.reading is AS_IT_IS:
+        return best
+    enough = [h for h in likely if h.special and h.median <= _explained_m(drive, h.reading, h.median, length_m)]
+    return min(enough, key=lambda h: h.median, default=best)
 
 
 def _fit(reading: Reading, T: F64, runs: Sequence[Run], special: bool = True) -> _Fit:
@@ -239,9 +247,9 @@ def _scale_words(m: Number, road: Road) -> tuple[str, str]:
         return f"{what}: by them the road lies {road.depth_m:.1f} m below", mend
     what = f"the prior's positions are {size} too large"
     if road.is_there and usual and not other:
-        return what, f"divide its positions by {m.value:.4f}"
+        return what, f"divide its positions by {m.value:.5g}"
     mend = (
-        f"divide its positions by {m.value:.4f}, or multiply the points by that: compare with a length that you know "
+        f"divide its positions by {m.value:.5g}, or multiply the points by that: compare with a length that you know "
     )
     mend += "(Mercator's metres need a projection such as UTM, feet 0.3048), or decide by a map (--map)"
     return f"{what}, or the scans that much too small", mend
