@@ -33,7 +33,7 @@ def sound() -> Recording:
         seen = transform(inverse(one), street[rng.random(len(street)) < 0.6])
         away = np.linalg.norm(seen, axis=1)
         scans.append(np.column_stack([seen, away])[(away < 40) & (away > 4)])
-    return Recording(scans, np.array(T), 0.1 * np.arange(len(T)), {})
+    return Recording(scans, np.array(T), np.linspace(0.0, 0.7, len(T)), {})
 
 
 def told(r: Recording, folder: Path, names: tuple[str, ...], stated: Mapping[str, F64]) -> list[str]:
