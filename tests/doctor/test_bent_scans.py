@@ -64,6 +64,21 @@ def test_scans_that_are_bent_fit_better_with_other_times(kind: str) -> None:
     assert "scans fit the map better" in finding.what
 
 
+@pytest.mark.parametrize("kind", [*SOUND, *WRONG])
+@pytest.mark.slow
+def test_poses_of_a_prior_tell_the_same_unless_they_jump(kind: str) -> None:
+    """The prior is off by .5 m, as satellites have it, and then jumps by .4 m from scan to scan."""
+    drive = SOUND[kind] if kind in SOUND else WRONG[kind][0]
+    prior = POSES.copy()
+    prior[:, :2, 3] += [0.4, 0.3]
+    found = list(check_bent(drive, list(prior), MAP, localised=False))
+    assert [f.what for f in found] == [f.what for f in check_bent(drive, list(POSES), MAP)] or (
+        len(found) == 1 and kind in WRONG and found[0].severity == WRONG[kind][1].split(":")[0]
+    )
+    prior[:, :2, 3] += np.random.default_rng(1).normal(0.0, 0.4, (len(prior), 2))
+    assert kind in WRONG or list(check_bent(drive, list(prior), MAP, localised=False)) == []
+
+
 def test_a_slow_drive_a_short_one_and_one_of_no_rings_tell_nothing() -> None:
     drive = WRONG["bent, without times"][0]
     standing = np.tile(POSES[:1], (len(POSES), 1, 1))

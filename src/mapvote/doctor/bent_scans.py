@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity
 from mapvote.formats.drives.point_fields import spinning_time_s
 from mapvote.matching.ndt import refine
@@ -33,6 +33,8 @@ class BentScans:
     """Fewer tell nothing."""
     least_speed_mps: float = 3.0
     """A slower sensor hardly bends its scans."""
+    unsteady_mps: float = 1.5
+    """Nor does a scan whose speed, over two steps and over six, differs by more."""
     better: float = 1.02
     """By what factor the median score with other times must exceed the score as read."""
     share: float = 0.75
@@ -43,19 +45,22 @@ BENT_SCANS = BentScans()
 _AS_READ, _NONE, _CLOCKWISE, _COUNTER = "as read", "none", "clockwise", "counter-clockwise"
 
 
-def check_bent(drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap) -> Iterator[Finding]:
+def check_bent(
+    drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap, *, localised: bool = True
+) -> Iterator[Finding]:
     """What other times of points fit the map clearly better than those of the drive. ``T_map_lidar``: of its scans, (4,
-    4) each, as localised."""
+    4) each, as localised; else as a prior has them, which may be off by a metre."""
     poses = np.array(T_map_lidar)
     stamps_ns = drive.stamps_ns[: len(poses)]
     if len(poses) < 3:
         return
     around = MapWindow(point_map)
+    first_level = len(LEVELS) - 1 if localised else 0
     scores: dict[str, list[float]] = {}
     told = None
     for i in np.unique(np.linspace(1, len(poses) - 2, BENT_SCANS.scans).astype(np.int64)).tolist():
-        twist = motion_at(stamps_ns, poses, i)
-        if np.linalg.norm(twist[:3]) < BENT_SCANS.least_speed_mps:
+        twist = _steady_motion(stamps_ns, poses, i)
+        if twist is None:
             continue
         try:
             scan = drive.read_scan(i)
@@ -67,12 +72,21 @@ def check_bent(drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap) ->
         ndt_map = around(poses[i, :3, 3])
         for name, time_s in _readings(scan, drive).items():
             clouds = Sample(replace(scan, time_s=time_s)).clouds(twist)
-            score = refine(ndt_map, clouds, poses[i], None, len(LEVELS) - 1).score
+            score = refine(ndt_map, clouds, poses[i], None, first_level).score
             scores.setdefault(name, []).append(score)
     best = _best(scores)
     if best is not None:
         how = "none" if told is None else told.how
         yield _finding(best, how, np.array(scores[_AS_READ]), np.array(scores[best]))
+
+
+def _steady_motion(stamps_ns: I64, poses: F64, i: int) -> F64 | None:
+    """(6,) motion per second at scan i; None if it is slow, or changes so much that the poses seem to jump."""
+    twist = motion_at(stamps_ns, poses, i)
+    span = slice(max(i - 3, 0), i + 4, 3)
+    longer = motion_at(stamps_ns[span], poses[span], 1)
+    slow = np.linalg.norm(twist[:3]) < BENT_SCANS.least_speed_mps
+    return None if slow or np.linalg.norm(twist[:3] - longer[:3]) > BENT_SCANS.unsteady_mps else twist
 
 
 def _readings(scan: Scan, drive: Drive) -> dict[str, F32 | None]:

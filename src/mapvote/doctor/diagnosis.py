@@ -19,6 +19,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
 from mapvote.doctor import Finding, Progress, any_error, in_order
 from mapvote.doctor.bags import check_bag, check_lidars_of_bag
+from mapvote.doctor.bent_scans import check_bent
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
@@ -136,6 +137,8 @@ def _with_map(
     else:
         more, T_level = check_on_map(mount.turned(drive), T @ mount.C.T, point_map, progress)
         T = T_level @ mount.C
+    if not any_error(more):
+        more += check_bent(drive, list(T), point_map, localised=False)
     if not of_map and all(f.severity == "note" for f in more):
         found = [f for f in found if not f.map_tells]
     return [*found, *named, *more], T
