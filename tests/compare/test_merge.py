@@ -38,6 +38,18 @@ def test_two_halves_in_frames_of_their_own_become_the_whole_with_one_point_a_vox
     assert len(voxels) == len(points)
 
 
+@pytest.mark.slow
+def test_times_of_points_tell_no_frame() -> None:
+    """Maps that state one frame share what separates them, whatever else one of them says."""
+    first = map_from_points(made_court(), georeference={"crs": "EPSG:32633"})
+    second = map_from_points(made_court(seed=2) + np.array([0.2, 0.0, 0.0]), georeference={"crs": "EPSG:32633"})
+    timed = replace(second, georeference={**second.georeference, "gps_times": "adjusted standard"})
+    elsewhere = replace(second, georeference={"crs": "EPSG:32632"})
+    T, T_timed, T_elsewhere = (merge_maps([first, other]).T_first_each for other in (second, timed, elsewhere))
+    assert np.array_equal(T_timed, T)
+    assert not np.array_equal(T_elsewhere, T)
+
+
 def test_free_space_of_every_map_comes_along_and_a_point_of_any_map_wins_over_it() -> None:
     def knowing(point_map: PointMap) -> PointMap:
         every = {i: replace(t, free=~t.obstacle_words & np.uint64(0xFF0)) for i, t in point_map.tiles.items()}

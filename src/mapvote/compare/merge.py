@@ -23,6 +23,7 @@ from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.core.voxels import VoxelCloud, voxel_keys
+from mapvote.formats.maps.tiling import GPS_TIMES, UNCHECKED
 from mapvote.survey.clean_map import specks, strays
 from mapvote.survey.driven_road import road_under
 from mapvote.survey.pose_graph import Anchors, Links, optimise
@@ -95,13 +96,17 @@ def _adjusted(
         for (i, j), one in pairs.items()
     ]
     moved_m = [np.linalg.norm(transform(T[k], middles[k][None])[0] - middles[k]) for k in range(len(maps))]
-    if any(one.lattice != maps[0].lattice or one.georeference != maps[0].georeference for one in maps) or any(
-        far_m > _SAME_FRAME_M for far_m in moved_m
-    ):
+    apart = any(one.lattice != maps[0].lattice or _place(one) != _place(maps[0]) for one in maps)
+    if apart or any(far_m > _SAME_FRAME_M for far_m in moved_m):
         anchors = Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)
     else:
         anchors = Anchors(np.arange(len(T)), inverse(about[0]) @ about, _SAME_FRAME_M, _SAME_FRAME_RAD)
     return np.asarray(about[0] @ optimise(nodes, links, [anchors], iterations=10) @ inverses(about))
+
+
+def _place(one: PointMap) -> dict[str, str]:
+    """What a map says of its coordinates; what it says of its points' times tells no frame."""
+    return {name: text for name, text in one.georeference.items() if name not in (GPS_TIMES, UNCHECKED)}
 
 
 def _along_the_pairs(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str]) -> F64:
