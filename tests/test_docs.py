@@ -38,6 +38,12 @@ def test_links_and_files_that_a_page_names_are_there_and_its_prose_wraps_at_120(
     assert [line for line in prose if len(line) > 120 and not line.startswith(("|", "!["))] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_a_cell_of_a_table_holds_at_most_three_sentences(page: Path) -> None:
+    cells = [cell for line in page.read_text().splitlines() if line.startswith("|") for cell in line.split("|")]
+    assert [cell for cell in cells if len(re.findall(r"[a-z0-9)%`*][.?!](?= [A-Z`*])", cell)) > 2] == []
+
+
 def test_every_page_is_reached_from_the_index_by_links() -> None:
     reached, to_read = set(), [ROOT / "docs/index.md"]
     while to_read:

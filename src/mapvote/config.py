@@ -336,7 +336,28 @@ def load_with_sources(
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"][:2])
-        raise MapvoteError(f"{sources[name]}: {name} = {first['input']!r}: {first['msg']}") from error
+        raise MapvoteError(f"{sources[name]}: {name} = {first['input']!r}: {wanted_of(first)}") from error
+
+
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "string": "a text",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "a table",
+}
+"""Types by the first word of pydantic's names of errors."""
+
+
+def wanted_of(error: Mapping[str, Any]) -> str:
+    """An error of pydantic as a sentence that says what to give."""
+    kind, _, fault = error["type"].partition("_")
+    if kind in _KINDS and fault in ("parsing", "type", "from_float"):
+        return f"give {_KINDS[kind]}"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return message.replace("Input should be", "give a value that is", 1)
 
 
 def _from_file(path: Path | str | None) -> Iterable[tuple[str, str, Any, str]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, is_url, sound_map, when
+from mapvote.cli.door import api_at, check_ending, is_url, sound_map, when
 from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
 from mapvote.core.types import MapvoteError
@@ -24,7 +24,9 @@ def register(app: typer.Typer) -> None:
     """Add the verbs of a server and its store."""
     verbs = (serve, publish, policy, log, explain, coverage, rollback, unvote, check, gc, keys)
     for verb in verbs:
-        app.command(rich_help_panel=SERVER)(verb)
+        # Half of every local map is negative: -12.5 is a coordinate there, no option.
+        negative = {"ignore_unknown_options": True} if verb is explain else None
+        app.command(rich_help_panel=SERVER, context_settings=negative)(verb)
 
 
 def serve(
@@ -201,21 +203,26 @@ def log(
     metres: Annotated[
         bool, typer.Option("--metres", help="write map metres instead of longitude and latitude")
     ] = False,
+    geojson: Annotated[bool, typer.Option("--geojson", help="print the changes as GeoJSON instead of a table")] = False,
     key_file: KeyFile = None,
 ) -> None:
     """List the versions of a store, or what was built and demolished between two of them.
 
-    With --from, --out or --html: the changes, as GeoJSON in longitude and latitude, or as a GeoPackage in the map's own
-    coordinate system. A map in local metres gives metres.
+    With --from or --to: a table of the changes, the largest first. --out writes them as GeoJSON in longitude and
+    latitude, or as a GeoPackage in the map's own coordinate system. A map in local metres gives metres.
 
         mapvote log fleet.db --events 20
 
         mapvote log fleet.db --from 1 --out changes.geojson
     """
-    if (old, new, out, page) == (None, None, None, None):
+    check_ending(out, "--out", ".geojson", ".json", ".gpkg")
+    check_ending(page, "--html", ".html", ".htm")
+    if (old, new, out, page) == (None, None, None, None) and not geojson:
         with api_at(store, key_file) as server:
             _print_versions(server.ask_json("GET", f"/v1/log?events={events}"))
         return
+    import json
+
     from mapvote.formats.atomic import write_whole
 
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
@@ -226,9 +233,13 @@ def log(
     if page is not None:
         write_whole(page, text)
         print(f"the largest of {len(found['features'])} changes in {page}")
-        if out is None:
-            return
-    _write_changes(found, out)
+    _tell_damaged(found)
+    if out is not None:
+        _write_changes(found, out)
+    elif geojson:
+        print(json.dumps(found, indent=1))
+    elif page is None:
+        _print_changes(found)
 
 
 def _print_versions(answer: Mapping[str, Any]) -> None:
@@ -242,19 +253,42 @@ def _print_versions(answer: Mapping[str, Any]) -> None:
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
 
 
-def _write_changes(found: dict[str, Any], out: Path | None) -> None:
+_MOST_CHANGES = 40
+
+
+def _print_changes(found: Mapping[str, Any]) -> None:
+    """The changes as a table, the largest first."""
+    rows = []
+    largest_first = sorted(found["features"], key=lambda feature: -feature["properties"]["area_m2"])
+    for feature in largest_first[:_MOST_CHANGES]:
+        about = feature["properties"]
+        (x0, y0), (x1, y1) = about["box"]
+        votes = f"{about['votes_min']}"
+        sizes = f"{about['area_m2']:.1f}", f"{about['height_m']:.1f}", str(about["points"])
+        rows.append((about["kind"], f"{0.5 * (x0 + x1):.1f}", f"{0.5 * (y0 + y1):.1f}", *sizes, votes))
+    versions = f"from version {found['from_version']} to {found['to_version']}"
+    if not rows:
+        print(f"nothing changed {versions}")
+        return
+    print_table(("change", "x (m)", "y (m)", "m2", "m high", "points", "votes at least"), rows)
+    if len(found["features"]) > _MOST_CHANGES:
+        print(f"and {len(found['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
+    print(f"{len(found['features'])} changes {versions}")
+
+
+def _tell_damaged(found: Mapping[str, Any]) -> None:
+    if found.get("damaged"):
+        left_out = "; ".join(found["damaged"])
+        typer.echo(f"left out: tiles {left_out} are damaged (see mapvote check)", err=True)
+
+
+def _write_changes(found: dict[str, Any], out: Path) -> None:
     import json
 
     from mapvote.formats.atomic import write_whole
     from mapvote.formats.geo.frame import frame_of
     from mapvote.formats.geo.geopackage import write_geopackage
 
-    if found.get("damaged"):
-        left_out = "; ".join(found["damaged"])
-        typer.echo(f"left out: tiles {left_out} are damaged (see mapvote check)", err=True)
-    if out is None:
-        print(json.dumps(found, indent=1))
-        return
     if out.suffix.lower() == ".gpkg":
         write_geopackage(out, found["features"], frame_of(found["georeference"]))
     else:
@@ -264,13 +298,13 @@ def _write_changes(found: dict[str, Any], out: Path | None) -> None:
 
 def explain(
     store: StoreOrUrl,
-    x: Annotated[float, typer.Argument(metavar="X", help="map metres; after -- if one is negative")],
+    x: Annotated[float, typer.Argument(metavar="X", help="map metres")],
     y: Annotated[float, typer.Argument(metavar="Y", help="map metres")],
     key_file: KeyFile = None,
 ) -> None:
     """Explain a cell of the map: every vote on it, and which version counted the vote or why none did.
 
-    mapvote explain fleet.db 12.5 -- -3.0
+    mapvote explain fleet.db 12.5 -3.0
     """
     with api_at(store, key_file) as server:
         answer = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
@@ -316,6 +350,7 @@ def coverage(
 
     from mapvote.formats.atomic import write_whole
 
+    check_ending(out, "--out", ".geojson", ".json")
     with api_at(store, key_file) as server:
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
@@ -488,8 +523,15 @@ def keys(
             ]
             print_table(("role", "name", "issued", "state"), rows)
         elif action == "issue":
+            valid = sum(key["name"] == name and key["valid"] for key in server.ask_json("GET", "/v1/keys")["keys"])
             ask = {"name": name, "role": role, "days": days}
             print(server.ask_json("POST", "/v1/keys", json=ask)["key"])
+            if valid:
+                typer.echo(
+                    f"{name} had {valid} valid {'key' if valid == 1 else 'keys'} before, and all of them stay valid: "
+                    "rotate replaces the old ones, revoke ends all",
+                    err=True,
+                )
         elif action == "rotate":
             ask = {"name": name, "overlap_days": overlap_days}
             print(server.ask_json("POST", "/v1/keys/rotate", json=ask)["key"])

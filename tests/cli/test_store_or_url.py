@@ -56,7 +56,7 @@ def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, 
     assert "every plane, ballot and version is what it was" in both(site, "check")
     assert re.search(r"ballots +│ 2 ", both(site, "info"))
     assert "Compared where others agree" in both(site, "info", "--vehicles")
-    found = json.loads(both(site, "log", "--from", 1, "--metres"))
+    found = json.loads(both(site, "log", "--from", 1, "--geojson", "--metres"))
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
     pages = [tmp_path / "store.html", tmp_path / "server.html"]
     for source, page in zip(site, pages, strict=True):

@@ -6,16 +6,19 @@ are checked by the doctor's cheap checks: an error stops the verb, warnings go t
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
-from mapvote.cli.terminal import progress
+from mapvote.cli.terminal import progress, waiting
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
@@ -74,7 +77,9 @@ def api_at(
         with closing(Connection(name, key=key_in(key_file), timeout_s=600.0)) as server:
             yield server
         return
-    with stores().api_of(name, settings, executor) as connection:
+    with ExitStack() as opened:
+        with waiting(f"opening {name}"):
+            connection = opened.enter_context(stores().api_of(name, settings, executor))
         yield connection
 
 
@@ -147,12 +152,34 @@ def map_at(
     yield sound_map(name)
 
 
+def numbers_in(text: str, option: str, wanted: str, count: int) -> tuple[float, ...]:
+    """``count`` finite numbers separated by commas. MapvoteError says what ``option`` wants: ``wanted``."""
+    try:
+        numbers = tuple(float(number) for number in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise MapvoteError(f"{option} {text}: give {wanted}")
+    return numbers
+
+
+def check_ending(file: Path | None, option: str, *endings: str) -> None:
+    """MapvoteError if a file to write has none of the ``endings``, which say the format."""
+    if file is not None and file.suffix.lower() not in endings:
+        raise MapvoteError(f"{option} {file}: is written as {' or '.join(endings)}; give the file such an ending")
+
+
+def named_after(folder: Path, point_map: PointMap) -> PointMap:
+    """The map with a name that people can read: that of its folder, and eight digits of its content's hash, which
+    tell maps of one name apart."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", folder.name)[:40]
+    return replace(point_map, map_id=f"{name}-{point_map.map_id[:8]}")
+
+
 def region_in(text: str) -> Region:
     """X0,Y0,X1,Y1 in map metres; MapvoteError if it is none."""
-    try:
-        x0, y0, x1, y1 = map(float, text.split(","))
-    except ValueError:
-        raise MapvoteError(f"--region {text}: give X0,Y0,X1,Y1 in map metres, lower left and upper right") from None
+    wanted = "X0,Y0,X1,Y1 in map metres, lower left and upper right"
+    x0, y0, x1, y1 = numbers_in(text, "--region", wanted, 4)
     if not (x0 < x1 and y0 < y1):
         raise MapvoteError(f"--region {text}: is empty; give the lower left corner first, then the upper right")
     return x0, y0, x1, y1

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import client_of, key_in, map_at, region_in, require_straight, usable_drives
+from mapvote.cli.door import (
+    check_ending,
+    client_of,
+    key_in,
+    map_at,
+    named_after,
+    region_in,
+    require_straight,
+    usable_drives,
+)
 from mapvote.cli.options import Config, KeyFile, with_drive_options
 from mapvote.cli.terminal import print_table, progress, waiting
 from mapvote.core.types import MapvoteError
@@ -48,6 +57,7 @@ def build(
     from mapvote.formats import open_drive, write_map
     from mapvote.survey.build import build_map
 
+    check_ending(report_png, "--report", ".png", ".svg", ".pdf")
     if out.exists():
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
     settings = load_settings(config)
@@ -55,7 +65,7 @@ def build(
     with usable_drives(opened) as looked_at, progress("mapping") as tell:
         point_map, report = build_map(looked_at, settings, progress=tell)
     with waiting(f"writing {out}"):
-        write_map(point_map, out)
+        write_map(named_after(out, point_map), out)
     _tell(report, out)
     if report_png is not None:
         from mapvote.plots import draw_survey
@@ -139,6 +149,10 @@ def vote(
             help="download only this part of a server's map, in map metres; leave 100 m around the drive",
         ),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="also write the poses of the scans, for evo: FILE.tum or FILE.kitti"),
+    ] = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="for a cloud: the sensor's poses in the cloud's frame, rows of 3 x 4 or TUM"),
@@ -158,7 +172,11 @@ def vote(
     from mapvote.core.point_map import has_open_ground
     from mapvote.formats import is_cloud, open_drive_on
     from mapvote.formats.atomic import write_whole
+    from mapvote.formats.drives.pose_files import ENDINGS, write_trajectory
 
+    check_ending(poses, "--poses", *ENDINGS)
+    if poses is not None and is_cloud(drive_path):
+        raise MapvoteError("vote: a cloud has no scans, so it has no poses to write; leave out --poses")
     if out is None and send is None:
         raise MapvoteError("vote: give --out BALLOT, --send URL, or both")
     key = key_in(key_file)
@@ -185,6 +203,9 @@ def vote(
     if out is not None:
         write_whole(out, data)
     _tell_votes(ballot, report, out, len(data))
+    if poses is not None and report is not None:
+        written = write_trajectory(poses, report.stamps_ns, report.T_map_lidar, frozenset(report.lost))
+        print(f"{poses}: {written} poses")
     if send is not None:
         _send(send, key, data)
 
@@ -279,6 +300,9 @@ def diff(
     """
     import json
 
+    check_ending(out, "--out", ".geojson", ".json")
+    check_ending(csv, "--csv", ".csv")
+    check_ending(page, "--html", ".html", ".htm")
     from mapvote.compare.cloud_changes import (
         compare_cells,
         difference_geojson,
@@ -352,7 +376,7 @@ def merge(
     for (i, j), far in merged.apart_m.items():
         print(f"{paths[i]} and {paths[j]}: {far:.3f} m apart after adjustment (median)")
     with waiting(f"writing {out}"):
-        write_map(merged.point_map, out)
+        write_map(named_after(out, merged.point_map), out)
     print(f"{out}: {merged.point_map.n_points} points")
 
 

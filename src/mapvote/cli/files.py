@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, is_store, is_url, key_in, look_at_points, map_at, sound_map, stores, when
+from mapvote.cli.door import (
+    api_at,
+    check_ending,
+    is_store,
+    is_url,
+    key_in,
+    look_at_points,
+    map_at,
+    named_after,
+    numbers_in,
+    sound_map,
+    stores,
+    when,
+)
 from mapvote.cli.options import Config, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
 from mapvote.core.types import MapvoteError
@@ -107,6 +120,7 @@ def doctor(
     from mapvote.doctor.diagnosis import Diagnosis, diagnose
     from mapvote.formats import read_map
 
+    check_ending(png, "--png", ".png", ".svg", ".pdf")
     if is_url(path):
         raise MapvoteError(f"doctor: {path} is a server: mapvote check {path} looks at its store")
     with ExitStack() as open_map:
@@ -201,6 +215,7 @@ def import_map(
 
         point_map, lone = without_lone_points(point_map)
         told = [*told, f"{lone} points above the ground dropped: they touch no other"]
+    point_map = named_after(out, point_map)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
@@ -252,10 +267,7 @@ def export(
             raise MapvoteError("export: --follow takes the URL of a server and a folder")
         _follow(source, out, projector, key_file, keep=keep, every=None if once else every)
         return
-    try:
-        x, y, z = (float(v) for v in offset.split(","))
-    except ValueError as error:
-        raise MapvoteError(f"--offset {offset!r}: give three numbers, for example 367000,3951000,0") from error
+    x, y, z = numbers_in(offset, "--offset", "three numbers, for example 367000,3951000,0", 3)
     live = not out.suffix and (is_url(source) or is_store(source))
     if since is not None and not live:
         raise MapvoteError("export: --since writes Autoware tiles of a store or a server: give a folder, not a file")
@@ -382,6 +394,7 @@ def update(
     from mapvote.formats.atomic import whole_file
     from mapvote.fusion.fuse import states_over, update_map
 
+    check_ending(cells, "--cells", ".npz")
     if out is None and not dry_run:
         raise MapvoteError("update: give --out MAP, or --dry-run to only report")
     ballots = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -93,10 +94,21 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for each stage as it begins, told (stage, done, in all); they stay, with the time that each took."""
+    """A bar for each stage as it begins, told (stage, done, in all); they stay, with the time that each took. Without a
+    terminal a line for each stage."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    if not sys.stderr.isatty():  # a file or a pipe: a line as each stage begins, so that nobody waits in the dark
+        begun: set[str] = set()
+
+        def tell_begin(stage: str, done: int, total: int) -> None:
+            if stage not in begun:
+                begun.add(stage)
+                print(f"{time.strftime('%H:%M:%S')} {stage} ({total})", file=sys.stderr, flush=True)
+
+        yield tell_begin
+        return
     columns = TextColumn("{task.description:<24}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True)) as bar:
         tasks: dict[str, TaskID] = {}

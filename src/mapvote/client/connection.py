@@ -83,7 +83,7 @@ class Connection:
                     raise Unreachable(f"{self.url}: {trouble}; ask again in {wait_s:.0f} s")
                 continue
             if answer.status_code >= 400:
-                why = f"{self.url}: refused ({answer.status_code}): {detail_of(answer)}"
+                why = f"{self.url}: refused ({answer.status_code}): {detail_of(answer)}{_mend(answer)}"
                 raise Refused(why, answer.status_code)
             return answer
         raise Unreachable(f"{self.url}: no answer after {self._attempts} attempts ({trouble}); try again later")
@@ -95,7 +95,8 @@ class Connection:
             with self._http.stream("GET", path, timeout=_LONGEST_WAIT_S) as answer:
                 if answer.status_code >= 400:
                     answer.read()
-                    raise Refused(f"{self.url}: refused: {detail_of(answer)}", answer.status_code)
+                    why = f"{self.url}: refused: {detail_of(answer)}{_mend(answer)}"
+                    raise Refused(why, answer.status_code)
                 yield from answer.iter_lines()
         except httpx2.TransportError as error:
             raise Unreachable(f"{self.url}: {error or type(error).__name__}") from error
@@ -115,6 +116,13 @@ def detail_of(answer: httpx2.Response) -> str:
     except (ValueError, KeyError, TypeError):
         return f"status {answer.status_code}"
     return str(found)
+
+
+def _mend(answer: httpx2.Response) -> str:
+    """How a user of the command line or of MapClient gives the key that a server asks for."""
+    if answer.status_code != 401:
+        return ""
+    return ". On the command line give --key-file FILE, or set MAPVOTE_KEY; in Python MapClient(url, key=...)"
 
 
 def _asked_to_wait_s(answer: httpx2.Response) -> float:

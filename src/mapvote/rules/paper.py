@@ -17,7 +17,7 @@ from typing import get_args
 import numpy as np
 from pydantic import ValidationError
 
-from mapvote.config import PaperSettings, Settings, VotingSettings
+from mapvote.config import PaperSettings, Settings, VotingSettings, wanted_of
 from mapvote.core.columns import EVERY_BIT, below_top, span_of
 from mapvote.core.grid import CELL_SIZE, Grid, TileIndex, window_around
 from mapvote.core.kernel import kernel
@@ -264,4 +264,4 @@ def read(base: PaperSettings, said: str) -> PaperSettings:
         return PaperSettings.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        raise MapvoteError(f"reading {first['loc'][0]}={first['input']}: {first['msg']}") from error
+        raise MapvoteError(f"reading {first['loc'][0]}={first['input']}: {wanted_of(first)}") from error

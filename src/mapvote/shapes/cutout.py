@@ -85,6 +85,8 @@ def _only_trimmed(facts: Mapping[str, Any]) -> bool:
 
 def fragment(cutouts: Sequence[Cutout]) -> str:
     """HTML to insert into a page: a 3D view of the changes, one at a time. It makes no request."""
+    if not cutouts:
+        return "<p>Nothing is gone and nothing is new: there is no change to show.</p>"
     viewer = resources.files("mapvote.shapes") / "viewer"
     modules = {name: (viewer / name).read_text() for name in _MODULES}
     return (

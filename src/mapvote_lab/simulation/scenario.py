@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mapvote.config import wanted_of
 from mapvote.core.sensors import NAMED
 from mapvote.core.types import MapvoteError
 
@@ -134,7 +135,7 @@ def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = No
     except ValidationError as error:
         first = error.errors()[0]
         raise MapvoteError(
-            f"scenario {scenario}: {'.'.join(str(part) for part in first['loc'])}: {first['msg']} "
+            f"scenario {scenario}: {'.'.join(str(part) for part in first['loc'])}: {wanted_of(first)} "
             f"(known keys: {', '.join(Scenario.model_fields)})"
         ) from error
     if found.sensor not in NAMED:

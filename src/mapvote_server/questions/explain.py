@@ -130,7 +130,8 @@ class CellStory:
     """Probability that the cell changed as the last decision states (fusion/loss_budget.py); None if it states no
     change."""
     thing: str
-    """Text: what stands in the cell, whether a new object is temporary, and how many earlier objects stood there."""
+    """Text: "outside the map", or what stands in the cell, whether a new object is temporary, and how many earlier
+    objects stood there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +169,10 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions else None
     by_version = [CellDecision(record.version, state, _edit_of(record, cell)) for record, state in decisions]
-    return CellStory(row, col, votes, by_version, probability, "; ".join([*_lacks(now, votes), *_thing(now)]))
+    thing = [*_lacks(now, votes), *_thing(now)]
+    if not thing and not votes and not decisions and not len(now.tile.points):
+        thing = ["outside the map"]
+    return CellStory(row, col, votes, by_version, probability, "; ".join(thing))
 
 
 def seen(stamp_ns: int | None, known: bool) -> int | None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import sqlalchemy as sa
 from pydantic import Field, ValidationError
 
-from mapvote.config import FuseSettings, GateSettings, RuleName, Section, Settings, did_you_mean
+from mapvote.config import FuseSettings, GateSettings, RuleName, Section, Settings, did_you_mean, wanted_of
 from mapvote.core.types import MapvoteError
 from mapvote_server.store import schema
 from mapvote_server.store.queries import log_event
@@ -115,4 +115,4 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"][:2])
-        raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error
+        raise MapvoteError(f"policy: {where} = {first['input']!r}: {wanted_of(first)}") from error

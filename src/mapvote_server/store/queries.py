@@ -37,7 +37,7 @@ def version_of(connection: sa.Connection, number: int | None = None, *, cleared:
     row = connection.execute(asked if number is None else asked.where(v == number)).one_or_none()
     if row is None:
         newest = current_number(connection)
-        raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
+        raise NotFound(f"there is no version {number}; the newest is {newest}")
     if row.cleared_seq is not None and not cleared:
         oldest = oldest_kept(connection)
         raise NotFound(f"version {number} was cleared away; the oldest that is kept is {oldest}")

@@ -23,6 +23,7 @@ from mapvote.codec.tile_planes import pack_memory, pack_tile
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import Bool
+from mapvote.core.voxels import found_among
 from mapvote.fusion.fuse import differing
 from mapvote_server.errors import Conflict, NotFound
 from mapvote_server.store import schema
@@ -132,8 +133,8 @@ def replay(
         if (mine if ours.there else None) != (pack_tile(theirs.tile)[0] if theirs.there else None):
             tiles[index] = mine if ours.there else structs.replace(TileHashes.none(), memory=mine.memory)
             planes.append(packed)
-            grown = len(ours.tile.points) - len(theirs.tile.points)
-            added, deleted = added + max(grown, 0), deleted + max(-grown, 0)
+            added += int((~found_among(ours.tile.points, theirs.tile.points)).sum())
+            deleted += int((~found_among(theirs.tile.points, ours.tile.points)).sum())
     if dry_run:
         return Outcome(newest.number, False, sorted(tiles), added, deleted, [])
     why = f"as if {vehicle} had never voted, from version {start} on"

@@ -195,11 +195,11 @@ def parse_scans(scans: str | None, n: int, where: str) -> I64:
                 chosen[int(parts[0] or 0)] = True
             else:
                 chosen[slice(*parts)] = True
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError):
             raise MapvoteError(
-                f"{where}: --scans {piece!r} chooses nothing from {n} scans ({error}); write START:STOP:STEP, "
+                f"{where}: --scans {piece!r} chooses nothing from {n} scans; write whole numbers as START:STOP:STEP, "
                 f"for example 0:12,24:36"
-            ) from error
+            ) from None
     if not chosen.any():
         raise MapvoteError(f"{where}: --scans {scans!r} chooses none of its {n} scans")
     return np.flatnonzero(chosen)
