@@ -21,6 +21,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
+from mapvote_server.api import key_form
 from mapvote_server.api.schemas import refuse
 from mapvote_server.api.services import Batcher, Metrics, RateLimit
 from mapvote_server.errors import Forbidden, TooMany, Unauthorised, Unavailable
@@ -36,7 +37,8 @@ _WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
 
 
 class Guard:
-    """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
+    """Keys come as ``Authorization: Bearer KEY``, as Basic with the key as password, or in the cookie of a browser
+    (:mod:`mapvote_server.api.key_form`).
 
     The key of every request is looked up in the store, many in one query, so a revoked key works no longer at once. The
     key of a ballot is looked up in the transaction that writes the ballot
@@ -109,11 +111,11 @@ def _secret_of(authorization: str | None) -> str | None:
 
 HEADERS = (
     ("X-Content-Type-Options", "nosniff"),
-    ("Referrer-Policy", "no-referrer"),
+    ("Referrer-Policy", "same-origin"),
     (
         "Content-Security-Policy",
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        "base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
     ),
     ("Cross-Origin-Resource-Policy", "same-origin"),
 )
@@ -164,6 +166,15 @@ def _name_in(host: str) -> str:
     return (found[1] or found[2]) if found else ""
 
 
+def _authorization(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
+    """The header, or what the cookie of a browser stands for."""
+    sent = next((value for name, value in headers if name == b"authorization"), None)
+    if sent is not None:
+        return sent.decode("latin-1")
+    kept = key_form.key_in_cookie(headers)
+    return None if kept is None else f"Bearer {kept}"
+
+
 PROBES = ("/livez", "/readyz")
 """Who asks without a key, by any name of the server, gets a status without content."""
 _PROBE_S = 1.0
@@ -196,9 +207,12 @@ class Watch:
 
         try:
             self._hosts.check(scope["headers"])
-            sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
-            authorization = None if sent is None else sent.decode("latin-1")
             peer = (scope["client"] or ("",))[0]
+            if scope["method"] == "POST" and scope["path"] == key_form.PATH:
+                answer = await self._let_in(scope, receive, peer)
+                await answer(scope, receive, watched)
+                return
+            authorization = _authorization(scope["headers"])
             ballot = scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/")
             whose = await self._guard.who(authorization, peer, ballot=ballot)
             key, key_hash = whose or (None, None)
@@ -207,8 +221,13 @@ class Watch:
         except MapvoteError as error:
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
             probed = asks and scope["path"] in PROBES
-            answer = Response(status_code=await self._status(scope["path"])) if probed else refuse(error)
-            await answer(scope, receive, watched)
+            if isinstance(error, Unauthorised) and asks and scope["path"] == key_form.STYLE:
+                refused = key_form.style()
+            elif isinstance(error, Unauthorised) and key_form.asks_for_page(scope):
+                refused = key_form.form(str(error) if key_form.key_in_cookie(scope["headers"]) else "")
+            else:
+                refused = Response(status_code=await self._status(scope["path"])) if probed else refuse(error)
+            await refused(scope, receive, watched)
         except asyncio.CancelledError:  # the server stops and waits no longer
             await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
         finally:
@@ -219,6 +238,15 @@ class Watch:
             tell = log.warning if status >= 500 else log.info
             name = key.name if key else "-"
             tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))
+
+    async def _let_in(self, scope: Scope, receive: Receive, peer: str) -> Response:
+        """The answer to the form that asks for a key."""
+        try:
+            sent = await key_form.key_sent(scope, receive)
+            await self._guard.who(f"Bearer {sent}", peer)
+        except Unauthorised as error:
+            return key_form.form(str(error))
+        return key_form.welcome(scope, sent)
 
     async def _status(self, path: str) -> int:
         """The answer to a probe."""

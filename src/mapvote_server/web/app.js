@@ -2,8 +2,8 @@
 
 import * as api from "./api.js";
 import { showTiles } from "./coverage.js";
-import { closeDetails, follow, showCell, showChange } from "./details.js";
-import { confirm, goBack, showDesk } from "./desk.js";
+import { closeDetails, drawable, follow, showCell, showChange } from "./details.js";
+import { choose, confirm, goBack, showDesk } from "./desk.js";
 import { showList } from "./list.js";
 import { Stage } from "./stage.js";
 import { listen } from "./live.js";
@@ -48,10 +48,25 @@ async function start() {
   await showRange(first);
   follow();
   showVehicles();
-  showDesk();
+  openOnChanges(await showDesk());
   listen();
 }
 state.restart = () => start();
+
+// The first look goes to what changed: what waits at the desk, else what the list holds. A link says itself where to look.
+let opened = false;
+function openOnChanges(pending) {
+  const asked = address.read();
+  const marked = opened || ["eye", "change", "cell", "pending"].some((name) => asked[name]);
+  opened = true;
+  if (marked) return;
+  if (pending.length) return choose(pending[0], true);
+  const large = state.features.filter((f) => f.properties.size !== "small");
+  const boxes = (large.length ? large : state.features).map((f) => drawable(f).box);
+  if (!boxes.length) return;
+  const around = [0, 1].map((i) => Math.min(...boxes.map((b) => b[i]))).concat([2, 3].map((i) => Math.max(...boxes.map((b) => b[i]))));
+  view.fit(around, 0.38, { elevation: 0.62 });
+}
 
 async function begin() {
   const coarse = api.overview().catch(() => null);

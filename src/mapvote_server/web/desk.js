@@ -9,13 +9,13 @@ const KEYS = { a: "accepted", h: "held", r: "rejected" };
 const REVIEW = "verdict.";  // a change that was held or rejected, which a publish leaves out
 let desk = null, chosen = null;
 
-// For reviewers and operators; to anyone else the server does not tell.
+// For reviewers and operators; to anyone else the server does not tell. The pending changes, the largest first.
 export async function showDesk() {
   try {
     desk = await api.desk();
   } catch (error) {
     if (error.status !== 403) notice(error.message);
-    return;
+    return [];
   }
   const { pending, reviewed, held, version } = desk;
   const size = (f) => -f.properties.area_m2;
@@ -34,6 +34,7 @@ export async function showDesk() {
   $("publish").textContent = held.length ? "Publish and override" : "Publish";
   const wanted = chosen?.id ?? address.read().pending;
   choose([...waiting, ...reviewed].find((f) => f.id === wanted) ?? null);
+  return waiting;
 }
 
 const row = (f) => {
@@ -68,7 +69,7 @@ const left = (f) => {
   ]);
 };
 
-function choose(feature, visit = false) {
+export function choose(feature, visit = false) {
   chosen = feature;
   address.write({ pending: feature?.id ?? null });
   state.view.setPending(feature && drawable(feature));

@@ -84,7 +84,9 @@ def test_the_whole_story(site: Site, tmp_path: Path) -> None:
     assert site.ask("POST", "/v1/publish", site.operator, json={"dry_run": True}).json()["points_deleted"] == 3
     done = site.ask("POST", "/v1/publish", site.operator, json={"parent": 1}).json()
     assert done == {
-        "version": 2, "published": True, "tiles": ["0,0"], "points_added": 0, "points_deleted": 3, "held": []
+        "version": 2, "published": True, "tiles": ["0,0"], "points_added": 0, "points_deleted": 3, "held": [],
+        "doubts": [],
+        "waits": ""
     }  # fmt: skip
     assert site.ask("POST", "/v1/publish", site.operator, json={"parent": 1}).status_code == 409
     before = len(list((tmp_path / "a" / "planes").iterdir()))
@@ -104,7 +106,7 @@ def test_the_whole_story(site: Site, tmp_path: Path) -> None:
         ("a", "changed_empty", False),
         ("b", "changed_empty", False),
     ]
-    assert cell["decisions"] == [{"version": 2, "state": "changed_empty"}]
+    assert cell["decisions"] == [{"version": 2, "state": "changed_empty", "edit": None}]
     tiles = site.ask("GET", "/v1/coverage", site.operator).json()["tiles"]
     assert [(t["vehicles"], t["last_seen"] is not None) for t in tiles] == [(2, True), (0, False)]
     assert site.ask("POST", "/v1/rollback", site.operator, json={"to": 1}).json() == {"version": 3}
@@ -135,6 +137,28 @@ def test_browsers_send_the_key_as_a_password(site: Site) -> None:
     page = httpx2.get(site.url + "/", auth=("operator", site.operator), timeout=300.0)
     assert page.status_code == 200
     assert "text/html" in page.headers["content-type"]
+
+
+def test_a_browser_is_asked_for_the_key_by_a_form_and_keeps_it_in_a_cookie(site: Site) -> None:
+    html = {"Accept": "text/html,application/xhtml+xml"}
+    with httpx2.Client(base_url=site.url, timeout=60.0) as browser:
+        page = browser.get("/", headers=html)
+        assert (page.status_code, page.headers["www-authenticate"]) == (401, "Bearer"), (
+            "no question of the browser's own"
+        )
+        assert 'action="key"' in page.text
+        assert browser.get("/viewer/key.css").status_code == 200
+        assert browser.get("/viewer/app.js").status_code == 401, "nothing else without a key"
+        wrong = browser.post("/key", data={"key": "wrong"})
+        assert (wrong.status_code, "unknown" in wrong.text) == (401, True)
+        assert browser.post("/key", content=b"\xff" * 9_000).status_code == 401
+        right = browser.post("/key", data={"key": site.operator})
+        assert (right.status_code, right.headers["location"]) == (303, "./")
+        assert {"HttpOnly", "SameSite=strict"} <= set(right.headers["set-cookie"].split("; "))
+        assert browser.get("/", headers=html).status_code == 200
+        assert browser.get("/v1/desk").status_code == 200
+        assert browser.get("/v1/desk", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert site.operator not in site.log.read_text()
 
 
 def test_errors_say_what_to_do(site: Site) -> None:

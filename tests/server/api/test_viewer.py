@@ -80,6 +80,10 @@ def open_page(browser: Chromium, url: str) -> None:
     browser.wait(SHOWN)
 
 
+def type_key(browser: Chromium, key: str) -> None:
+    browser.run(f"document.querySelector('#key').value = {key!r}; document.querySelector('form').submit()")
+
+
 def test_the_liar_is_named_from_the_ballots_in_the_store(town: Path) -> None:
     store = Store.open(f"sqlite:///{town}")
     found = {s.vehicle: s for s in vehicle_standings(store)}
@@ -176,7 +180,14 @@ def test_the_browser_keeps_the_key_and_sends_it_for_every_list(browser: Chromium
         assert httpx2.get(url).status_code == 401
         answer = httpx2.get(f"{url}/v1/vehicles", headers={"Authorization": f"Bearer {vehicle}"}, timeout=60.0)
         assert answer.status_code == 403, "who contradicts whom"
-        open_page(browser, url.replace("://", f"://operator:{key}@"))
+        browser.open(url)
+        browser.wait("!!document.querySelector('form #key')")
+        assert "This map needs a key" in browser.text("main")
+        type_key(browser, "wrong")
+        browser.wait("document.querySelector('[role=alert]')?.innerText.includes('unknown')")
+        type_key(browser, key)
+        browser.wait(SHOWN)
+        browser.errors.clear()  # the form itself is an answer of status 401
         browser.wait("document.querySelector('#vehicles').innerText.includes('liar')")
         asked = (
             "fetch(new URL(a.getAttribute('href'), location.origin + location.pathname)).then(answer => answer.status)"
