@@ -31,6 +31,7 @@ from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError
 from mapvote.core.voting import to_wire
 from mapvote.formats.drives.sensor_estimate import sensor_upright
 from mapvote.matching.localiser import Localise, Localiser
+from mapvote.matching.prior_frame import PriorFrame
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.rules.voter import NewPoints, TileVotes, make_voter, points_in
@@ -56,12 +57,13 @@ class Vehicle:
         localise: Localise | None = None,
         prior_sigma_m: float = 1.0,
         prior_sigma_deg: float = 1.0,
+        prior_in_map: bool = True,
     ) -> None:
         self.name, self.point_map, self.drive_id = name, point_map, drive_id
         self.settings = settings or Settings()
         self._rule = rule_named(self.settings.voting.method)
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
-        self._localise = localise or Localiser(point_map, self.settings, sensor)
+        self._localise = localise or Localiser(point_map, self.settings, sensor, prior_in_map=prior_in_map)
         self._frontend = Frontend(
             self._localise,
             MovingFilter(sensor, self.settings.moving),
@@ -85,6 +87,17 @@ class Vehicle:
     def report(self) -> DriveReport:
         """How the drive goes."""
         return self._frontend.report
+
+    @property
+    def prior_frame(self) -> PriorFrame | None:
+        """The frame of the priors, as far as it is learnt; None where poses are given."""
+        return self._localise.prior_frame if isinstance(self._localise, Localiser) else None
+
+    def expect_own_frame(self) -> None:
+        """The priors from here on are in a frame of their own, which is learnt, unless that has happened."""
+        frame = self.prior_frame
+        if frame is not None and not frame.is_own:
+            frame.is_unknown = True
 
     @property
     def done(self) -> int:
@@ -295,6 +308,7 @@ def vote_drive(
         localise=localise,
         prior_sigma_m=drive.prior_sigma_m,
         prior_sigma_deg=drive.prior_sigma_deg,
+        prior_in_map=drive.prior_in_map,
     )
     for i, scan in enumerate(drive):
         vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])

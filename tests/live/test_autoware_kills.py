@@ -48,6 +48,11 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened.close()
 
 
+def until_told(log: Path, word: str, times: int) -> None:
+    """Until the log has the word more than so many times."""
+    until(lambda: log.read_text().count(word) > times)
+
+
 def new_version(store: Store) -> None:
     """Publish that the walls are gone, or roll that back."""
     if store.current() % 2 == 1:
@@ -88,7 +93,8 @@ def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_befor
 
 @pytest.mark.slow
 def test_of_50_starts_and_kills_none_empties_a_client(tmp_path: Path, store: Store, domain: int) -> None:
-    """Every fifth start has a fresh folder, every third no server, every seventh a new version on the way."""
+    """Every fifth start has a fresh folder, every third no server, every seventh a new version on the way. Half are
+    killed as soon as they serve or within 2 s, the others at any moment of their start."""
     from live.foreign_client import ForeignClient
 
     client, dice = ForeignClient(domain, OLD), random.Random(7)
@@ -106,8 +112,13 @@ def test_of_50_starts_and_kills_none_empties_a_client(tmp_path: Path, store: Sto
         with serving(tmp_path / "fleet.db", log=tmp_path / "serve.log") as (url, _):
             for k in range(50):
                 before = client.replies
-                with loader(AWAY if k % 3 == 2 else url, tmp_path / f"map_{k // 5}", domain) as process:
-                    ended.wait(dice.uniform(0.5, 4.0))
+                log = tmp_path / "autoware.log"
+                told = log.read_text().count("serving") if log.exists() else 0
+                served = k % 3 != 2 and k % 4 != 3
+                with loader(url if k % 3 != 2 else AWAY, tmp_path / f"map_{k // 5}", domain) as process:
+                    if served:
+                        until_told(log, "serving", told)
+                    ended.wait(dice.uniform(0.0, 2.0))
                     if k % 7 == 0:
                         new_version(store)
                         ended.wait(dice.uniform(0.0, 1.0))

@@ -194,6 +194,8 @@ class Drive:
     """(n, 4, 4) what the vehicle believed (GNSS/INS), or None."""
     prior_sigma_m: float = 1.0
     prior_sigma_deg: float = 1.0
+    prior_in_map: bool = True
+    """Whether the prior is in the map's frame; odometry in a frame of its own (REP 105: odom) is not."""
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
     georeference: Mapping[str, str] = field(default_factory=dict)
     """Where on Earth the prior's frame lies, as a map carries it; empty if unknown."""

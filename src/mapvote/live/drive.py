@@ -167,6 +167,11 @@ class FirstSeconds:
         """What shows in the scans themselves, and, if the vehicle finds no sure place, how they lie on the map."""
         if self._looking is None:
             return []
+        frame = vehicle.prior_frame
+        if frame is not None and frame.is_unknown:
+            self._priors = [None] * len(self._priors)
+        elif frame is not None and frame.is_own:
+            self._priors = [None if T is None else frame.T_map_prior @ T for T in self._priors]
         drive = self._drive(vehicle)
         found = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
         report = vehicle.report
@@ -211,6 +216,14 @@ class LiveDrive:
         end."""
         self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
         self.T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
+        self._place: F64 | None = None
+        """(3,) where the last scan was that has a place, map metres."""
+        self._is_lost = False
+        """Whether the last decided scan has no place."""
+        self.prior_in_map = True
+        """Whether odometry is in the map's frame. Where it is not, its frame is learnt."""
+        self._frames_begun = 0
+        """How often a frame of odometry was told."""
         self.name, self.number = name, outbox.begin(name)
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
@@ -285,6 +298,7 @@ class LiveDrive:
             self._count_votes(self.vehicle, ended=True)
             self._leave(self.vehicle.ballot)
         self.vehicle = None
+        self._place = None
         self._observed.clear()
         new_ns = self._last_ns + step_ns
         self._poses = deque((p for p in self._poses if abs(p[0] - new_ns) < 10 * _BACK_NS), maxlen=_POSES)
@@ -372,6 +386,9 @@ class LiveDrive:
             self._cut(self.vehicle, newest)  # the version of the open ballot ends here, a newer one does not
         if self.vehicle is None:
             self.vehicle = self._make_vehicle(self._maps.current())
+            self._frames_begun = 0
+            if not self.prior_in_map:
+                self.vehicle.expect_own_frame()
             self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(self._cuts), 0
         vehicle = self.vehicle
         if self.first is not None:
@@ -388,11 +405,19 @@ class LiveDrive:
         self._leave(vehicle.cut(stretch_name(self.name, self.number + 1), newest))
 
     def _position(self, prior: F64 | None) -> F64 | None:
-        """(3,) where the vehicle is by its last scan, else by its prior."""
-        poses = [] if self.vehicle is None else self.vehicle.report.T_map_lidar
-        if poses:
-            return np.asarray(poses[-1][:3, 3])
-        return None if prior is None else np.asarray(prior[:3, 3])
+        """(3,) where the vehicle is by its last scan that has a place, while scans find theirs; else by its prior. None
+        where neither says."""
+        by_prior = None if prior is None else self._in_map(prior)
+        if self._place is None or (self._is_lost and by_prior is not None):
+            return None if by_prior is None else np.asarray(by_prior[:3, 3])
+        return self._place
+
+    def _in_map(self, prior: F64) -> F64 | None:
+        """The prior in the map's frame; None while it is not known where its own frame lies."""
+        frame = None if self.vehicle is None else self.vehicle.prior_frame
+        if frame is not None and frame.is_own:
+            return np.asarray(frame.T_map_prior @ prior)
+        return prior if self.prior_in_map else None
 
     def _count_votes(self, vehicle: Vehicle, *, ended: bool = False) -> None:
         """Latencies of the scans that are done, unless the drive has ended, and the tiles that they voted on."""
@@ -400,9 +425,11 @@ class LiveDrive:
         lost = set(report.lost) if vehicle.done > self._finished else set()
         for i in range(self._finished, vehicle.done):
             stamp_ns, sent_ns = self._observed.popleft()
-            if i in lost:
+            self._is_lost = i in lost
+            if self._is_lost:
                 self.counts.lost += 1
                 continue
+            self._place = report.T_map_lidar[i][:3, 3]
             self.counts.localised += 1
             self.fixes.append(Fixed(stamp_ns, report.T_map_lidar[i], report.covariances[i]))
             since_ns = stamp_ns if abs(sent_ns - stamp_ns) < 5 * 10**9 else sent_ns
@@ -413,6 +440,20 @@ class LiveDrive:
             for tile in window.tiles():
                 self._touched.setdefault(tile, now_s)
         self._finished = vehicle.done
+        self._tell_frame(vehicle)
+
+    def expect_own_frame(self) -> None:
+        """Odometry turns out to be in a frame of its own: it is learnt."""
+        self.prior_in_map = False
+        if self.vehicle is not None:
+            self.vehicle.expect_own_frame()
+
+    def _tell_frame(self, vehicle: Vehicle) -> None:
+        """Log the frame of odometry where it was taken anew."""
+        frame = vehicle.prior_frame
+        if frame is not None and frame.begun > self._frames_begun:
+            self._frames_begun = frame.begun
+            self._repeated("frame", f"odometry is in a frame of its own. Its origin in the map: {frame.told()}")
 
     def _leave(self, written: Callable[[], Ballot]) -> None:
         """A ballot is closed, and the next one begins."""

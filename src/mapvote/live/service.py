@@ -19,6 +19,7 @@ from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
 from mapvote.live.subscriptions import Cloud, Subscriptions
+from mapvote.matching.prior_frame import is_map_frame
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")
@@ -187,8 +188,11 @@ def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -
 
 
 def _mounted(live: LiveDrive, topics: Subscriptions, plan: Plan) -> bool:
-    """Give the drive the mount that frames tell, which odometry that begins late may change; returns whether it is
-    known: poses of a body that the LiDAR is not joined to are of no use."""
+    """Give the drive the mount that frames tell, and the frame of the poses, which odometry that begins late may
+    change; returns whether the mount is known: poses of a body that the LiDAR is not joined to are of no use."""
+    if live.prior_in_map and not is_map_frame(topics.map_frame):
+        log.info("poses are in frame %s: where it lies in the map is learnt from the scans", topics.map_frame)
+        live.expect_own_frame()
     if plan.T_base_lidar is not None:
         return True
     T = topics.T_base_lidar()

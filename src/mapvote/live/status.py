@@ -60,6 +60,8 @@ class Status:
     """Tiles of the map that are here."""
     server_away: str
     """Why, or ""."""
+    odometry_frame: str = ""
+    """Where odometry's own frame lies in the map; "" if its poses are in the map's."""
 
     def values(self) -> dict[str, Any]:
         """All of it by name: those of the counts and of the outbox, then its own."""
@@ -73,6 +75,7 @@ class Status:
             f"latency {self.latency_s:.2f} s, {self.waiting_scans} wait, {self.counts.left_out} left out, "
             f"{self.counts.missing} never came; map version {self.map_version}, {self.tiles} tiles; "
             f"{self.counts.ballots} ballots, {self.outbox.spooled} in the spool"
+            + (f"; odometry's origin in the map {self.odometry_frame}" if self.odometry_frame else "")
             + (f"; server away: {self.server_away}" if self.server_away else "")
         )
 
@@ -179,7 +182,14 @@ class StatusBoard:
             map_version=version,
             tiles=tiles,
             server_away=away,
+            odometry_frame=_odometry_frame(live),
         )
+
+
+def _odometry_frame(live: LiveDrive) -> str:
+    """Where odometry's own frame lies in the map, in figures; "" if it has none."""
+    frame = None if live.vehicle is None else live.vehicle.prior_frame
+    return frame.told() if frame is not None and frame.is_own else ""
 
 
 class RosStatus:

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import inverse
+from mapvote.core.geometry import exp, inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
@@ -24,6 +24,7 @@ from mapvote.matching.ndt_map import LEVELS, MapWindow
 from mapvote.matching.odometry import TWIST_AGE_S, Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
 from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
+from mapvote.matching.prior_frame import PriorFrame, apart
 
 LOOKS = 3
 """In turn that must hold before the first vote."""
@@ -36,6 +37,8 @@ _JUMPS = 4
 """How often a track may move on one scan before it counts as lost there."""
 _MEMORY = 0.1
 """Weight of the newest difference between fix and prior in the one remembered."""
+_BACK_M, _BACK_RAD = 1.0, float(np.radians(5.0))
+"""A scan that is followed back farther off the motion of the scans after it is lost: metres, radians."""
 _FIRST_SEARCH = 6
 """Scans without a confirmed place before the whole map is searched; every further search waits twice as long."""
 
@@ -57,6 +60,14 @@ class _Waiting:
     fix: Fix
     misfit: F64 | None
     """(3,) how far the fix lies off the prior as it came, map metres."""
+    prior: PosePrior | None = None
+    """As it came."""
+    in_map: PosePrior | None = None
+    """The prior in the map's frame, where its own frame was known."""
+    begun: int = 0
+    """Which of the frames that the prior began it is in."""
+    nowhere: bool = False
+    """Whether no place is known yet."""
 
 
 class Localiser:
@@ -65,11 +76,14 @@ class Localiser:
     Without a prior, and when no place holds for long, the whole map is searched.
     """
 
-    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
+    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor, *, prior_in_map: bool = True) -> None:
+        """``prior_in_map``: priors are stated to be in the map's frame; else their frame is learnt from the first scans
+        that the search of the whole map places."""
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
         self.map_around = MapWindow(point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
+        self.prior_frame = PriorFrame(in_map=prior_in_map)
         self.misfit = np.zeros(3)
         """How far trusted fixes lately lay off their priors, map metres."""
         self._waiting: deque[_Waiting] = deque()
@@ -83,12 +97,16 @@ class Localiser:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
             nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
-            self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None))
-            return self._decide(len(self._waiting), False)
-        fix = self.tracker.localise(scan, None if prior is None else self._corrected(prior))
+            self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None, prior, nowhere=True))
+            return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+        if prior is not None:
+            self._catch_leap(scan, prior)
+        usable = prior is not None and not self.prior_frame.is_unknown
+        fix = self.tracker.localise(scan, self._corrected(prior) if prior is not None and usable else None)
         self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
-        self._waiting.append(_Waiting(fix, misfit))
+        self._waiting.append(_Waiting(fix, misfit, prior))
+        self._place_prior(self._waiting[-1])
         if self._is_due(fix):
             self._look()
             if self._confirmed and self._held:
@@ -108,7 +126,8 @@ class Localiser:
 
     def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
         """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
-        homeless = prior is None and self.tracker.last_pose is None
+        placed = prior is not None and not self.prior_frame.is_unknown
+        homeless = not placed and self.tracker.last_pose is None
         self._unconfirmed = 0 if self._confirmed else self._unconfirmed + 1
         if not (homeless or self._unconfirmed >= self._next_search):
             return True
@@ -118,10 +137,46 @@ class Localiser:
         found = self.search(scan)
         if found is not None:
             self.tracker.move_to(found, scan.stamp_ns)
+            if prior is not None and self.prior_frame.is_far(prior, found):
+                self._take_frame(prior, found)
         return found is not None or not homeless
 
+    def _take_frame(self, prior: PosePrior, T_map_lidar: F64) -> None:
+        """The prior is in a frame of its own: the scans that wait were taken where their priors lie in it."""
+        self.prior_frame.begin(prior, T_map_lidar)
+        self.misfit = np.zeros(3)
+        following = prior
+        following_ns = self.tracker.last_stamp_ns
+        for waiting in reversed(self._waiting):
+            if waiting.prior is None:
+                break
+            self._place_prior(waiting)
+            guess = self.prior_frame.in_map(waiting.prior).T_map_lidar
+            seconds = 1e-9 * (following_ns - waiting.fix.scan.stamp_ns)
+            twist = twist_between(waiting.prior.T_map_lidar, following.T_map_lidar, max(seconds, 1e-3))
+            self._register_anew(waiting, guess, twist)
+            following = waiting.prior
+            following_ns = waiting.fix.scan.stamp_ns
+
+    def _place_prior(self, waiting: _Waiting) -> None:
+        """The prior of a scan that waits, in the frame that is known now."""
+        if waiting.prior is not None and self.prior_frame.is_own:
+            waiting.in_map = self.prior_frame.in_map(waiting.prior)
+            waiting.begun = self.prior_frame.begun
+
+    def _catch_leap(self, scan: Scan, prior: PosePrior) -> None:
+        """A prior of its own frame that leaps away from a track that holds has begun anew: so does its frame."""
+        age = 1e-9 * (scan.stamp_ns - self.tracker.last_stamp_ns)
+        if not self._confirmed or self.tracker.last_pose is None or age > TWIST_AGE_S:
+            return
+        predicted = self.tracker.last_pose @ exp(age * self.tracker.twist)
+        if self.prior_frame.leapt(prior, predicted):
+            self.prior_frame.begin(prior, predicted)
+
     def _corrected(self, prior: PosePrior) -> PosePrior:
-        """The prior without what it was off by lately, and no surer of itself than that."""
+        """The prior in the map's frame, without what it was off by lately, and no surer of itself than that."""
+        if self.prior_frame.is_own:
+            return self.prior_frame.in_map(prior)
         T_map_lidar = prior.T_map_lidar.copy()
         T_map_lidar[:3, 3] += self.misfit
         return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.linalg.norm(self.misfit))))
@@ -144,9 +199,31 @@ class Localiser:
         self._looked_at = self._waiting[-1].fix
         if self._looked_at.trusted and self.judge.holds(verdict):
             self._held += 1
-            self._confirmed = self._confirmed or self._held >= LOOKS
+            if not self._confirmed and self._held >= LOOKS:
+                self._confirmed = True
+                self._follow_back()
         else:
             self._held, self._confirmed = 0, False
+
+    def _follow_back(self) -> None:
+        """The track holds: the scans before it that have no place are registered from it backwards in time, with the
+        motion of the scans after them, as far as each fits where that leads."""
+        waiting = list(self._waiting)
+        first = next((i for i, one in enumerate(waiting) if not one.nowhere), 0)
+        twist = self.tracker.twist
+        for i in range(first - 1, -1, -1):
+            later = waiting[i + 1].fix
+            seconds = 1e-9 * (later.scan.stamp_ns - waiting[i].fix.scan.stamp_ns)
+            if i + 2 < len(waiting):
+                after = waiting[i + 2].fix
+                span = 1e-9 * (after.scan.stamp_ns - later.scan.stamp_ns)
+                twist = twist_between(later.registration.T_map_lidar, after.registration.T_map_lidar, span)
+            guess = later.registration.T_map_lidar @ exp(-seconds * twist)
+            self._register_anew(waiting[i], guess, twist)
+            off_m, off_rad = apart(guess, waiting[i].fix.registration.T_map_lidar)
+            if not waiting[i].fix.trusted or off_m > _BACK_M or off_rad > _BACK_RAD:
+                waiting[i].fix = replace(waiting[i].fix, trusted=False)
+                return
 
     def _verdict(self) -> Verdict:
         fix = self._waiting[-1].fix
@@ -169,6 +246,8 @@ class Localiser:
             around, sample = self.map_around(T_map_lidar[:3, 3]), Sample(newest.fix.scan)
             twist = self.tracker.guess_motion(around, newest.fix.scan.stamp_ns, sample, T_map_lidar)
         for waiting in self._waiting:
+            if waiting.nowhere:
+                continue
             self._register_anew(waiting, shift @ waiting.fix.registration.T_map_lidar, twist)
         self._held, self._confirmed = 0, False
         self._go_on()
@@ -178,6 +257,7 @@ class Localiser:
         points = deskew(waiting.fix.scan, twist)
         result = refine(ndt_map, thin_for_levels(points), guess)
         waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
+        waiting.nowhere = False
         if waiting.misfit is not None:
             waiting.misfit = waiting.misfit + result.T_map_lidar[:3, 3] - before[:3, 3]
 
@@ -201,6 +281,12 @@ class Localiser:
             fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
             if fix.trusted and waiting.misfit is not None:
                 self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
+            if waiting.prior is not None and waiting.begun == self.prior_frame.begun:
+                self._place_prior(waiting)  # by all that was learnt before this scan
+                if fix.trusted:
+                    self.prior_frame.learn(waiting.prior, fix.registration.T_map_lidar)
+            if waiting.in_map is not None:
+                fix = replace(fix, prior=waiting.in_map)
             decided.append(fix)
         return decided
 

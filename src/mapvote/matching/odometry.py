@@ -48,6 +48,8 @@ class Fix:
     """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed with the motion found."""
     trusted: bool
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
+    prior: PosePrior | None = None
+    """The prior in the map's frame, where its own frame had to be learnt."""
 
 
 class Tracker:

@@ -226,6 +226,8 @@ class Frontend:
         index = len(report.T_map_lidar)
         report.T_map_lidar.append(fix.registration.T_map_lidar)
         report.covariances.append(fix.registration.covariance.astype(np.float32))
+        if fix.prior is not None:
+            report.priors[index] = fix.prior
         if not fix.trusted:
             report.lost.append(index)
             return []
