@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.matching.prepare import motion_at
-from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 LENGTH_M = 45.0
 
@@ -90,17 +87,3 @@ def drive_along(
         prior_sigma_m=sigma_m,
         prior_sigma_deg=sigma_deg,
     )
-
-
-def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
-    """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
-    named DRIVE-001, DRIVE-002 and so on."""
-    name, road, k = drive.drive_id, RoadDriven(cuts), 1
-    vehicle.drive_id = stretch_name(name, k)
-    for i, scan in enumerate(drive):
-        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
-        if road.is_full(vehicle.report, vehicle.done):
-            k, road = k + 1, RoadDriven(cuts)
-            yield vehicle.cut(stretch_name(name, k))
-    vehicle.finish()
-    yield vehicle.ballot

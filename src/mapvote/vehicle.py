@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,7 +22,7 @@ from mapvote.codec.planes import pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
-from mapvote.core.mount import mount_of_prior
+from mapvote.core.mount import Mount, mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
@@ -57,13 +57,12 @@ class Vehicle:
         localise: Localise | None = None,
         prior_sigma_m: float = 1.0,
         prior_sigma_deg: float = 1.0,
-        prior_in_map: bool = True,
     ) -> None:
         self.name, self.point_map, self.drive_id = name, point_map, drive_id
         self.settings = settings or Settings()
         self._rule = rule_named(self.settings.voting.method)
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
-        self._localise = localise or Localiser(point_map, self.settings, sensor, prior_in_map=prior_in_map)
+        self._localise = localise or Localiser(point_map, self.settings, sensor)
         self._frontend = Frontend(
             self._localise,
             MovingFilter(sensor, self.settings.moving),
@@ -290,26 +289,12 @@ def vote_drive(
     A sensor that its prior mounts upside down, on its side or turned is localised in axes with x ahead and z up; the
     report has its own again.
     """
-    mount = None
-    if localise is None and drive.T_map_lidar_prior is not None:
-        mount = mount_of_prior(drive.T_map_lidar_prior)
+    prior = drive.T_map_lidar_prior
+    mount = mount_of_prior(prior) if localise is None and prior is not None else None
     if mount is not None:
         mount = mount.in_steps()
-        own, drive = drive, mount.turned(drive)
-        measured = own.sensor_told.startswith("measured")
-        middle = drive.read_scan(len(drive) // 2).by_lidar()[0][1]
-        drive = replace(drive, sensor=sensor_upright(own.sensor, measured, middle, mount.lean_deg))
-    vehicle = Vehicle(
-        drive.vehicle,
-        drive.sensor,
-        point_map,
-        settings,
-        drive_id=drive.drive_id,
-        localise=localise,
-        prior_sigma_m=drive.prior_sigma_m,
-        prior_sigma_deg=drive.prior_sigma_deg,
-        prior_in_map=drive.prior_in_map,
-    )
+        drive = _upright(drive, mount)
+    vehicle = vehicle_on(drive, point_map, settings, localise=localise)
     for i, scan in enumerate(drive):
         vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
         if progress:
@@ -320,6 +305,54 @@ def vote_drive(
     if mount is not None:
         report.T_map_lidar[:] = [np.asarray(T @ mount.C) for T in report.T_map_lidar]
     return ballot, report
+
+
+def _upright(drive: Drive, mount: Mount) -> Drive:
+    """``drive`` in axes with x ahead and z up, with the model of its sensor in them."""
+    turned = mount.turned(drive)
+    measured = drive.sensor_told.startswith("measured")
+    middle = turned.read_scan(len(turned) // 2).by_lidar()[0][1]
+    return replace(turned, sensor=sensor_upright(drive.sensor, measured, middle, mount.lean_deg))
+
+
+def vehicle_on(
+    drive: Drive, point_map: PointMap, settings: Settings | None = None, *, localise: Localise | None = None
+) -> Vehicle:
+    """A vehicle that has driven nowhere yet, with the names, the sensor and the prior's sigmas of ``drive``."""
+    vehicle = Vehicle(
+        drive.vehicle,
+        drive.sensor,
+        point_map,
+        settings,
+        drive_id=drive.drive_id,
+        localise=localise,
+        prior_sigma_m=drive.prior_sigma_m,
+        prior_sigma_deg=drive.prior_sigma_deg,
+    )
+    if not drive.prior_in_map:
+        vehicle.expect_own_frame()
+    return vehicle
+
+
+def vote_in_stretches(
+    drive: Drive, vehicle: Vehicle, cuts: Cuts, progress: Callable[[int, int], None] | None = None
+) -> Iterator[tuple[str, Callable[[], Ballot]]]:
+    """Every scan of ``drive`` observed by ``vehicle``; where a live drive would close a ballot, its name and what
+    writes it. The ballots are named DRIVE-001, DRIVE-002 and so on."""
+    number = 1
+    vehicle.drive_id = stretch_name(drive.drive_id, number)
+    road = RoadDriven(cuts)
+    for i, scan in enumerate(drive):
+        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+        if progress:
+            progress(i + 1, len(drive))
+        if road.is_full(vehicle.report, vehicle.done):
+            closed = vehicle.drive_id
+            number += 1
+            road = RoadDriven(cuts)
+            yield closed, vehicle.cut(stretch_name(drive.drive_id, number))
+    vehicle.finish()
+    yield vehicle.drive_id, vehicle.ballot
 
 
 def stretch_name(drive_id: str, k: int) -> str:

@@ -17,14 +17,15 @@ import pytest
 from bag_recorder import START, Recorder
 from command_line import type_in
 from mapvote.codec.ballot import encode
+from mapvote.core.geometry import from_xyz_rpy, interpolate, inverse
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
 from mapvote.formats import open_drive, read_map, write_map
-from mapvote.live.messages import BASE_FRAME, CLOUD, ODOMETRY
-from mapvote.live.play import cloud_message, odometry_message
-from mapvote.vehicle import Cuts, Vehicle
-from streets import path, street, sweep, twist_of, vote_in_stretches
+from mapvote.live.messages import BASE_FRAME, CLOUD, ODOMETRY, TF
+from mapvote.live.play import cloud_message, frames_message, odometry_message
+from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
+from streets import path, street, sweep, twist_of
 
 pytest.importorskip("cyclonedds")
 SCANS = 40
@@ -66,10 +67,50 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
         player.wait(120)
     drive = open_drive(bag, sensor="hdl32e", vehicle="car", prior="/odometry")
     voter = Vehicle("car", SENSORS["hdl32e"], read_map(tmp_path / "map"), drive_id="day")
-    wanted = [written() for written in vote_in_stretches(replace(drive, drive_id="day"), voter, Cuts(length_m=12.0))]
+    wanted = [written() for _, written in vote_in_stretches(replace(drive, drive_id="day"), voter, Cuts(length_m=12.0))]
     assert " 0 scans left out, 0 without odometry" in said
     assert len(wanted) >= 2
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {f"car~{b.drive}.ballot": encode(b) for b in wanted}
+
+
+@pytest.mark.slow
+def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_ballots_are_equal_bit_for_bit(
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Odometry at 50 Hz in a frame of its own, a LiDAR that sits on the vehicle by /tf_static, a sensor to measure."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    mount = from_xyz_rpy(1.2, 0.1, 1.5, 0.0, 0.02, 0.05)
+    T_odom_map = from_xyz_rpy(100.0, 50.0, 0.0, 0.0, 0.0, 0.6)
+    recorder, poses = Recorder(tmp_path / "bag"), path(SCANS)
+    recorder.write_raw("/tf_static", TF, START, frames_message(START, {"lidar": mount}))
+    bodies = [T_odom_map @ T @ inverse(mount) for T in poses]
+    for i, T in enumerate(poses):
+        ns = START + i * 100_000_000
+        for k in range(5):
+            at_ns = ns + k * 20_000_000
+            T_body = interpolate(bodies[i], bodies[min(i + 1, SCANS - 1)], 0.2 * k)
+            recorder.write_raw("/wheels", ODOMETRY, at_ns, odometry_message(at_ns, T_body, "odom"))
+            if k == 0:
+                scan = sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns)
+                recorder.write_raw("/lidar", CLOUD, ns, cloud_message(Scan(ns, scan.points), "lidar"))
+    recorder.bag.close()
+    write_map(map_from_points(street(1)), tmp_path / "map")
+    for folder in ("live", "offline"):
+        (tmp_path / folder).mkdir()
+    play = f"play {tmp_path}/bag --domain {domain} --rate 0.5 --wait 600"
+    player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
+    drive = f"--map {tmp_path}/map --vehicle car --name day --every-m 12"
+    try:
+        said = type_in(f"mapvote drive {drive} --idle 60 --out {tmp_path}/live --domain {domain}")
+    finally:
+        player.wait(120)
+    offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
+    ballots = {
+        folder: {f.name: f.read_bytes() for f in (tmp_path / folder).iterdir()} for folder in ("live", "offline")
+    }
+    assert f"{SCANS} of {SCANS} scans voted" in said, said + offline
+    assert len(ballots["live"]) >= 2
+    assert ballots["live"] == ballots["offline"], said + offline
 
 
 @pytest.mark.slow

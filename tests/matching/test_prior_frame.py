@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, PosePrior
-from mapvote.matching.prior_frame import PriorFrame, apart, is_map_frame
+from mapvote.formats.drives.rosbag import is_map_frame
+from mapvote.matching.prior_frame import PriorFrame, distance_to
 from mapvote.vehicle import Vehicle
 from streets import drive_along, path, street
 
@@ -41,7 +42,9 @@ def odometry(poses: F64, T_odom_start: F64, drift: float = 0.0) -> F64:
 def drive(prior: F64 | None, poses: F64, *, in_map: bool = False) -> tuple[Vehicle, int, float]:
     """The vehicle after the drive, how many scans voted, and the largest error of those, metres."""
     recorded = drive_along(poses, 1, prior=prior)
-    vehicle = Vehicle("car", recorded.sensor, town(), prior_in_map=in_map)
+    vehicle = Vehicle("car", recorded.sensor, town())
+    if not in_map:
+        vehicle.expect_own_frame()
     for i, scan in enumerate(recorded):
         vehicle.observe(scan, None if prior is None else prior[i])
     vehicle.finish()
@@ -80,7 +83,7 @@ def test_a_frame_that_drifts_is_followed_within_a_tenth_of_a_metre_and_its_sigma
     for T_odom, T_map in zip(said, poses, strict=True):
         if frame.is_unknown:
             frame.begin(prior(T_odom), T_map)
-        off.append(apart(frame.in_map(prior(T_odom)).T_map_lidar, T_map)[0])
+        off.append(distance_to(frame.in_map(prior(T_odom)).T_map_lidar, T_map)[0])
         frame.learn(prior(T_odom), T_map)
     assert max(off) < 0.1
     assert 0.01 < frame.sigma_m < 0.1
@@ -95,7 +98,7 @@ def test_a_wrong_scan_moves_the_frame_little_and_the_road_without_a_scan_widens_
     for T, shift in zip(poses, noise, strict=True):
         frame.learn(prior(T), from_xyz_rpy(*shift) @ T)
     frame.learn(prior(poses[-1]), from_xyz_rpy(8.0, 0.0, 0.0) @ poses[-1])
-    assert apart(frame.in_map(prior(poses[-1])).T_map_lidar, poses[-1])[0] < 0.15
+    assert distance_to(frame.in_map(prior(poses[-1])).T_map_lidar, poses[-1])[0] < 0.15
     near = frame.in_map(prior(poses[-1])).sigma_m
     far = frame.in_map(prior(poses[-1] @ from_xyz_rpy(200.0, 0.0, 0.0))).sigma_m
     assert far > near + 5.0

@@ -34,8 +34,8 @@ app = typer.Typer(
 )
 VERBS = {
     DRIVE: (
-        drives.build, drives.vote, live.topics, live.play, live.drive, live.autoware, drives.diff, drives.merge,
-        files.doctor,
+        drives.build, drives.vote, live.send, live.topics, live.play, live.drive, live.autoware, drives.diff,
+        drives.merge, files.doctor,
     ),
     MAP: (files.import_map, files.export, files.info, files.update),
     SETUP: (setup.config, setup.warmup),

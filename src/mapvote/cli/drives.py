@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -153,6 +154,15 @@ def vote(
         Path | None,
         typer.Option(metavar="FILE", help="also write the poses of the scans, for evo: FILE.tum or FILE.kitti"),
     ] = None,
+    cuts: Annotated[
+        bool, typer.Option("--cuts", help="close ballots as `mapvote drive` does; --out is a folder for them")
+    ] = False,
+    every_m: Annotated[
+        float, typer.Option(min=1.0, metavar="METRES", help="with --cuts: longest stretch of road in one ballot")
+    ] = 2000.0,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="name of the drive; default: drive.toml, else the drive's name")
+    ] = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="for a cloud: the sensor's poses in the cloud's frame, rows of 3 x 4 or TUM"),
@@ -197,7 +207,12 @@ def vote(
         if is_cloud(drive_path):
             ballot, report = _ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
         else:
-            drive = open_drive_on(point_map, drive_path, vehicle=vehicle, **drive_options)
+            drive = open_drive_on(point_map, drive_path, vehicle=vehicle, as_live=True, **drive_options)
+            if name is not None:
+                drive = replace(drive, drive_id=name)
+            if cuts:
+                _vote_in_cuts(drive, point_map, settings, every_m, _Outlets(out, send, key))
+                return
             ballot, report = _drive_once(drive, point_map, settings, trust_prior)
     data = encode(ballot)
     if out is not None:
@@ -226,6 +241,38 @@ def _drive_once(
         ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
     require_straight(drive, report, point_map)
     return ballot, report
+
+
+class _Outlets(NamedTuple):
+    """Where ballots go."""
+
+    folder: Path | None
+    url: str | None
+    key: str | None
+
+
+def _vote_in_cuts(drive: Drive, point_map: PointMap, settings: Settings, every_m: float, outlets: _Outlets) -> None:
+    """The ballots that a live drive by the same scans would close, each written or sent as soon as it is known that
+    the drive can be used."""
+    from mapvote.codec.ballot import encode
+    from mapvote.formats.atomic import write_whole
+    from mapvote.vehicle import Cuts, vehicle_on, vote_in_stretches
+
+    with usable_drives([drive]) as (looked,), progress("voting") as tell:
+        vehicle = vehicle_on(looked, point_map, settings)
+        closed = list(vote_in_stretches(looked, vehicle, Cuts(length_m=every_m), tell))
+    for drive_id, written in closed:
+        try:
+            ballot = written()
+        except MapvoteError as error:
+            print(f"{drive_id}: no ballot ({error})")
+            continue
+        data = encode(ballot)
+        print(f"{drive_id}: {ballot.scans_localised} of {ballot.scans} scans voted")
+        if outlets.folder is not None:
+            write_whole(outlets.folder / f"{drive.vehicle}~{drive_id}.ballot", data)
+        if outlets.url is not None:
+            _send(outlets.url, outlets.key, data)
 
 
 def _send(url: str, key: str | None, data: bytes) -> None:

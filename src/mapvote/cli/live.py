@@ -293,3 +293,32 @@ def autoware(
         follower = Follower(lambda: follow_once(client, folder, projector, keep), every, stopped, say)
         serve_followed(service, follower, stopped, say)
     print(f"{service.answered} requests answered")
+
+
+def send(
+    ballots: Annotated[
+        list[Path], typer.Argument(metavar="BALLOT|FOLDER...", help="ballots, or folders whose *.ballot are sent")
+    ],
+    to: Annotated[str, typer.Option("--to", metavar="URL", help="the server")],
+    key_file: KeyFile = None,
+) -> None:
+    """Send ballots that were made offline to a server, one by one; the outcome of each is printed.
+
+    Run the same command again after the server was away: a ballot that it has is not counted twice.
+
+        mapvote send ballots/ --to https://maps.example.org --key-file key
+    """
+    from mapvote.core.types import MapvoteError
+    from mapvote.live.depot import send_all
+
+    files = []
+    for path in ballots:
+        within = [f for f in path.rglob("*") if f.suffix.lower() == ".ballot"] if path.is_dir() else [path]
+        if not within:
+            raise MapvoteError(f"{path}: holds no *.ballot")
+        files += sorted(within)
+    with client_of(to, key_in(key_file)) as client:
+        done = send_all(client, files, lambda text: print(text, flush=True))
+    print(f"{to}: {done.told()}")
+    if done.unsent:
+        raise typer.Exit(1)

@@ -128,10 +128,10 @@ def cloud_message(scan: Scan, frame: str = LIDAR_FRAME) -> bytes:
     return to_cdr(CLOUD, cloud_of(columns, scan.stamp_ns, frame))
 
 
-def odometry_message(stamp_ns: int, T_map_base: F64) -> bytes:
-    """An Odometry of a pose (4, 4)."""
-    message = blank_message(ODOMETRY, header=header_of(stamp_ns, MAP_FRAME), child_frame_id=BASE_FRAME)
-    message.pose.pose = pose_of(T_map_base)
+def odometry_message(stamp_ns: int, T_frame_base: F64, frame: str = MAP_FRAME) -> bytes:
+    """An Odometry of a pose (4, 4) in ``frame``."""
+    message = blank_message(ODOMETRY, header=header_of(stamp_ns, frame), child_frame_id=BASE_FRAME)
+    message.pose.pose = pose_of(T_frame_base)
     return to_cdr(ODOMETRY, message)
 
 

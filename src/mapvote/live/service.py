@@ -13,13 +13,13 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.drives.rosbag import is_map_frame
 from mapvote.live.choice import WAITS, Voice
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
 from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
 from mapvote.live.subscriptions import Cloud, Subscriptions
-from mapvote.matching.prior_frame import is_map_frame
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")

@@ -17,7 +17,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
-from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
+from mapvote.formats.drives.sensor_estimate import MEASURED_SCANS, UNKNOWN, estimate_sensor, rate_of_first
 from mapvote.live.choice import Chosen
 from mapvote.live.dds import Network
 from mapvote.live.drive import WaitingScan
@@ -31,8 +31,6 @@ _SWEEP = 0.55
 """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
 _DEPTH = 200
 """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
-_MEASURED = 10
-"""Scans in which a sensor is measured."""
 _POSES = 400
 """Poses whose times of sending are kept: four seconds at 100 Hz."""
 _OTHER_CLOCK_NS = 10**9
@@ -285,11 +283,11 @@ class Subscriptions:
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
         firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
-        if self.sensor is None and len(firsts) >= _MEASURED:
-            steps_ns = np.diff([cloud.stamp_ns for cloud in firsts])
-            rate_hz = round(1e9 / float(np.median(steps_ns)), 1)
-            unknown = replace(UNKNOWN, rate_hz=rate_hz)
-            read = [scan_from_point_cloud2(c.message, unknown, self._readers[0]) for c in firsts[:_MEASURED]]
+        if self.sensor is None and len(firsts) >= MEASURED_SCANS:
+            del firsts[MEASURED_SCANS:]  # how many arrive together does not matter
+            rate_hz = rate_of_first(np.array([cloud.stamp_ns for cloud in firsts]))
+            model = replace(UNKNOWN, rate_hz=rate_hz)
+            read = [scan_from_point_cloud2(cloud.message, model, self._readers[0]) for cloud in firsts]
             found = estimate_sensor(read, rate_hz)
             self.sensor, self.sensor_told = found.sensor, found.told
         return self.sensor is not None

@@ -24,7 +24,7 @@ from mapvote.matching.ndt_map import LEVELS, MapWindow
 from mapvote.matching.odometry import TWIST_AGE_S, Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
 from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
-from mapvote.matching.prior_frame import PriorFrame, apart
+from mapvote.matching.prior_frame import PriorFrame, distance_to
 
 LOOKS = 3
 """In turn that must hold before the first vote."""
@@ -76,14 +76,12 @@ class Localiser:
     Without a prior, and when no place holds for long, the whole map is searched.
     """
 
-    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor, *, prior_in_map: bool = True) -> None:
-        """``prior_in_map``: priors are stated to be in the map's frame; else their frame is learnt from the first scans
-        that the search of the whole map places."""
+    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
         self.map_around = MapWindow(point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
-        self.prior_frame = PriorFrame(in_map=prior_in_map)
+        self.prior_frame = PriorFrame()
         self.misfit = np.zeros(3)
         """How far trusted fixes lately lay off their priors, map metres."""
         self._waiting: deque[_Waiting] = deque()
@@ -220,7 +218,7 @@ class Localiser:
                 twist = twist_between(later.registration.T_map_lidar, after.registration.T_map_lidar, span)
             guess = later.registration.T_map_lidar @ exp(-seconds * twist)
             self._register_anew(waiting[i], guess, twist)
-            off_m, off_rad = apart(guess, waiting[i].fix.registration.T_map_lidar)
+            off_m, off_rad = distance_to(guess, waiting[i].fix.registration.T_map_lidar)
             if not waiting[i].fix.trusted or off_m > _BACK_M or off_rad > _BACK_RAD:
                 waiting[i].fix = replace(waiting[i].fix, trusted=False)
                 return

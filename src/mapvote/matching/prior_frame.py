@@ -39,14 +39,6 @@ class FrameLearning:
 
 
 LEARNING = FrameLearning()
-_MAP_FRAMES = {"", "map", "world", "earth", "global", "utm", "enu"}
-"""Last parts of the names of frames that are fixed to the Earth, in small letters; "" is no name."""
-
-
-def is_map_frame(name: str) -> bool:
-    """Whether poses in the frame of this name may be taken for poses in the map (REP 105: map and earth are fixed, odom
-    is not, and a LiDAR odometry names its first pose)."""
-    return name.strip("/").split("/")[-1].lower() in _MAP_FRAMES
 
 
 class PriorFrame:
@@ -85,7 +77,7 @@ class PriorFrame:
         """Whether a place in the map is too far from the prior for the prior to be in the frame that is known."""
         if self.is_unknown:
             return True
-        off_m, off_rad = apart(self.in_map(prior).T_map_lidar, T_map_lidar)
+        off_m, off_rad = distance_to(self.in_map(prior).T_map_lidar, T_map_lidar)
         learning = self._learning
         return bool(off_m > learning.far_m + 3.0 * prior.sigma_m or off_rad > learning.far_rad + 3.0 * prior.sigma_rad)
 
@@ -126,7 +118,7 @@ class PriorFrame:
         """Whether the prior has begun anew: it lies so far from where the track leads that no vehicle drives there."""
         if not self.is_own:
             return False
-        off_m, off_rad = apart(self.in_map(prior).T_map_lidar, T_map_lidar_predicted)
+        off_m, off_rad = distance_to(self.in_map(prior).T_map_lidar, T_map_lidar_predicted)
         allowed_m = self._learning.leap_m + 3.0 * self.in_map(prior).sigma_m
         return bool(off_m > allowed_m or off_rad > self._learning.leap_rad)
 
@@ -140,7 +132,7 @@ class PriorFrame:
         )
 
 
-def apart(T: F64, other: F64) -> tuple[float, float]:
+def distance_to(T: F64, other: F64) -> tuple[float, float]:
     """Distance, metres, and angle, radians, between two poses (4, 4)."""
     off = inverse(T) @ other
     return float(np.linalg.norm(off[:3, 3])), rotation_angle(off)

@@ -18,7 +18,8 @@ from mapvote.core import geometry
 from mapvote.core.types import F32, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.messages import blank_message, header_of, to_cdr
+from mapvote.live.messages import ODOMETRY, blank_message, header_of, to_cdr
+from mapvote.live.play import odometry_message
 
 N = 5
 STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * i for i in range(N)]
@@ -216,3 +217,55 @@ def test_a_bag_of_packets_says_what_to_do(tmp_path: Path) -> None:
     bag.bag.close()
     with pytest.raises(MapvoteError, match="decode with your driver first"):
         open_drive(tmp_path / "bag")
+
+
+def record_vehicle(path: Path, *odometries: str, frame: str = "odom", static: bool = True) -> Path:
+    """A bag of a LiDAR that sits on a vehicle, and of the vehicle's odometry in ``frame``."""
+    bag = Recorder(path)
+    for i, ns in enumerate(STAMPS):
+        bag.cloud("/points", "lidar", ns, cloud(i))
+        for topic in odometries:
+            T = geometry.from_xyz_rpy(float(i), 0.0, 0.0, 0.0, 0.0, 0.1)
+            bag.write_raw(topic, ODOMETRY, ns, odometry_message(ns, T, frame))
+    if static:
+        bag.static({"lidar": MOUNT})
+    bag.bag.close()
+    return path
+
+
+MOUNT = geometry.from_xyz_rpy(1.0, 0.0, 1.8, 0.0, 0.0, 0.2)
+
+
+@pytest.mark.parametrize(("frame", "in_map"), [("odom", False), ("map", True), ("camera_init", False)])
+def test_a_drive_that_votes_takes_odometry_and_mount_from_the_bag_as_a_live_one_does(
+    tmp_path: Path, frame: str, in_map: bool
+) -> None:
+    bag = record_vehicle(tmp_path / "bag", "/wheels", frame=frame)
+    assert open_drive(bag, sensor="hdl32e").T_map_lidar_prior is None, "a map is not built by drifting odometry"
+    for drive in (open_drive(bag, sensor="hdl32e", as_live=True), open_drive(bag, sensor="hdl32e", prior="/wheels")):
+        assert drive.T_map_lidar_prior is not None
+        wanted = geometry.from_xyz_rpy(2.0, 0.0, 0.0, 0.0, 0.0, 0.1) @ MOUNT
+        assert np.allclose(drive.T_map_lidar_prior[2], wanted)
+        assert np.allclose(drive.T_base_lidar, MOUNT)
+        assert drive.prior_in_map == in_map
+
+
+def test_what_the_user_says_wins_over_what_a_live_drive_would_choose(tmp_path: Path) -> None:
+    bag = record_vehicle(tmp_path / "bag", "/wheels")
+    assert open_drive(bag, sensor="hdl32e", as_live=True, prior="none").T_map_lidar_prior is None
+    drive = open_drive(bag, sensor="hdl32e", as_live=True, mount="0,0,2,0,0,0")
+    assert drive.T_map_lidar_prior is not None
+    assert np.allclose(drive.T_map_lidar_prior[0][:3, 3], [0, 0, 2])
+
+
+def test_a_choice_of_poses_and_a_mount_that_nobody_names_are_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    two = record_vehicle(tmp_path / "two", "/wheels", "/lio")
+    assert open_drive(two, sensor="hdl32e", as_live=True).T_map_lidar_prior is None
+    assert "--prior chooses: /lio, /wheels" in caplog.messages[-1]
+    unjoined = record_vehicle(tmp_path / "unjoined", "/wheels", static=False)
+    assert open_drive(unjoined, sensor="hdl32e", as_live=True).T_map_lidar_prior is None
+    assert "join lidar to base_link" in caplog.messages[-1]
+    assert open_drive(unjoined, sensor="hdl32e", prior="/wheels").T_map_lidar_prior is not None
+    assert "taken for the LiDAR's own" in caplog.messages[-1]

@@ -19,7 +19,7 @@ from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
 from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
-from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
+from mapvote.formats.drives.sensor_estimate import MEASURED_SCANS, UNKNOWN, estimate_sensor, rate_of_first
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 from mapvote.formats.listing import entry
@@ -43,6 +43,7 @@ class SaidOfDrive(TypedDict, total=False):
     time_field: str | None
     time_unit: str | None
     frame: MapFrame | None
+    as_live: bool
 
 
 class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,6 +79,8 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
     """``T_base_lidar`` as the command line gives it."""
     frame: MapFrame | None = None
     """The map's frame, into which latitudes and longitudes go."""
+    as_live: bool = False
+    """Whether poses, mount and sensor of a bag are chosen as ``mapvote drive`` chooses them from the same topics."""
 
     @property
     def time_rules(self) -> TimeRules:
@@ -86,7 +89,7 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
         return TimeRules(self.motion_compensated, self.time_field, self.time_unit, rate)
 
 
-_NOT_IN_FILE = ("scans", "mount", "frame")
+_NOT_IN_FILE = ("scans", "mount", "frame", "as_live")
 
 
 def beside(drive: Path) -> Path:
@@ -243,7 +246,7 @@ def make_drive(
         )
     chosen = parse_scans(options.scans, len(stamps_ns), where)
     rate_hz = options.rate_hz
-    sensor, told = _sensor_of(where, options.sensor, stamps_ns, chosen, rate_hz, read_scan)
+    sensor, told = _sensor_of(where, options, stamps_ns, chosen, read_scan)
     if rate_hz is not None:
         if not 0.1 <= rate_hz <= 100:
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
@@ -267,20 +270,24 @@ def make_drive(
 
 def _sensor_of(
     where: str,
-    said: str | dict[str, Any] | None,
+    options: DriveOptions,
     stamps_ns: I64,
     chosen: I64,
-    rate_hz: float | None,
     read_scan: Callable[[int, Sensor], Scan],
 ) -> tuple[Sensor, str]:
     """(the sensor, where it comes from). A table that gives only some fields wins over what is measured."""
+    said = options.sensor
+    rate_hz = options.rate_hz
     if isinstance(said, str):
         return read_sensor(said, where), "named"
     if isinstance(said, dict) and {"name", "elevations_deg", "azimuth_step_deg"} <= set(said):
         return read_sensor(said, where), "drive.toml"
-    if rate_hz is None and len(stamps_ns) > 1:
-        rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
     some = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
+    if options.as_live and rate_hz is None and len(chosen) > 1:
+        some = chosen[:MEASURED_SCANS]
+        rate_hz = rate_of_first(stamps_ns[some])
+    elif rate_hz is None and len(stamps_ns) > 1:
+        rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
     read = (read_scan(int(i), replace(UNKNOWN, rate_hz=rate_hz or 10.0)) for i in np.unique(some))
     scans = [scan.by_lidar()[0][1] for scan in read]  # the first LiDAR's own
     found = estimate_sensor(scans, rate_hz or 10.0)

@@ -8,10 +8,11 @@ from __future__ import annotations
 import struct
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
-from mapvote.formats.drives.options import DriveOptions, make_drive, map_frame, read_mount, step_of
+from mapvote.formats.drives.options import DriveOptions, beside, make_drive, map_frame, read_mount, step_of
 from mapvote.formats.drives.point_fields import PointReader, livox_table, log, point_cloud_table, stamp_of
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Trajectory, prior_of
@@ -36,6 +37,12 @@ CLOUDS = (CLOUD, *LIVOX)
 PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
 """Parts of the names of messages in which drivers record what came over the wire."""
 POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_MAP_FRAMES = {"", "map", "world", "earth", "global", "utm", "enu"}
+"""Last parts of the names of frames that are fixed to the Earth, in small letters; "" is no name."""
+_BASE = "base_link"
+"""The body that poses without a name of what they track are of (REP 105)."""
+_OWN_POSES = "/mapvote/pose"
+"""What a live drive publishes: no prior."""
 GNSS = ("sensor_msgs/msg/NavSatFix",)
 _TF = "tf2_msgs/msg/TFMessage"
 
@@ -132,7 +139,8 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     own = _mount_in(options.mounts, topics[0], str(path))
     sweeps = _sweeps(bag, topics)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
-    T_prior, frame = _prior(bag, options, stamps_ns, own)
+    poses = _poses(bag, options, topics[0], own)
+    T_prior, frame = _prior(bag, options, stamps_ns, poses)
     readers = [PointReader(f"{path} {topic}", options.time_rules, step_of(stamps_ns)) for topic in topics]
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
@@ -149,28 +157,94 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         scans = [read_message(i, message, sensor) for message in sweeps[i]]
         return scans[0] if len(scans) == 1 else Scan.sweep(int(stamps_ns[i]), scans)
 
-    return make_drive(
+    drive = make_drive(
         path,
         options,
         stamps_ns=stamps_ns,
         T_map_lidar_prior=T_prior,
         read_scan=read_scan,
         frame=frame,
-        T_base_lidar=own,
+        T_base_lidar=poses.T_base_lidar,
     )
+    return replace(drive, prior_in_map=poses.in_map)
 
 
-def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64, mount: F64 | None) -> tuple[F64 | None, MapFrame]:
+def _prior(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: _Poses) -> tuple[F64 | None, MapFrame]:
     """T_map_lidar of every scan (n, 4, 4) from a topic or a file, and the frame it is in."""
-    topic, poses = options.prior, bag.topics(*POSES, *GNSS)
-    if topic is not None and topic.startswith("/") and topic not in poses and not Path(topic).is_file():
-        raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(poses) or 'none'}")
+    topic = poses.topic
+    known = bag.topics(*POSES, *GNSS)
+    if topic is not None and topic.startswith("/") and topic not in known and not Path(topic).is_file():
+        raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(known) or 'none'}")
 
     def own() -> Trajectory | None:
         return None if topic is None else _trajectory(bag, topic, map_frame(options))
 
     files = [bag.path] * len(stamps_ns)
-    return prior_of(bag.path, options, files, stamps_ns, own, topic if topic in poses else None, mount)
+    chosen = msgspec.structs.replace(options, prior=topic)
+    try:
+        return prior_of(bag.path, chosen, files, stamps_ns, own, topic if topic in known else None, poses.T_base_lidar)
+    except MapvoteError as error:
+        if options.prior is not None:
+            raise
+        log.warning("%s. No prior is used; --prior TOPIC says which one counts", error)
+        return None, MapFrame()
+
+
+class _Poses(NamedTuple):
+    """The topic of poses of a bag, as a live drive would choose it."""
+
+    topic: str | None
+    """What ``--prior`` says, else the only one."""
+    T_base_lidar: F64 | None
+    """(4, 4) the first LiDAR on what the topic tracks, by the frames in the bag."""
+    in_map: bool
+    """Whether the poses are in the map's frame."""
+
+
+def _poses(bag: Bag, options: DriveOptions, cloud: str, mount: F64 | None) -> _Poses:
+    """The poses that ``options`` name, else what ``mapvote drive`` chooses: the only Odometry, else the only other
+    topic of poses. ``mount``: of the options."""
+    topic = options.prior
+    if topic is None and options.as_live and not (beside(bag.path) / "prior.txt").is_file():
+        topic = _only_topic_of_poses(bag)
+    if topic not in bag.topics(*POSES):
+        return _Poses(topic, mount, True)
+    in_map = is_map_frame(frame_id(bag, topic))
+    if mount is not None or options.mount is not None or options.T_base_lidar is not None:
+        return _Poses(topic, mount, in_map)
+    lidar = frame_id(bag, cloud)
+    tracked = frame_id(bag, topic, child=True)
+    frames = static_frames(bag)
+    if not tracked and lidar in T_from(frames, _BASE):
+        tracked = _BASE
+    if tracked in ("", lidar):
+        return _Poses(topic, None, in_map)
+    T_base_lidar = T_from(frames, tracked).get(lidar)
+    if T_base_lidar is None:
+        problem = f"{bag.path}: no frames of /tf_static join {lidar} to {tracked}, which {topic} tracks"
+        if options.prior is None:
+            log.warning("%s: no prior is used; name the mount with --mount", problem)
+            return _Poses(None, None, True)
+        log.warning("%s: its poses are taken for the LiDAR's own; name the mount with --mount", problem)
+    return _Poses(topic, T_base_lidar, in_map)
+
+
+def is_map_frame(name: str) -> bool:
+    """Whether poses in the frame of this name may be taken for poses in the map (REP 105: map and earth are fixed, odom
+    is not, and a LiDAR odometry names its first pose)."""
+    return name.strip("/").split("/")[-1].lower() in _MAP_FRAMES
+
+
+def _only_topic_of_poses(bag: Bag) -> str | None:
+    """The only Odometry that holds messages, else the only other topic of poses; None, and a word, if there are
+    several."""
+    for kinds in (POSES[:1], POSES[1:]):
+        named = [topic for topic, n in bag.topics(*kinds).items() if n and topic != _OWN_POSES]
+        if len(named) > 1:
+            log.warning("%s: several topics of poses, none is used; --prior chooses: %s", bag.path, ", ".join(named))
+        if named:
+            return named[0] if len(named) == 1 else None
+    return None
 
 
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:

@@ -34,6 +34,15 @@ class Estimate:
     told: str
 
 
+MEASURED_SCANS = 10
+"""Scans at the beginning of a live drive in which its sensor is measured."""
+
+
+def rate_of_first(stamps_ns: I64) -> float:
+    """Revolutions per second by the stamps (n,), n > 1, of the first scans of a live drive, to a tenth."""
+    return round(1e9 / float(np.median(np.diff(stamps_ns))), 1)
+
+
 def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
     """The sensor of some scans (one or more). A known model where the rings fit one, else a model of what is seen.
 
