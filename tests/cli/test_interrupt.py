@@ -82,6 +82,7 @@ VERBS = {
     "demo --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
+    "send car_1.ballot --to http://localhost:9": "import mapvote.live.depot as m; m.send_all = wait",
     "export http://localhost:9 new --follow": "import mapvote.client as m; m.MapClient.manifest = wait",
 }
 ELSEWHERE = {"serve", "simulate", "topics", "play", "drive", "autoware"}
