@@ -210,6 +210,8 @@ def vote(
             drive = open_drive_on(point_map, drive_path, vehicle=vehicle, as_live=True, **drive_options)
             if name is not None:
                 drive = replace(drive, drive_id=name)
+            if cuts and (poses is not None or trust_prior):
+                raise MapvoteError("vote: --cuts goes with neither --poses nor --trust-prior")
             if cuts:
                 _vote_in_cuts(drive, point_map, settings, every_m, _Outlets(out, send, key))
                 return
