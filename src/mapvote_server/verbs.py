@@ -314,7 +314,8 @@ def explain(
         if edit is not None:
             went = "deleted" if edit["state"] == "changed_empty" else "added"
             trimmed = f"; points {went} by {edit['votes']} of {edit['votes'] + edit['against']} vehicles"
-        print(f"version {decision['version']} decided {decision['state']}{trimmed}")
+        fell = f"; {decision['fell']}" if decision.get("fell") else ""
+        print(f"version {decision['version']} decided {decision['state']}{trimmed}{fell}")
     if answer.get("probability") is not None:
         print(f"probability that the last decision is right: {answer['probability']:.2f}")
     for v in answer["votes"]:

@@ -181,6 +181,7 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
         "versions": [],
         "box": [[0.3, -0.6], [1.5, 0.6]],
         "trimmed": 0,
+        "fell": 0,
         "near": [],
     }
 

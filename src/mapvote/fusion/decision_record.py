@@ -20,6 +20,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.edit import EditVotes
+from mapvote.fusion.gravity import Fallen
 from mapvote.fusion.loss_budget import unpack_agreed
 
 _BYTE_MAX = 255
@@ -100,6 +101,7 @@ class Record:
     packed_odds: bytes | None
     packed_standings: bytes
     packed_edits: bytes | None = None
+    packed_fell: bytes | None = None
 
     @cached_property
     def states(self) -> U8:
@@ -120,6 +122,12 @@ class Record:
     def edit_votes(self) -> EditVotes:
         """Votes behind what came and went in cells of which the states state no such change."""
         return EditVotes.none() if self.packed_edits is None else unpack_edit_votes(self.packed_edits)
+
+    @cached_property
+    def fell(self) -> tuple[I64, I64]:
+        """(flat cells (n,) of which something fell, the first deleted cell of what it fell with (n,), see
+        :class:`mapvote.fusion.gravity.Fallen`)."""
+        return unpack_fell(self.packed_fell)
 
     @cached_property
     def standings(self) -> Sequence[Standing]:
@@ -168,3 +176,19 @@ def unpack_edit_votes(data: bytes) -> EditVotes:
         np.frombuffer(raw, dtype, n, int(start)) for (_, dtype), start in zip(_EDIT_FIELDS, starts, strict=True)
     )
     return EditVotes(cells.astype(np.int64), states, votes.astype(np.int32), against.astype(np.int32))
+
+
+def pack_fell(fell: Fallen) -> bytes | None:
+    """The cells of which something fell, and with what, as a zstd frame; None if there are none."""
+    if not len(fell.cells):
+        return None
+    return compress(fell.cells.astype("<u2").tobytes() + fell.beside.astype("<i8").tobytes(), 1)
+
+
+def unpack_fell(data: bytes | None) -> tuple[I64, I64]:
+    """The inverse of :func:`pack_fell`, (n,) each; MapvoteError if it is damaged."""
+    raw = b"" if data is None else unpack_bytes(data, 10 * CELLS, "decision: fell")
+    n, left = divmod(len(raw), 10)
+    if left:
+        raise MapvoteError(f"decision: fell is damaged ({len(raw)} bytes)")
+    return np.frombuffer(raw, "<u2", n).astype(np.int64), np.frombuffer(raw, "<i8", n, 2 * n).astype(np.int64)

@@ -31,6 +31,7 @@ from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, re
 from mapvote.fusion.copies import Copy, liars_among, originals, without
 from mapvote.fusion.distrust import contradictors, deniers
 from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
+from mapvote.fusion.gravity import Fallen, Remains, fall_across, fall_within, remains_of, remains_without_votes
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled
 from mapvote.fusion.tile_vote import TileVote, by_voter, newest_votes, offered, one_each, silenced
@@ -69,6 +70,12 @@ class Decision:
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
     edit_votes: EditVotes = field(default_factory=EditVotes.none)
     """Votes behind what comes and goes in cells of which ``states`` state no such change; none before the edit."""
+    fell: Fallen = field(default_factory=Fallen.none)
+    """Voxels that fell with a demolished object (fusion/gravity.py); cells that they leave empty are changed-empty."""
+    waits: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """(n,) flat cells from which nothing falls, because their change waits."""
+    undecided: Remains | None = None
+    """The tile, if other tiles decide whether more of it falls."""
     added: int = 0
     """Points added to the tile."""
     deleted: int = 0
@@ -112,14 +119,21 @@ def fuse_tile(
     settings: FuseSettings,
     version: int = 0,
     history: History | None = None,
+    *,
+    reviewed: Bool | None = None,
+    fallen: Fallen | None = None,
 ) -> tuple[Decision, Tile]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
     tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
-    it. The rest as in :func:`decide_tile`.
+    it. ``reviewed`` (256, 256): cells of changes that a reviewer holds or rejected, from which nothing falls.
+    ``fallen``: what falls besides, as its neighbours decide. The rest as in :func:`decide_tile`.
     """
     decided = decide_tile(tile, drives, rule, settings, history)
     gone, edit_votes = deletions(tile, decided)
     edited, added, deleted = _edit(tile, decided.votes, decided.edits, decided.quorum, gone)
+    if not rule.undetermined_competes:
+        decided, edited, more = _let_fall(decided, tile, edited, reviewed, fallen)
+        deleted += more
     if edited is not tile:
         changed = np.flatnonzero(differing(tile, edited))
         memory = (tile.memory or Memory.none()).with_changed(changed, version)
@@ -196,6 +210,33 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int, gone: 
     if (states == int(CellState.CHANGED_OCCUPIED)).any():
         edited, added = add_points(edited, *offered(votes, states, tile.window), quorum)
     return _learn_free(edited, votes, quorum, points_added=added > 0), added, deleted
+
+
+def _let_fall(
+    decided: Decision, tile: Tile, edited: Tile, reviewed: Bool | None, fallen: Fallen | None
+) -> tuple[Decision, Tile, int]:
+    """(the decision, the tile ``edited`` by votes, without what falls, how many points that were)."""
+    # From cells whose change waits nothing falls.
+    waits = np.zeros(CELLS, dtype=np.bool_)
+    waits[decided.pending.cells] = True
+    for cells in (decided.denied, reviewed):
+        if cells is not None:
+            waits |= cells.reshape(-1)
+    site = remains_of(tile, edited, decided.edits, np.flatnonzero(waits))
+    fell, missing = fall_within(tile.index, site)
+    fell = fell if fallen is None else fell.joined(fallen)
+    decided = replace(decided, fell=fell, waits=np.flatnonzero(waits))
+    if not len(fell.cells):
+        return (replace(decided, undecided=site) if missing else decided), edited, 0
+    plane = fell.plane()
+    edited, deleted = delete_points(edited, plane)
+    site = replace(site, rest=site.rest & ~plane)
+    # A cell that the fall leaves empty is changed-empty; its points may be noise of a cell beside it.
+    edits = decided.edits.copy()
+    edits.reshape(-1)[fell.cells[site.rest.reshape(-1)[fell.cells] == 0]] = int(CellState.CHANGED_EMPTY)
+    states = without_spilled(edits, tile, decided.votes) if len(decided.odds.cells) else edits
+    decided = replace(decided, states=states, edits=edits, undecided=site if missing else None)
+    return decided, edited, deleted
 
 
 def hear(
@@ -344,12 +385,25 @@ def update_map(
     changed: dict[TileIndex, Tile] = {}
     version = (point_map.version or 0) + 1
     decisions: dict[TileIndex, Decision] = {}
-    for index in sorted({tile.tile for ballot in unique.values() for tile in ballot.tiles}):
+
+    def fuse(index: TileIndex, fallen: Fallen | None = None) -> None:
         tile = point_map.tile(index)
         votes = [unspent(vote, tile) for vote in newest_votes(_votes_on(index, unique), settings)]
-        decisions[index], edited = fuse_tile(tile, votes, rule, settings, version)
+        decisions[index], edited = fuse_tile(tile, votes, rule, settings, version, fallen=fallen)
         if edited is not tile:
             changed[index] = edited
+
+    def remains_at(index: TileIndex) -> Remains:
+        tile, decided = point_map.tile(index), decisions.get(index)
+        if decided is None:
+            return remains_without_votes(tile)
+        return remains_of(tile, changed.get(index, tile), decided.edits, decided.waits, decided.fell)
+
+    for index in sorted({tile.tile for ballot in unique.values() for tile in ballot.tiles}):
+        fuse(index)
+    undecided = {index: one.undecided for index, one in decisions.items() if one.undecided is not None}
+    for index, fallen in fall_across(undecided, remains_at).items():
+        fuse(index, fallen)
     if point_map.version is not None and changed:
         point_map = replace(point_map, version=version)
     return replace(point_map, tiles=with_changed(point_map.tiles, changed)), decisions

@@ -66,6 +66,8 @@ class ChangedCells:
     """Confidence of the votes for it in that version; UNSAID where no vote states one."""
     stands: Bool
     """Whether the cell is decided to stand: only some of its voxels went."""
+    fell: Bool
+    """Whether its points fell with those of other cells (fusion/gravity.py): no vote is needed for them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,8 @@ class ChangeObject:
     where all its cells stand."""
     trimmed: int
     """Number of its cells that stand and lost only some voxels, beside what stays."""
+    fell: int
+    """Number of its cells whose points fell with those of the others, because nothing holds them."""
 
     @property
     def area_m2(self) -> float:
@@ -206,7 +210,8 @@ def _object(
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
-    voted = mine[versions > 0] if made_in else mine
+    by_vote = (versions > 0) & ~cells.fell[mine]
+    voted = mine[by_vote] if by_vote.any() else mine
     judged = voted[~cells.stands[voted]]
     seen_first, seen_last = int(cells.first_ns[mine].min()), int(cells.last_ns[mine].max())
     columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
@@ -230,6 +235,7 @@ def _object(
         versions=made_in,
         probability=float(probability[judged].mean()) if made_in and len(judged) else None,
         trimmed=int(cells.stands[mine].sum()),
+        fell=int(cells.fell[mine].sum()),
     )
 
 
@@ -238,7 +244,7 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
     n = len(flat)
     votes, against, versions = (np.zeros(n, dtype=np.int64) for _ in range(3))
     odds, first, last = np.full(n, UNSAID, dtype=np.int8), np.full(n, _NEVER), np.full(n, _UNTIL)
-    stands = np.zeros(n, dtype=np.bool_)
+    stands, fell = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     for decision, drives in decided:
         said = decision.states.reshape(-1)[flat]
         tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat] // VOTE_UNIT
@@ -259,10 +265,11 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
         against = np.where(agrees, others, against)
         versions = np.where(agrees, decision.version, versions)
         stands = np.where(agrees, said == CellState.UNCHANGED_OCCUPIED, stands)
+        fell = np.where(agrees, np.isin(flat, decision.fell[0]), fell)
         odds = np.where(agrees, decision.odds.at(flat), odds)
         for end_ns, drive in drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)
     counts = {"votes": votes.astype(np.int32), "against": against.astype(np.int32), "versions": versions}
-    return counts | {"first_ns": first, "last_ns": last, "odds": odds, "stands": stands}
+    return counts | {"first_ns": first, "last_ns": last, "odds": odds, "stands": stands, "fell": fell}

@@ -112,7 +112,7 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
 
 _FACTS = (
     *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
-    *("against_median", "share_for", "probability", "trimmed"),
+    *("against_median", "share_for", "probability", "trimmed", "fell"),
 )
 _DIGITS = {"area_m2": 2, "height_m": 2, "volume_m3": 2, "share_for": 3, "probability": 3}
 

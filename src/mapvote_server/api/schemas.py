@@ -224,6 +224,7 @@ class ChangeFacts(Answer):
     share_for: float | None
     probability: float | None = Field(description="mean over its cells that each of them changed")
     trimmed: int = Field(description="of its cells those that stand and lost only some voxels, beside what stays")
+    fell: int = Field(description="of its cells those whose points fell with the others', because nothing holds them")
     first_seen: str | None
     last_seen: str | None
     versions: list[int]

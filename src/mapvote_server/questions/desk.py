@@ -23,8 +23,8 @@ from mapvote.shapes.geojson import to_geojson
 from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.coverage import waiting_votes
-from mapvote_server.store.fusion_jobs import Fused
-from mapvote_server.store.publish import Gate, Round, doubts_of, edited_tile, reasons_to_hold, round_at
+from mapvote_server.store.fusion_jobs import Fused, edited_tile
+from mapvote_server.store.publish import Gate, Round, doubts_of, reasons_to_hold, round_at
 from mapvote_server.store.queries import load_tile, tile_of
 from mapvote_server.store.reviews import Review, Verdict, decide, standing
 from mapvote_server.store.store import Store

@@ -28,6 +28,7 @@ from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probabi
 from mapvote.fusion.next_pass import Waiting, lacks_quorum_only
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
 from mapvote.shapes.geojson import utc
+from mapvote_server.questions.falls import fell_with
 from mapvote_server.store import schema
 from mapvote_server.store.fusion_jobs import standings_of
 from mapvote_server.store.integrity import DamagedBallots, ballot_name
@@ -89,6 +90,8 @@ class CellDecision:
     state: str
     edit: Edit | None = None
     """The points that it edited though it states no such change; None if there are none."""
+    fell: str = ""
+    """Text: with which demolished object its points fell; empty if none did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,12 +166,16 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
         found = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
         decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
+        falls = [fell_with(store, connection, index, record, cell) for record, _ in decisions]
         votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]], known)
     if not known:
         shown = pseudonyms(store, {vote.vehicle for vote in votes})
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
-    probability = _probability(decisions[-1][0], cell) if decisions else None
-    by_version = [CellDecision(record.version, state, _edit_of(record, cell)) for record, state in decisions]
+    probability = _probability(decisions[-1][0], cell) if decisions and not falls[-1] else None
+    by_version = [
+        CellDecision(record.version, state, _edit_of(record, cell), fell)
+        for (record, state), fell in zip(decisions, falls, strict=True)
+    ]
     thing = [*_lacks(now, votes), *_thing(now)]
     if not thing and not votes and not decisions and not len(now.tile.points):
         thing = ["outside the map"]

@@ -19,16 +19,26 @@ import sqlalchemy as sa
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import pack_plane
-from mapvote.codec.tile_planes import pack_tile
+from mapvote.codec.tile_planes import pack_tile, unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
-from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.columns import EVERY_BIT
+from mapvote.core.grid import TILE_CELLS, Grid, TileIndex
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
-from mapvote.core.types import I64, Bool, MapvoteError
+from mapvote.core.types import I64, U8, Bool, MapvoteError
 from mapvote.fusion.change_time import emptied_and_filled
 from mapvote.fusion.copies import Copy
-from mapvote.fusion.decision_record import Record, Standing, pack_edit_votes, pack_standings, pack_tally, packed_cells
+from mapvote.fusion.decision_record import (
+    Record,
+    Standing,
+    pack_edit_votes,
+    pack_fell,
+    pack_standings,
+    pack_tally,
+    packed_cells,
+)
 from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.gravity import Fallen, Remains, fall_across, remains_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote, voter_of
 from mapvote_server.errors import Unavailable
@@ -40,7 +50,7 @@ from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, po
 _GROUP, _ROUND = 8, 8
 """Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
 executor, so that all its workers have work and a round can be cancelled between groups."""
-_NOWHERE = np.empty(0, dtype=np.uint64)
+_NOWHERE, _NO_CELLS = np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +67,8 @@ class Task:
     asked: Electorate
     misread: Mapping[int, Bool] | None = None
     """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
+    fallen: Fallen | None = None
+    """What falls besides, as the tiles around decide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +100,17 @@ class Fused:
     """Drives that did not count because another vehicle's drive is a copy of them."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because their probability of a false deletion exceeds the budget."""
+    fell: Fallen = field(default_factory=Fallen.none)
+    """What fell with a demolished object, see :class:`mapvote.fusion.fuse.Decision`, as are the next three."""
+    waits: I64 = field(default_factory=lambda: _NO_CELLS)
+    undecided: Remains | None = None
+    noise: tuple[I64, U8] = field(default_factory=lambda: (_NO_CELLS, np.empty(0, np.uint8)))
+    """(flat cells (n,), states by which their points come and go (n,)) where these are not the decided ones."""
 
     @classmethod
     def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
         """The result for a tile that cannot be read."""
-        nowhere = np.empty(0, dtype=np.int64)
-        return cls(index, None, 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
+        return cls(index, None, 0, 0, 0, 0, None, {}, _NO_CELLS, _NO_CELLS, 0, None, damaged)
 
 
 def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
@@ -141,7 +158,13 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         return recent_votes(connection, tile, task.asked, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
-    decision, edited = fuse_tile(tile, votes, rule_named(cast.method), task.asked.settings, task.version, recent)
+    rule, settings = rule_named(cast.method), task.asked.settings
+    barred = [cells for _, cells in polled.bars[tile.index]]
+    reviewed = np.logical_or.reduce(barred) if barred else None
+    decision, edited = fuse_tile(
+        tile, votes, rule, settings, task.version, recent, reviewed=reviewed, fallen=task.fallen
+    )
+    noise = np.flatnonzero(decision.states != decision.edits)
     stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
     held, holds = (tile.obstacle_words, edited.obstacle_words) if hashes else (_NOWHERE, _NOWHERE)
@@ -155,6 +178,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
             pack_agreed(decision.odds, decision.states),
             pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings)),
             pack_edit_votes(decision.edit_votes),
+            pack_fell(decision.fell),
         ),
         vehicles=decision.vehicles,
         points=len(tile.points),
@@ -168,6 +192,10 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         tile=None if task.misread is None else edited,
         copies=decision.copies,
         pending=decision.pending,
+        fell=decision.fell,
+        waits=decision.waits,
+        undecided=decision.undecided,
+        noise=(noise, decision.edits.reshape(-1)[noise]),
     )
 
 
@@ -231,6 +259,57 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
     return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
+
+
+def fallen_across(
+    alone: Mapping[TileIndex, Fused], task_of: Callable[[TileIndex], Task], database: Database
+) -> dict[TileIndex, Fused]:
+    """The tiles in which more falls than each tile of a round decides ``alone``, fused again.
+
+    ``task_of`` gives the task of any tile: those around the round's tiles are fused too where they decide.
+    """
+    undecided = {index: fused.undecided for index, fused in alone.items() if fused.undecided is not None}
+
+    @lru_cache(maxsize=_SITES)
+    def remains_at(index: TileIndex) -> Remains:
+        task = task_of(index)
+        fused = alone[index] if index in alone else fuse_stored([task], database)[0]
+        with database.reading() as connection:
+            return _solid() if fused.record is None else _remains_after(_tile(connection, task), fused, fused.record)
+
+    fallen = fall_across(undecided, remains_at)
+    return {i: fuse_stored([replace(task_of(i), fallen=fell)], database)[0] for i, fell in fallen.items()}
+
+
+_SITES = 32
+"""Most tiles that are kept while groups are followed, 2 MB each."""
+
+
+def _remains_after(before: Tile, fused: Fused, record: Record) -> Remains:
+    """The remains of a tile that was ``before`` its fusion."""
+    after = before if fused.hashes is None else fused.tile or edited_tile(fused, before)
+    cells, states = fused.noise
+    edits = record.states.copy()
+    edits.reshape(-1)[cells] = states
+    return remains_of(before, after, edits, fused.waits, fused.fell)
+
+
+def _solid() -> Remains:
+    """The remains of a tile that cannot be read: what reaches into it stays."""
+    every, none = np.full((TILE_CELLS, TILE_CELLS), EVERY_BIT), np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
+    return Remains(every, every, none, np.zeros(every.shape, dtype=np.int32))
+
+
+def edited_tile(fused: Fused, before: Tile) -> Tile:
+    """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
+    hashes, planes = fused.hashes, fused.planes
+    assert hashes is not None
+    ground, free = before.ground_z, before.free
+    if hashes.ground in planes:
+        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
+    if hashes.free is not None and hashes.free in planes:
+        free = unpack_free_plane(planes[hashes.free], hashes.free)
+    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)
 
 
 @lru_cache(maxsize=4)

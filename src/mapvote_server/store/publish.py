@@ -21,7 +21,6 @@ from sqlalchemy.exc import IntegrityError
 
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap, with_changed
@@ -32,7 +31,7 @@ from mapvote_server.errors import Conflict, Held
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of, insert_rows
 from mapvote_server.store.doubts import Doubts, doubts_about
-from mapvote_server.store.fusion_jobs import Fused, Task, fuse_round
+from mapvote_server.store.fusion_jobs import Fused, Task, edited_tile, fallen_across, fuse_round
 from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote_server.store.policy import GatePolicy
 from mapvote_server.store.queries import (
@@ -43,6 +42,7 @@ from mapvote_server.store.queries import (
     log_event,
     newest_seq,
     set_tiles,
+    tile_of,
     tiles_of,
     tiles_set_between,
     version_of,
@@ -200,7 +200,8 @@ def write_version(
 def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
     """In the order of the table's columns."""
     made = record.packed_states, record.packed_tally, fused.vehicles, fused.added, fused.deleted
-    return number, *fused.index, *made, record.packed_odds, record.packed_standings, record.packed_edits
+    planes = record.packed_odds, record.packed_standings, record.packed_edits, record.packed_fell
+    return number, *fused.index, *made, *planes
 
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
@@ -221,6 +222,8 @@ class Round:
     """Tiles that may differ from what they were when they were last fused: a publish decides these."""
     beside: Mapping[TileIndex, Fused]
     """All other tiles with votes, for what waits there; none unless they were asked for."""
+    alone: Mapping[TileIndex, Fused]
+    """Both as each tile is without its neighbours: of what falls, only what the tile decides alone."""
     every: bool
     """Whether ``beside`` was asked for."""
 
@@ -298,10 +301,17 @@ def _decide(
         until = next_ripe_ns(connection, asked)
     made, url = newest.number + 1, address_of(store.database.url)
     tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
-    found |= {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
-    decided = {index: found[index] for index in dirty}
+    alone = found | {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
+
+    def task_of(index: TileIndex) -> Task:
+        with store.database.reading() as connection:
+            return Task(url, store.lattice.tile(index), made, tile_of(connection, newest.number, index), asked)
+
+    fell = fallen_across(alone, task_of, store.database)
+    found = alone | fell
+    decided = {index: found[index] for index in sorted({*dirty, *fell})}
     beside = {index: found[index] for index in wanted if index not in decided}
-    return Round(newest, asked, until, decided, beside, every)
+    return Round(newest, asked, until, decided, beside, alone, every)
 
 
 def _holds(store: Store, known: Round, now: int) -> bool:
@@ -342,7 +352,7 @@ def _still_true(
     if asked.policy.fuse.min_age_s > 0:
         return {}
     touched = _touched(connection, asked.mark, last.asked.mark)
-    return {index: fused for index, fused in {**last.decided, **last.beside}.items() if index not in touched}
+    return {index: fused for index, fused in last.alone.items() if index not in touched}
 
 
 def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
@@ -362,18 +372,6 @@ def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
             }
             latest.judged = found, gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))
         return [*held, *latest.judged[1]]
-
-
-def edited_tile(fused: Fused, before: Tile) -> Tile:
-    """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
-    hashes, planes = fused.hashes, fused.planes
-    assert hashes is not None
-    ground, free = before.ground_z, before.free
-    if hashes.ground in planes:
-        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
-    if hashes.free is not None and hashes.free in planes:
-        free = unpack_free_plane(planes[hashes.free], hashes.free)
-    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)
 
 
 def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:

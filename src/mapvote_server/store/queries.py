@@ -244,7 +244,7 @@ def records_of(connection: sa.Connection, index: TileIndex, *, after: int = 0, u
     """The decision records of a tile, oldest version first: of all versions, or of those ``after`` one ``upto``
     another, the latter included."""
     d = schema.decisions
-    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds, d.c.standings, d.c.edits)
+    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds, d.c.standings, d.c.edits, d.c.fell)
     query = query.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
     query = query.where(d.c.version > after)
     if upto is not None:

@@ -28,7 +28,7 @@ from mapvote.fusion.fuse import differing
 from mapvote_server.errors import Conflict, NotFound
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of
-from mapvote_server.store.fusion_jobs import Task, fuse_round
+from mapvote_server.store.fusion_jobs import Task, fallen_across, fuse_round
 from mapvote_server.store.publish import Outcome, write_version
 from mapvote_server.store.queries import (
     Version,
@@ -172,14 +172,19 @@ def _turned_back(store: Store, number: int, before: _State, target: _State) -> _
 
 def _fused(store: Store, version: Version, before: _State, history: _History, executor: Executor | None) -> _State:
     without = frozenset(name for name, until in history.out.items() if version.number < until)
-    tasks, url = [], address_of(store.database.url)
+    url = address_of(store.database.url)
     with store.database.reading() as connection:
         asked = Electorate.of(version, without, ballots_aside(connection))
-        for index in standing_tiles(connection, version.mark):
+        standing = standing_tiles(connection, version.mark)
+
+    def task_of(index: TileIndex) -> Task:
+        with store.database.reading() as connection:
             tile, misread = _content(store, connection, before, index).tile, history.misread.get(index, {})
-            tasks.append(Task(url, tile.window, version.number, tile, asked, misread))
-    fused = fuse_round(tasks, store.database, executor)
-    edited = {f.index: _Content(f.tile, True) for f in fused if f.hashes and f.tile is not None}
+        return Task(url, tile.window, version.number, tile, asked, misread)
+
+    alone = {fused.index: fused for fused in fuse_round(list(map(task_of, standing)), store.database, executor)}
+    fused = alone | fallen_across(alone, task_of, store.database)
+    edited = {f.index: _Content(f.tile, True) for f in fused.values() if f.hashes and f.tile is not None}
     return _State(before.root, {**before.edited, **edited})
 
 

@@ -172,12 +172,14 @@ decisions = sa.Table(
     sa.Column("odds", sa.LargeBinary),
     sa.Column("standings", sa.LargeBinary, nullable=False),
     sa.Column("edits", sa.LargeBinary),
+    sa.Column("fell", sa.LargeBinary),
     sum_but("version", "row", "col", "vehicles", "added", "deleted"),
 )
 """The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: log-odds of the changed
 cells by the vehicles that voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: no vehicle sent
 any. ``standings``: which ballots counted, and why the others did not. ``edits``: the votes behind points that came or
-went in cells of which ``states`` state no such change; null: there are none."""
+went in cells of which ``states`` state no such change; null: there are none. ``fell``: cells of which something fell
+with a demolished object (fusion/gravity.py); null: none."""
 
 reviews = sa.Table(
     "reviews",

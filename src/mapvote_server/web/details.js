@@ -99,7 +99,7 @@ export async function showCell([x, y]) {
       !v.counts && element("div", { className: "why" }, [`does not count now: ${v.why || "no reason given"}`]),
     ]);
   const edited = ({ state, votes, against }) => `; points ${state === "changed_empty" ? "deleted" : "added"} by ${votes} of ${votes + against} vehicles`;
-  const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}${d.edit ? edited(d.edit) : ""}.`);
+  const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}${d.edit ? edited(d.edit) : ""}${d.fell ? `; ${d.fell}` : ""}.`);
   if (/^(pending|trimmed):/.test(answer.thing)) decided.push(`${answer.thing}.`);
   details(title, null, [
     ...decided.map((text) => element("p", {}, [text])),

@@ -1,0 +1,472 @@
+"""Gravity: what remains in the air where an object was demolished falls with it.
+
+Rays seldom cross the tops of facades and roofs. So votes on single cells leave them hanging over a house that a quorum
+saw go. A group of remaining obstacle voxels (26 neighbours) falls if nothing holds it, and it
+
+- touches what a decided changed-empty deletes in this round, or
+- lies inside a demolished object: wholly within its outline from above, and beginning no higher than its top.
+
+A group is held by a voxel near the ground, by a cell that is decided occupied (unchanged or changed), and by a cell
+whose change waits (for a reviewer, for another vehicle, for the budget of false deletions). Wires, signs, bridges and
+tree crowns stay: they hang on something that stays, or reach beyond the outline of what went.
+
+Groups and objects are followed over the borders of tiles, as far as :class:`Gravity` says. Whether a group falls
+depends on both alone, never on the order of votes or tiles, nor on where the borders lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
+from mapvote.core.kernel import inlined, kernel
+from mapvote.core.tile import Tile
+from mapvote.core.types import I32, I64, NO_VOTE, U8, U64, Bool, CellState, read_only
+
+
+@dataclass(frozen=True, slots=True)
+class Gravity:
+    """When a group falls."""
+
+    touch_voxels: int = 2
+    """A group touches a deleted voxel that is at most so far away along each axis, voxels. So far an outline reaches
+    beyond its deleted cells, and a group may begin above the top of an object."""
+    ground_voxels: int = 7
+    """So many of the lowest voxels of a column hold; bit 0 holds the ground, so they reach 1.8 to 2.1 m above it."""
+    longest_cells: int = 250
+    """A group that spans more rows or columns stays, cells: 75 m."""
+    longest_object_cells: int = 500
+    """An object that spans more rows or columns has no inside, cells: 150 m. So two tiles in each direction show all
+    that decides about one tile."""
+    reach_cells: int = 1
+    """Deleted cells are of one object if their surroundings, so many cells wide, touch."""
+    inside_cells: int = 45
+    """An object with a smaller outline has no inside, cells: 4 m2. Poles, signs and bollards have none."""
+
+
+GRAVITY = Gravity()
+
+
+@dataclass(frozen=True, slots=True)
+class Remains:
+    """A tile after the edit by votes; arrays (256, 256)."""
+
+    rest: U64
+    """Column words of the obstacle voxels that remain."""
+    holds: U64
+    """Those of them that stay, whatever happens around them."""
+    deleted: U64
+    """Voxels that a decided changed-empty has deleted in this round."""
+    base: I32
+    """Lattice layer of bit 0 of each column."""
+
+
+def remains_of(before: Tile, after: Tile, states: U8, kept: I64, fell: Fallen | None = None) -> Remains:
+    """The remains of a tile ``before`` and ``after`` its edit by ``states`` (256, 256).
+
+    ``kept`` (n,): flat cells that hold, whatever their state. ``fell``: what went by gravity, not by votes. A tile
+    without known ground has no beginning of columns: all of it holds.
+    """
+    rest = after.obstacle_words
+    near_ground = (1 << GRAVITY.ground_voxels) - 1 if after.has_ground else (1 << 64) - 1
+    holds = rest & np.uint64(near_ground)
+    stands = (states == int(CellState.UNCHANGED_OCCUPIED)) | (states == int(CellState.CHANGED_OCCUPIED))
+    holds[stands] = rest[stands]
+    holds.reshape(-1)[kept] = rest.reshape(-1)[kept]
+    emptied = states == int(CellState.CHANGED_EMPTY)
+    deleted = np.where(emptied, before.obstacle_words & ~rest, np.uint64(0))
+    if fell is not None:
+        deleted &= ~fell.plane()
+    return Remains(rest, holds, deleted, after.base)
+
+
+def remains_without_votes(tile: Tile) -> Remains:
+    """The remains of a tile of which no vehicle votes."""
+    silent = np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8)
+    return remains_of(tile, tile, silent, np.empty(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class Fallen:
+    """The voxels of one tile that fell; n cells, ascending."""
+
+    cells: I64
+    """(n,) flat."""
+    words: U64
+    """(n,) column words."""
+    beside: I64
+    """(n,) the first deleted cell that the group touches, else that of the object, by :func:`lattice_key`."""
+
+    @classmethod
+    def none(cls) -> Fallen:
+        """Nothing fell."""
+        return cls(np.empty(0, np.int64), np.empty(0, np.uint64), np.empty(0, np.int64))
+
+    @classmethod
+    def of(cls, words: U64, beside: I64) -> Fallen:
+        """From planes (256, 256); ``beside`` counts where a word has a bit."""
+        cells = np.flatnonzero(words)
+        return cls(cells, words.reshape(-1)[cells], beside.reshape(-1)[cells])
+
+    def plane(self) -> U64:
+        """(256, 256) column words."""
+        words = np.zeros(CELLS, dtype=np.uint64)
+        words[self.cells] = self.words
+        return words.reshape(TILE_CELLS, TILE_CELLS)
+
+    def joined(self, other: Fallen) -> Fallen:
+        """The voxels of both."""
+        words, beside = np.zeros(CELLS, np.uint64), np.full(CELLS, _NOWHERE)
+        for part in (self, other):
+            words[part.cells] |= part.words
+            beside[part.cells] = np.minimum(beside[part.cells], part.beside)
+        return Fallen.of(words, beside)
+
+
+_NOWHERE = np.iinfo(np.int64).max
+_HALF = 1 << 31
+
+
+def lattice_key(row: int, col: int) -> int:
+    """A cell of the lattice as one number, ascending by row, then column."""
+    return (row << 32) + col + _HALF
+
+
+def lattice_cell(key: int) -> tuple[int, int]:
+    """(row, col): the inverse of :func:`lattice_key`."""
+    return key >> 32, (key & 0xFFFFFFFF) - _HALF
+
+
+def fall_within(index: TileIndex, site: Remains) -> tuple[Fallen, frozenset[TileIndex]]:
+    """(what falls in one tile whatever lies around it, the tiles without which more cannot be decided)."""
+    if not site.deleted.any():
+        return Fallen.none(), frozenset()
+    fallen, missing = _fall_in(index, {index: site})
+    return fallen.get(index, Fallen.none()), missing
+
+
+def fall_across(
+    undecided: Mapping[TileIndex, Remains], remains_at: Callable[[TileIndex], Remains]
+) -> dict[TileIndex, Fallen]:
+    """What falls besides, by tile.
+
+    ``undecided``: the remains of tiles for which :func:`fall_within` misses others. ``remains_at`` gives those of any
+    other tile; it is asked only for tiles that matter.
+    """
+    fallen: dict[TileIndex, Fallen] = {}
+    for index in sorted(undecided):
+        sites, missing = {index: undecided[index]}, frozenset({index})
+        found: dict[TileIndex, Fallen] = {}
+        while missing:
+            found, missing = _fall_in(index, sites)
+            sites |= {tile: undecided[tile] if tile in undecided else remains_at(tile) for tile in missing}
+        for tile, more in found.items():
+            fallen[tile] = fallen[tile].joined(more) if tile in fallen else more
+    return fallen
+
+
+def _fall_in(
+    index: TileIndex, sites: Mapping[TileIndex, Remains], gravity: Gravity = GRAVITY
+) -> tuple[dict[TileIndex, Fallen], frozenset[TileIndex]]:
+    """(what falls by the deletions of tile ``index`` as far as ``sites`` show, the tiles that are missing)."""
+    window = _Window.of(sites)
+    own = window.slices_of(index)
+    # Groups that touch a deletion of this tile.
+    corner, reach = (own[0].start, own[1].start), (gravity.touch_voxels, gravity.longest_cells)
+    deleted = read_only(np.ascontiguousarray(window.deleted[own]))
+    _drop_touching(*window.shown, deleted, *corner, *window.lattice_corner, *reach, *window.memory, *window.found)
+    # Groups inside an object of which a part lies in this tile.
+    for body in _bodies(window, own, gravity):
+        limits = body.tops, *body.corner, body.key, gravity.longest_cells
+        _drop_inside(*window.shown, *limits, *window.memory, *window.found)
+    fallen = {tile: window.fallen_in(tile) for tile in sites if window.words[window.slices_of(tile)].any()}
+    # What leaves the tiles around is too long.
+    around = gravity.longest_object_cells // TILE_CELLS + 1
+    near = {t for t in window.missing() if max(abs(t[0] - index[0]), abs(t[1] - index[1])) <= around}
+    return fallen, frozenset(near)
+
+
+class _Window:
+    """The planes of some sites as one window of whole tiles, and what is found in it."""
+
+    def __init__(self, corner: TileIndex, known: Bool, rest: U64, holds: U64, deleted: U64, base: I32) -> None:
+        self.corner, self.known = corner, known
+        self.base, self.deleted = base, deleted
+        self.shown = read_only(rest), read_only(holds), read_only(base), known
+        most = int(np.bitwise_count(rest & ~holds).sum()) + 1
+        self.words, self.asked = np.zeros_like(rest), np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
+        self.memory = np.zeros_like(rest), np.zeros_like(rest), np.empty(most, np.int64), np.empty(most, np.uint64)
+        self.beside = np.full(rest.shape, _NOWHERE)
+        self.found = self.asked, self.words, self.beside
+
+    @classmethod
+    def of(cls, sites: Mapping[TileIndex, Remains]) -> _Window:
+        """The smallest window that holds all ``sites``; what no site shows is not known."""
+        row0, col0 = min(row for row, _ in sites), min(col for _, col in sites)
+        known = np.zeros((max(row for row, _ in sites) - row0 + 1, max(col for _, col in sites) - col0 + 1), np.bool_)
+        for row, col in sites:
+            known[row - row0, col - col0] = True
+        names = "rest", "holds", "deleted", "base"
+        return cls((row0, col0), known, *(_laid_out(sites, name, (row0, col0), known.shape) for name in names))
+
+    @property
+    def lattice_corner(self) -> tuple[int, int]:
+        """Row and column of its first cell on the lattice."""
+        return self.corner[0] * TILE_CELLS, self.corner[1] * TILE_CELLS
+
+    def slices_of(self, index: TileIndex) -> tuple[slice, slice]:
+        """The cells of a tile."""
+        return _slices(index[0] - self.corner[0], index[1] - self.corner[1])
+
+    def fallen_in(self, index: TileIndex) -> Fallen:
+        """What falls in a tile."""
+        own = self.slices_of(index)
+        return Fallen.of(self.words[own], self.beside[own])
+
+    def missing(self) -> set[TileIndex]:
+        """The tiles that were asked for."""
+        row0, col0 = self.corner
+        return {(int(row) + row0 - 1, int(col) + col0 - 1) for row, col in np.argwhere(self.asked)}
+
+    def shows(self, low: tuple[int, int], high: tuple[int, int]) -> bool:
+        """Whether all cells from ``low`` to ``high``, (row, col) each, are known; the tiles that are not are asked
+        for."""
+        rows, cols = (range(a // TILE_CELLS, b // TILE_CELLS + 1) for a, b in zip(low, high, strict=True))
+        unknown = [(r, c) for r in rows for c in cols if not self._knows(r, c)]
+        for r, c in unknown:
+            if -1 <= r <= self.known.shape[0] and -1 <= c <= self.known.shape[1]:
+                self.asked[r + 1, c + 1] = True
+        return not unknown
+
+    def _knows(self, row: int, col: int) -> bool:
+        inside = 0 <= row < self.known.shape[0] and 0 <= col < self.known.shape[1]
+        return inside and bool(self.known[row, col])
+
+
+def _laid_out(sites: Mapping[TileIndex, Remains], name: str, corner: TileIndex, shape: tuple[int, ...]) -> NDArray[Any]:
+    """One plane of all sites, over ``shape`` tiles from ``corner``."""
+    if len(sites) == 1:
+        return np.asarray(getattr(next(iter(sites.values())), name))
+    dtype = np.int32 if name == "base" else np.uint64
+    whole = np.zeros((shape[0] * TILE_CELLS, shape[1] * TILE_CELLS), dtype=dtype)
+    for (row, col), site in sites.items():
+        whole[_slices(row - corner[0], col - corner[1])] = getattr(site, name)
+    return whole
+
+
+def _slices(row: int, col: int) -> tuple[slice, slice]:
+    return slice(row * TILE_CELLS, (row + 1) * TILE_CELLS), slice(col * TILE_CELLS, (col + 1) * TILE_CELLS)
+
+
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """The inside of a demolished object."""
+
+    tops: I32
+    """(h, w) lattice layer up to which a group may begin, in the cells within the outline; elsewhere _OUTSIDE."""
+    corner: tuple[int, int]
+    """Row and column of its first cell in the window."""
+    key: int
+    """Its first deleted cell, by :func:`lattice_key`."""
+
+
+_OUTSIDE = -(1 << 30)
+
+
+def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iterator[_Body]:
+    """The insides of the objects of which a deleted cell lies in the cells ``own``; those that unknown tiles may extend
+    are asked for instead."""
+    rows, cols = np.nonzero(window.deleted)
+    if not len(rows):
+        return
+    # Objects among the deleted cells.
+    row0, col0 = int(rows.min()), int(cols.min())
+    emptied = np.zeros((int(rows.max()) - row0 + 1, int(cols.max()) - col0 + 1), dtype=np.bool_)
+    emptied[rows - row0, cols - col0] = True
+    wide = np.ones((2 * gravity.reach_cells + 1,) * 2, dtype=np.bool_)
+    near = scipy.ndimage.binary_dilation(emptied, wide)
+    objects = np.where(emptied, scipy.ndimage.label(near, np.ones((3, 3)))[0], 0)
+    # Those of this tile that are large enough for an inside, and not too long.
+    boxes = scipy.ndimage.find_objects(objects)
+    here = objects[
+        tuple(slice(max(s.start - o, 0), max(s.stop - o, 0)) for s, o in zip(own, (row0, col0), strict=True))
+    ]
+    for number in np.unique(here[here > 0]).tolist():
+        box = boxes[number - 1]
+        height, width = (side.stop - side.start for side in box)
+        if max(height, width) > gravity.longest_object_cells or height * width < gravity.inside_cells:
+            continue
+        r, c = np.nonzero(objects[box] == number)
+        r, c = r + box[0].start + row0, c + box[1].start + col0
+        margin = 2 * gravity.reach_cells + gravity.touch_voxels
+        if window.shows((int(r.min()) - margin, int(c.min()) - margin), (int(r.max()) + margin, int(c.max()) + margin)):
+            body = _body_of(window, r, c, gravity)
+            if body is not None:
+                yield body
+
+
+def _body_of(window: _Window, rows: I64, cols: I64, gravity: Gravity) -> _Body | None:
+    """The inside of the object of deleted cells (n,) of the window, by row, then column; None if it is too small."""
+    # The outline from above: the convex hull of the cells.
+    first = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
+    last = np.append(first[1:], len(rows)) - 1
+    ends = np.concatenate([np.stack([rows[at], cols[at]], axis=1) for at in (first, last)])
+    corners = np.concatenate([ends + np.array([i, j]) for i in (-0.5, 0.5) for j in (-0.5, 0.5)])
+    hull = scipy.spatial.ConvexHull(corners)
+    if hull.volume < gravity.inside_cells:
+        return None
+    # The cells within it, and a little beyond.
+    touch = gravity.touch_voxels
+    low = max(int(rows.min()) - touch, 0), max(int(cols.min()) - touch, 0)
+    r = np.arange(low[0], min(int(rows.max()) + touch + 1, window.base.shape[0]))[:, None]
+    c = np.arange(low[1], min(int(cols.max()) + touch + 1, window.base.shape[1]))
+    inside = np.ones((len(r), len(c)), dtype=np.bool_)
+    for across, along, offset in hull.equations:
+        inside &= across * r + along * c + offset <= touch
+    # The highest deleted voxel.
+    words = window.deleted[rows, cols]
+    highest = np.floor(np.log2(words.astype(np.float64))).astype(np.int64).clip(0, 63)
+    top = int((window.base[rows, cols] + highest).max()) + touch
+    key = int(lattice_key(int(rows[0]) + window.lattice_corner[0], int(cols[0]) + window.lattice_corner[1]))
+    return _Body(np.where(inside, np.int32(top), np.int32(_OUTSIDE)), low, key)
+
+
+@inlined
+def _seen_from(word: np.uint64, layers: int) -> np.uint64:
+    """A column's word from a base that lies ``layers`` lower; bits that pass an end are gone."""
+    if layers >= 64 or layers <= -64:
+        return np.uint64(0)
+    return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
+
+
+@kernel
+def _drop_touching(
+    rest: U64, holds: U64, base: I32, known: Bool, deleted: U64, row0: int, col0: int, lattice_row: int,
+    lattice_col: int, touch: int, longest: int, seen: U64, stays: U64, cells: I64, words: U64, asked: Bool,
+    fallen: U64, beside: I64,
+) -> None:  # fmt: skip
+    """Into ``fallen`` and ``beside`` the groups that touch a voxel of ``deleted`` (256, 256) and that nothing holds.
+
+    The other planes are of a window of tiles; ``known`` says which of them are shown. ``row0`` and ``col0`` are the
+    first cell of ``deleted`` in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. ``seen`` and ``stays``
+    mark the voxels of groups that were followed, and of those that are held; ``cells`` and ``words`` are memory for one
+    group. Into ``asked``, which has one tile more on every side, the tiles that would decide a group.
+    """
+    rows, cols = rest.shape
+    nowhere = base[:0, :0]
+    for i in range(TILE_CELLS):
+        for j in range(TILE_CELLS):
+            if deleted[i, j] == 0:
+                continue
+            r, c = row0 + i, col0 + j
+            for a in range(r - touch, r + touch + 1):
+                for b in range(c - touch, c + touch + 1):
+                    if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
+                        asked[a // TILE_CELLS + 1, b // TILE_CELLS + 1] = True
+                        continue
+                    near = _seen_from(deleted[i, j], base[r, c] - base[a, b])
+                    for _ in range(touch):
+                        near |= (near << np.uint64(1)) | (near >> np.uint64(1))
+                    near &= rest[a, b] & ~holds[a, b]
+                    while near & ~seen[a, b]:
+                        start = near & ~seen[a, b]
+                        start &= ~start + np.uint64(1)
+                        n = _follow(
+                            rest, holds, base, known, a, b, start, nowhere, 0, 0, longest, seen, stays, cells, words,
+                            asked,
+                        )  # fmt: skip
+                        for k in range(n):
+                            x, y = cells[k] // cols, cells[k] % cols
+                            fallen[x, y] |= words[k]
+                            beside[x, y] = min(beside[x, y], ((lattice_row + r) << 32) + lattice_col + c + _HALF)
+
+
+@kernel
+def _drop_inside(
+    rest: U64, holds: U64, base: I32, known: Bool, tops: I32, row0: int, col0: int, key: int, longest: int, seen: U64,
+    stays: U64, cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
+) -> None:  # fmt: skip
+    """Into ``fallen`` and ``beside`` (``key``) the groups inside a body that nothing holds: ``tops`` (h, w) as in
+    :class:`_Body`, from ``row0``, ``col0`` of the window. The rest as in :func:`_drop_touching`."""
+    cols = rest.shape[1]
+    for i in range(tops.shape[0]):
+        for j in range(tops.shape[1]):
+            if tops[i, j] == _OUTSIDE:
+                continue
+            a, b = row0 + i, col0 + j
+            waiting = rest[a, b] & ~holds[a, b] & ~seen[a, b]
+            while waiting:
+                start = waiting & (~waiting + np.uint64(1))
+                n = _follow(
+                    rest, holds, base, known, a, b, start, tops, row0, col0, longest, seen, stays, cells, words, asked
+                )
+                for k in range(n):
+                    x, y = cells[k] // cols, cells[k] % cols
+                    fallen[x, y] |= words[k]
+                    beside[x, y] = min(beside[x, y], key)
+                waiting &= ~start & ~seen[a, b]
+
+
+@kernel
+def _follow(
+    rest: U64, holds: U64, base: I32, known: Bool, row: int, col: int, start: np.uint64, tops: I32, row0: int,
+    col0: int, longest: int, seen: U64, stays: U64, cells: I64, words: U64, asked: Bool,
+) -> int:  # fmt: skip
+    """How many entries of ``cells`` and ``words`` are the group of a voxel that falls; 0 if it stays or is undecided.
+
+    With ``tops`` the group must be inside them; if it is not, it is not ``seen`` either.
+    """
+    rows, cols = rest.shape
+    wide, confined = cols // TILE_CELLS + 2, tops.shape[0] > 0
+    low_row, high_row, low_col, high_col = row, row, col, col
+    seen[row, col] |= start
+    cells[0], words[0] = row * cols + col, start
+    done, n, wanted, held, leaves, begins = 0, 1, 0, False, False, False
+    while done < n and not held and not leaves:
+        r, c = cells[done] // cols, cells[done] % cols
+        if confined and not begins:
+            lowest = 0
+            while not words[done] >> np.uint64(lowest) & np.uint64(1):
+                lowest += 1
+            begins = base[r, c] + lowest <= tops[r - row0, c - col0]
+        for a in range(r - 1, r + 2):
+            for b in range(c - 1, c + 2):
+                if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
+                    wanted |= 1 << ((a // TILE_CELLS + 1) * wide + b // TILE_CELLS + 1)
+                    continue
+                near = _seen_from(words[done], base[r, c] - base[a, b])
+                near = (near | (near << np.uint64(1)) | (near >> np.uint64(1))) & rest[a, b]
+                held = held or near & (holds[a, b] | stays[a, b]) != 0
+                near &= ~seen[a, b]
+                if near:
+                    i, j = a - row0, b - col0
+                    if confined and (
+                        i < 0 or j < 0 or i >= tops.shape[0] or j >= tops.shape[1] or tops[i, j] == _OUTSIDE
+                    ):
+                        leaves = True
+                        continue
+                    seen[a, b] |= near
+                    cells[n], words[n] = a * cols + b, near
+                    n += 1
+                    low_row, high_row = min(low_row, a), max(high_row, a)
+                    low_col, high_col = min(low_col, b), max(high_col, b)
+        done += 1
+        held = held or high_row - low_row >= longest or high_col - low_col >= longest
+    if held:
+        for k in range(n):
+            stays[cells[k] // cols, cells[k] % cols] |= words[k]
+        return 0
+    if leaves or (confined and not begins):
+        for k in range(n):
+            seen[cells[k] // cols, cells[k] % cols] &= ~words[k]
+        return 0
+    for k in range(asked.shape[0] * wide):
+        if wanted >> k & 1:
+            asked[k // wide, k % wide] = True
+    return 0 if wanted else n
