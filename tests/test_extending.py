@@ -16,10 +16,12 @@ from command_line import typed
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core import rule
+from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import update_map
 from mapvote.matching.localiser import GivenPoses
+from mapvote.matching.matcher import map_around
 from mapvote.vehicle import vote_drive
 from mapvote_server.api.app import URL, in_process
 from stores import NewStore
@@ -93,6 +95,23 @@ def test_a_rule_of_another_distribution_casts_ballots_that_fuse_and_that_a_serve
         refused = client.put(f"/v1/ballots/{other.vehicle}/other", content=encode(other))
         assert refused.status_code == 409
         assert "uses method surfaces, two-stage; the current round accepts only any_hit, two-stage" in refused.text
+
+
+def test_a_matcher_of_another_distribution_localises_a_drive(install: Install) -> None:
+    install("fine_vgicp")
+    poses = path(8)
+    off_m = from_xyz_rpy(0.6, -0.4, 0.1)
+    drive = drive_along(poses, 3, prior=poses @ off_m)
+    settings = Settings.model_validate({"ndt": {"matcher": "fine_vgicp"}})
+    _, report = vote_drive(drive, map_from_points(street(7)), settings)
+    assert not report.lost
+    errors_m = [np.linalg.norm(T[:3, 3] - true[:3, 3]) for T, true in zip(report.T_map_lidar, poses, strict=True)]
+    assert max(errors_m) < 0.15
+
+
+def test_a_matcher_that_no_distribution_brings_is_named_with_those_that_are_known(old_map: PointMap) -> None:
+    with pytest.raises(MapvoteError, match="no matcher 'gicp'; known are ndt, vgicp"):
+        map_around("gicp", old_map)
 
 
 def test_a_rule_that_no_distribution_brings_is_named_with_those_that_are_known(old_map: PointMap) -> None:

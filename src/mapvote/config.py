@@ -42,6 +42,11 @@ class Section(BaseModel):
 class NdtSettings(Section):
     """When a scan's registration is sound (matching/odometry.py)."""
 
+    matcher: str = Field(
+        default="ndt",
+        pattern="^[a-z][a-z0-9_]*$",
+        description="how scans are matched with the map: ndt, vgicp (extra vgicp), or that of a plug-in",
+    )
     min_inlier_share: float = Field(
         default=0.5, description="abstain if fewer of the returns are inliers; scans at a wrong pose have about 0.4"
     )

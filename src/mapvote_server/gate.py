@@ -21,7 +21,6 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
-from mapvote.matching.ndt import refine
 from mapvote.matching.ndt_map import MapWindow
 from mapvote.matching.prepare import deskew, thin_for_levels, twist_between
 from mapvote.shapes.change_objects import changed_cells
@@ -182,7 +181,7 @@ def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, list[str]]:
 
 def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F64], ndt: NdtSettings) -> Localised:
     ndt_map = window(prior[:3, 3])
-    found = [refine(ndt_map, clouds, guess) for guess in guesses]
+    found = [ndt_map.refine(clouds, guess) for guess in guesses]
     best = max(found, key=lambda registration: registration.score)
     positions = np.array([registration.T_map_lidar[:3, 3] for registration in found])
     scatter = float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))

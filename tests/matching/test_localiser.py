@@ -38,8 +38,9 @@ def scan(i: int) -> Scan:
     return sweep(world(100 + i, 0.6), POSES[i], twist_of(POSES, i), (i + 1) * 100_000_000)
 
 
-def localiser(point_map: PointMap) -> Localiser:
-    return Localiser(point_map, SETTINGS, SENSORS["hdl32e"])
+def localiser(point_map: PointMap, matcher: str = "ndt") -> Localiser:
+    settings = SETTINGS.model_copy(update={"ndt": SETTINGS.ndt.model_copy(update={"matcher": matcher})})
+    return Localiser(point_map, settings, SENSORS["hdl32e"])
 
 
 def told(T_map_lidar: F64) -> PosePrior:
@@ -66,10 +67,13 @@ def test_scans_wait_until_several_agree_and_leave_with_the_look_that_confirms_th
     assert all(fix.trusted for fix in one.flush())
 
 
+@pytest.mark.parametrize("matcher", ["ndt", "vgicp"])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (-8.0, 0.0), (10.0, 0.0), (3.0, 4.0)])
-def test_a_prior_metres_off_moves_no_vehicle_and_silences_none(point_map: PointMap, shift: tuple[float, float]) -> None:
+def test_a_prior_metres_off_moves_no_vehicle_and_silences_none(
+    point_map: PointMap, shift: tuple[float, float], matcher: str
+) -> None:
     """A steady error of it is learned."""
-    one = localiser(point_map)
+    one = localiser(point_map, matcher)
     fixes = drive(one, np.array([T @ from_xyz_rpy(*shift, 0.0) for T in POSES]))
     assert len(fixes) == len(POSES)
     assert all(fix.trusted for fix in fixes)

@@ -2,6 +2,7 @@
 formulas written plainly in numpy, in float64 and pair by pair."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import exp, from_xyz_rpy, hat, inverse, log, rotation_angle, transform
 from mapvote.core.types import F64, PosePrior
 from mapvote.matching import ndt
-from mapvote.matching.ndt import CUTOFF_E, INLIER_E, Room, best_of, fitnesses, likeliest, refine
-from mapvote.matching.ndt_map import NdtGrid, NdtMap, build_ndt
+from mapvote.matching.matcher import best_of, likeliest
+from mapvote.matching.ndt import CUTOFF_E, INLIER_E, Room
+from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap, build_ndt
+from mapvote.matching.ndt_voxels import NdtGrid
 from mapvote.matching.prepare import in_rows, thin_for_levels
 from streets import street, surface
 
@@ -38,7 +41,7 @@ def errors(T: F64) -> tuple[float, float]:
 @given(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7), st.floats(-0.2, 0.2), st.floats(-0.05, 0.05))
 def test_a_known_motion_is_recovered(ndt_map: NdtMap, scan: F64, dx: float, dy: float, dz: float, yaw: float) -> None:
     guess = T_TRUE @ from_xyz_rpy(dx, dy, dz, 0.0, 0.0, yaw)
-    result = refine(ndt_map, thin_for_levels(scan), guess)
+    result = ndt_map.refine(thin_for_levels(scan), guess)
     shift, turn = errors(result.T_map_lidar)
     assert result.converged
     assert shift < 0.02
@@ -50,34 +53,34 @@ def test_the_answer_does_not_depend_on_where_in_the_world_the_street_lies(scan: 
     offset = np.array([600_000.0, -5_600_000.0, 300.0])
     guess = T_TRUE.copy()
     guess[:3, 3] += offset + np.array([0.3, 0.2, 0.0])
-    result = refine(build_ndt(street(1, 2.0) + offset), thin_for_levels(scan), guess)
+    result = build_ndt(street(1, 2.0) + offset).refine(thin_for_levels(scan), guess)
     result.T_map_lidar[:3, 3] -= offset
     assert errors(result.T_map_lidar)[0] < 0.02
 
 
 def test_a_wrong_pose_shows_in_score_and_inliers_and_no_overlap_at_all_is_no_error(ndt_map: NdtMap, scan: F64) -> None:
     clouds = thin_for_levels(scan)
-    right = refine(ndt_map, clouds, T_TRUE)
-    lost = refine(ndt_map, clouds, T_TRUE @ from_xyz_rpy(60.0, 40.0, 0.0, 0.0, 0.0, 1.0))
+    right = ndt_map.refine(clouds, T_TRUE)
+    lost = ndt_map.refine(clouds, T_TRUE @ from_xyz_rpy(60.0, 40.0, 0.0, 0.0, 0.0, 1.0))
     assert lost.score < 0.5 * right.score
     assert lost.inlier_share < 0.5 * right.inlier_share
     off, empty = thin_for_levels(scan), thin_for_levels(np.zeros((0, 3)))
-    for nowhere in (refine(ndt_map, off, T_TRUE @ from_xyz_rpy(1e6, 0, 0)), refine(ndt_map, empty, T_TRUE)):
+    for nowhere in (ndt_map.refine(off, T_TRUE @ from_xyz_rpy(1e6, 0, 0)), ndt_map.refine(empty, T_TRUE)):
         assert nowhere.inlier_share == nowhere.score == 0.0
         assert np.isfinite(nowhere.covariance).all()
 
 
-def test_covariance_covers_the_error_over_many_scans(ndt_map: NdtMap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_covariance_covers_the_error_over_many_scans() -> None:
     """Normalised squared errors average 6 when the covariance is right; a factor of 4 either way is accepted.
 
     The map of this test is exact, so the part of the covariance that stands for the map's own error is left out.
     """
-    monkeypatch.setattr(ndt, "MAP_SIGMA_M", 0.0)
-    monkeypatch.setattr(ndt, "MAP_SIGMA_RAD", 0.0)
+    ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, map_sigma_m=0.0, map_sigma_deg=0.0))
+    ndt_map.enter(street(1, 2.0))
     squares = []
     for seed in range(10, 30):
         points = transform(inverse(T_TRUE), street(seed, 0.5))
-        result = refine(ndt_map, thin_for_levels(points), T_TRUE, first_level=1)
+        result = ndt_map.refine(thin_for_levels(points), T_TRUE, first_level=1)
         R = result.T_map_lidar[:3, :3] @ T_TRUE[:3, :3].T
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         error = np.concatenate([result.T_map_lidar[:3, 3] - T_TRUE[:3, 3], turn])
@@ -90,7 +93,7 @@ def test_a_road_without_houses_does_not_know_where_along_it_one_is() -> None:
     rng = np.random.default_rng(5)
     bare = build_ndt(surface(rng, 30_000, (-60, -8, 0), (60, 8, 0)))
     points = surface(rng, 8_000, (-40, -7, -1.8), (40, 7, -1.8))
-    result = refine(bare, thin_for_levels(points), from_xyz_rpy(0.0, 0.0, 1.9))
+    result = bare.refine(thin_for_levels(points), from_xyz_rpy(0.0, 0.0, 1.9))
     assert abs(result.T_map_lidar[2, 3] - 1.8) < 0.02
     sigma = np.sqrt(np.diag(result.covariance))
     assert sigma[0] > 3 * sigma[2]
@@ -102,7 +105,7 @@ def test_a_precise_prior_decides_what_the_geometry_leaves_open() -> None:
     seen = [surface(rng, 6_000, (-40, -6, -1.8), (40, 6, -1.8)), surface(rng, 6_000, (-40, 6, -1.8), (40, 6, 6.2))]
     prior = PosePrior(from_xyz_rpy(0.5, 0.0, 1.8), 0.02, np.radians(0.05))
     clouds = thin_for_levels(np.concatenate(seen))
-    held = refine(build_ndt(np.concatenate(corridor)), clouds, from_xyz_rpy(0.0, 0.1, 1.7), prior)
+    held = build_ndt(np.concatenate(corridor)).refine(clouds, from_xyz_rpy(0.0, 0.1, 1.7), prior)
     np.testing.assert_allclose(held.T_map_lidar[:3, 3], [0.5, 0.0, 1.8], atol=0.06)
 
 
@@ -113,7 +116,7 @@ def test_of_many_guesses_the_likeliest_come_first_and_the_best_of_them_is_refine
     assert len(likeliest(ndt_map, clouds[0], guesses, 9, points=50)) == len(guesses)
     assert errors(best_of(ndt_map, clouds, guesses, 3).T_map_lidar)[0] < 0.02
     lost = best_of(ndt_map, clouds, guesses[:2], 1)
-    assert lost.score == refine(ndt_map, clouds, likeliest(ndt_map, clouds[0], guesses[:2], 1)[0]).score
+    assert lost.score == ndt_map.refine(clouds, likeliest(ndt_map, clouds[0], guesses[:2], 1)[0]).score
 
 
 Sums = tuple[F64, F64, F64, float, float]
@@ -173,7 +176,7 @@ def test_one_step_sums_what_the_book_says(ndt_map: NdtMap, scan: F64, level: int
     points, grid = scan[::40].astype(np.float32).astype(np.float64), ndt_map.levels[level]
     wanted = by_hand(grid, points, T)
     assert_equal(compiled(grid, points, T, unpaired(points, T)), wanted, 1e-4, 2e-5)
-    assert fitnesses(ndt_map, in_rows(points), T[None], level)[0] == pytest.approx(wanted[3], rel=1e-4)
+    assert ndt_map.likelihood(in_rows(points), T[None], level)[0] == pytest.approx(wanted[3], rel=1e-4)
 
 
 def test_a_scan_that_moved_is_paired_as_if_for_the_first_time(ndt_map: NdtMap, scan: F64) -> None:

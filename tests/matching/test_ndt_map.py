@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,8 @@ from hypothesis import strategies as st
 from hand_made import make_map, make_tile, wall
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
-from mapvote.matching.ndt_map import Level, MapWindow, NdtGrid, NdtMap, build_ndt, tiles_within
+from mapvote.matching.ndt_map import NDT_WINDOW, MapWindow, NdtMap, build_ndt, tiles_within
+from mapvote.matching.ndt_voxels import Level, NdtGrid
 
 SIZE, FLOOR_M = 2.0, 0.1
 MIDDLE = np.array([3.0, -3.0, 1.0])
@@ -18,7 +21,9 @@ MIDDLE = np.array([3.0, -3.0, 1.0])
 
 
 def one_level(size: float = SIZE, half_m: float = 10.0) -> NdtMap:
-    return NdtMap(np.zeros(3), (Level(size, FLOOR_M, points_m=0.1, iterations=1),), half_m)
+    return NdtMap(
+        np.zeros(3), (Level(size, FLOOR_M, points_m=0.1, iterations=1),), replace(NDT_WINDOW, half_window_m=half_m)
+    )
 
 
 def grid_of(*clouds: F64) -> NdtGrid:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,8 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
 from mapvote.matching import pose_check
-from mapvote.matching.ndt_map import Level, NdtMap, build_ndt
+from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap, build_ndt
+from mapvote.matching.ndt_voxels import Level
 from mapvote.matching.pose_check import Judge, Verdict, height_above_lowest, stands_above_ground
 
 HERE = np.eye(4)
@@ -21,7 +24,8 @@ TWELVE_UP = np.array([0.0, 0.0, 12.0])
 
 def one_level(points: F64, size: float, half_m: float = 24.0) -> NdtMap:
     """A map of voxels of one size, ``half_m`` along x and y to all sides of its middle."""
-    ndt_map = NdtMap(np.zeros(3), (Level(size, floor_m=0.1, points_m=0.1, iterations=10),), half_m)
+    level = Level(size, floor_m=0.1, points_m=0.1, iterations=10)
+    ndt_map = NdtMap(np.zeros(3), (level,), replace(NDT_WINDOW, half_window_m=half_m))
     ndt_map.enter(points)
     return ndt_map
 

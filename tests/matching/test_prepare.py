@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.types import Bool, Scan
-from mapvote.matching.ndt_map import LEVELS, build_ndt
+from mapvote.matching.ndt_map import build_ndt
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.pose_check import Judge
 from mapvote.matching.prepare import deskew, solid_sample, thin_for_levels, twist_between
 

@@ -17,8 +17,8 @@ from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_po
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.core.voxels import voxel_downsample
 from mapvote.matching.coarse_search import LEAST_LEAD, place_without_prior, stands
-from mapvote.matching.ndt import fitness, refine
-from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.matcher import likelihood_at
+from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap
 from mapvote.matching.prepare import thin_for_levels
 
 STEP_M, SIDE_M = 15.0, 30.0
@@ -81,8 +81,8 @@ class Patches:
         other = T_a_b.copy()
         other[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
         finest = len(ndt_map.levels) - 1
-        own = fitness(ndt_map, clouds, self.T_a_patch[k], finest)
-        return 1.0 - fitness(ndt_map, clouds, other, finest) / max(own, 1e-9)
+        own = likelihood_at(ndt_map, clouds, self.T_a_patch[k], finest)
+        return 1.0 - likelihood_at(ndt_map, clouds, other, finest) / max(own, 1e-9)
 
     def apart_m(self, T_a_b: F64) -> F64:
         """(m,) how far each compared patch moves from one motion to where it lies on the surfaces of a, metres."""
@@ -132,7 +132,7 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F
         # Where the patch fits best by itself.
         guess = np.eye(4)
         guess[:3, :3], guess[:3, 3] = T[:3, :3], at
-        found = refine(_ndt(near, at), clouds, guess)
+        found = _ndt(near, at).refine(clouds, guess)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]))
         centres.append(centre)
         poses.append(found.T_map_lidar)
@@ -162,7 +162,7 @@ def _thinned(points: F64, size_m: float) -> F64:
 
 
 def _ndt(points: F64, centre: F64) -> NdtMap:
-    ndt_map = NdtMap(centre, half_window_m=SIDE_M)
+    ndt_map = NdtMap(centre, numbers=replace(NDT_WINDOW, half_window_m=SIDE_M))
     ndt_map.enter(points)
     return ndt_map
 

@@ -18,8 +18,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Severity
 from mapvote.formats.drives.point_fields import spinning_time_s
-from mapvote.matching.ndt import refine
-from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.ndt_map import MapWindow
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, motion_at
 
 
@@ -72,7 +72,7 @@ def check_bent(
         ndt_map = around(poses[i, :3, 3])
         for name, time_s in _readings(scan, drive).items():
             clouds = Sample(replace(scan, time_s=time_s)).clouds(twist)
-            score = refine(ndt_map, clouds, poses[i], None, first_level).score
+            score = ndt_map.refine(clouds, poses[i], None, first_level).score
             scores.setdefault(name, []).append(score)
     best = _best(scores)
     if best is not None:

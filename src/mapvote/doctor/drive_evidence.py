@@ -8,7 +8,7 @@ a fraction of a per cent. Each thing is measured once, when a check first asks f
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,8 +19,8 @@ from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress
 from mapvote.doctor.scans import Looking, Looks
 from mapvote.formats.drives.options import source_of_times
-from mapvote.matching.ndt import fitness, likeliest, refine
-from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.matcher import likeliest, likelihood_at
+from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap
 from mapvote.matching.prepare import thin_for_levels
 
 _UPS = {sign + axis: s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}
@@ -228,7 +228,7 @@ class DriveEvidence:
 
     def _follow(self, start: int, scans: int = _SCANS) -> Run:
         """The run of at most ``scans`` scans that begins at readable scan ``start``."""
-        ndt_map = NdtMap(np.zeros(3), half_window_m=_HALF_WINDOW_M)
+        ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=_HALF_WINDOW_M))
         ndt_map.enter(_near(self._points(self.readable[start])))
         indices, poses, fits = [start], [np.eye(4)], [1.0]
         i, step = start, 1
@@ -339,16 +339,16 @@ def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Ro
 
     Only objects on the road distinguish guesses: the sensor's rings on it fit best where nothing has moved.
     """
-    found = refine(ndt_map, clouds, guesses[0])
+    found = ndt_map.refine(clouds, guesses[0])
     if len(guesses) == 2 and found.inlier_share >= _GOOD_FIT:
         return found
     stands = [np.abs(road.normal @ cloud + road.depth_m) > _STANDS_M for cloud in clouds]
     standing = [np.ascontiguousarray(cloud[:, high]) for cloud, high in zip(clouds, stands, strict=True)]
     tried = [
         found,
-        *(refine(ndt_map, clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, _REFINED, 800)),
+        *(ndt_map.refine(clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, _REFINED, 800)),
     ]
-    return max(tried, key=lambda one: fitness(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
+    return max(tried, key=lambda one: likelihood_at(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
 
 
 def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]:

@@ -7,7 +7,7 @@ two LiDARs exchanged, which is what exchanged frame ids do.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,8 +16,8 @@ import scipy
 from mapvote.core.geometry import exp, inverse, log, transform
 from mapvote.core.types import F32, F64, Drive
 from mapvote.doctor import Finding
-from mapvote.matching.ndt import fitness, refine
-from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.matcher import likelihood_at
+from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap
 from mapvote.matching.prepare import thin_for_levels
 
 
@@ -98,7 +98,7 @@ def _sweeps(drive: Drive, T_base_lidars: F64, rules: SweepRules) -> Iterator[lis
 
 
 def _map_of(points: F32, rules: SweepRules) -> NdtMap:
-    ndt_map = NdtMap(np.zeros(3), half_window_m=rules.window_m)
+    ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=rules.window_m))
     ndt_map.enter(points.astype(np.float64))
     return ndt_map
 
@@ -107,7 +107,7 @@ def _fit(sweep: list[F32], T_first_others: F64, rules: SweepRules) -> float:
     """Mean likelihood of the other LiDARs' points among those of the first."""
     ndt_map = _map_of(sweep[0], rules)
     pairs = zip(sweep[1:], T_first_others, strict=True)
-    return float(np.mean([fitness(ndt_map, thin_for_levels(points), T) for points, T in pairs]))
+    return float(np.mean([likelihood_at(ndt_map, thin_for_levels(points), T) for points, T in pairs]))
 
 
 def _measured(
@@ -118,7 +118,7 @@ def _measured(
     maps = [_map_of(sweep[0], rules) for sweep in sweeps]
     for k, T in enumerate(stated):
         clouds = [thin_for_levels(sweep[k + 1]) for sweep in sweeps]
-        found = [refine(one, cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
+        found = [one.refine(cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
         off = np.median([log(inverse(T) @ T_found) for T_found in found], axis=0)
         spread = np.median([np.abs(log(inverse(T) @ T_found) - off) for T_found in found], axis=0)
         off_m, off_deg = float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:])))

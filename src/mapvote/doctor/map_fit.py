@@ -25,8 +25,9 @@ from mapvote.doctor import Finding, Progress, Severity
 from mapvote.doctor.drive_evidence import find_road
 from mapvote.doctor.prior import Similarity, fit_similarity
 from mapvote.matching.global_search import GlobalSearch
-from mapvote.matching.ndt import fitness, likeliest, refine
-from mapvote.matching.ndt_map import LEVELS, MapWindow, NdtMap
+from mapvote.matching.matcher import likeliest, likelihood_at
+from mapvote.matching.ndt_map import MapWindow, NdtMap
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.pose_check import MIN_FIT, Judge
 from mapvote.matching.prepare import deskew, motion_at, solid_sample, thin_for_levels
 
@@ -199,8 +200,8 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
             starts = [place.T_map_lidar]
             if not place.fits:  # it may be elsewhere: where the prior has it, in a map so much larger
                 starts.append(e.scaled(place.index, scale))
-            found = [refine(ndt_map, clouds, start).T_map_lidar for start in starts]
-            fits.append(max(fitness(ndt_map, clouds, T, len(clouds) - 1) for T in found))
+            found = [ndt_map.refine(clouds, start).T_map_lidar for start in starts]
+            fits.append(max(likelihood_at(ndt_map, clouds, T, len(clouds) - 1) for T in found))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
         peaks.append(_SCALES[best] + _FINER * peak_of(fits[best - 1], fits[best], fits[best + 1]))
     scale = float(np.median(peaks))
@@ -295,7 +296,7 @@ def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], ju
         starts = [guess]
         for attempt in range(2):
             for start in starts:
-                T = refine(ndt_map, clouds, start).T_map_lidar
+                T = ndt_map.refine(clouds, start).T_map_lidar
                 best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known), key=lambda p: p.fit)
             if best.fits or attempt:
                 break

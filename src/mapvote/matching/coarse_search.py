@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample, voxel_keys
-from mapvote.matching.ndt import fitness, refine
+from mapvote.matching.matcher import likelihood_at
 from mapvote.matching.ndt_map import NdtMap, build_ndt
 from mapvote.matching.prepare import thin_for_levels
 
@@ -168,7 +168,7 @@ def _refined(windows: _Windows, guesses: list[F64], standing: _Standing) -> list
     out: list[tuple[float, F64]] = []
     for T in distinct((T for _, T in ranked), _SPREAD_RAD, 1.0)[:_REFINED]:
         ndt_map, clouds = windows.around(T)
-        found = refine(ndt_map, clouds, T).T_map_lidar
+        found = ndt_map.refine(clouds, T).T_map_lidar
         out.append((standing.nearness(found), found))
     return out
 
@@ -231,7 +231,7 @@ class _Windows:
         if clouds[level].shape[1] == 0:
             return 0.0
         inside = (np.abs(transform(T, self._b[self._stands])[:, :2] - ndt_map.centre[:2]) < _WINDOW_M - 2.0).all(axis=1)
-        return float(inside.mean()) * fitness(ndt_map, clouds, T, level % len(ndt_map.levels))
+        return float(inside.mean()) * likelihood_at(ndt_map, clouds, T, level % len(ndt_map.levels))
 
 
 def distinct(poses: Iterable[F64], turn_rad: float, height_m: float = np.inf) -> list[F64]:

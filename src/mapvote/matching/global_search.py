@@ -21,8 +21,8 @@ from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
 from mapvote.matching.coarse_search import LEAST_LEAD, best_and_rival, distinct, place_without_prior
-from mapvote.matching.ndt import refine
-from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.matcher import map_around
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Tracker
 from mapvote.matching.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
 from mapvote.matching.prepare import Sample, deskew, solid_sample, thin_for_levels
@@ -232,7 +232,7 @@ class GlobalSearch:
 
     def __init__(self, point_map: PointMap, ndt: NdtSettings, range_sigma_m: float) -> None:
         self.point_map, self.ndt = point_map, ndt
-        self.map_around = MapWindow(point_map)
+        self.map_around = map_around(ndt.matcher, point_map)
         self.judge = Judge(range_sigma_m)
 
     def in_map(self, point_map: PointMap) -> GlobalSearch:
@@ -317,7 +317,7 @@ class GlobalSearch:
         guesses.sort(key=lambda T: (round(T[0, 3] / 40.0), round(T[1, 3] / 40.0)))  # neighbours share a window
         clouds = thin_for_levels(scan.points)
         clouds = [np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // 2000)]) for cloud in clouds]
-        refined = [refine(self.map_around(guess[:3, 3]), clouds, guess) for guess in guesses]
+        refined = [self.map_around(guess[:3, 3]).refine(clouds, guess) for guess in guesses]
         refined.sort(key=lambda result: -result.score)
         places = distinct((one.T_map_lidar for one in refined), _SPREAD_RAD)[:_JUDGED]
         if not places:
@@ -326,11 +326,11 @@ class GlobalSearch:
         return Found(T, fit, fit - rival)
 
     def _judged(self, scan: Scan, T: F64) -> tuple[float, F64]:
-        ndt_map = self.map_around(T[:3, 3])
+        around = self.map_around(T[:3, 3])
         points = scan.points
         if scan.time_s is not None:
             tracker = Tracker(self.map_around, self.ndt)
-            points = deskew(scan, tracker.guess_motion(ndt_map, scan.stamp_ns, Sample(scan), T))
-        T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
+            points = deskew(scan, tracker.guess_motion(around, scan.stamp_ns, Sample(scan), T))
+        T = around.refine(thin_for_levels(points), T).T_map_lidar
         few = solid_sample(points, LEVELS[-1].points_m)
-        return self.judge.fit(ndt_map, few, T), T
+        return self.judge.fit(around, few, T), T

@@ -19,8 +19,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
 from mapvote.matching.global_search import GlobalSearch
-from mapvote.matching.ndt import refine
-from mapvote.matching.ndt_map import LEVELS, MapWindow
+from mapvote.matching.matcher import map_around
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import TWIST_AGE_S, Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
 from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
@@ -78,7 +78,7 @@ class Localiser:
 
     def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
-        self.map_around = MapWindow(point_map)
+        self.map_around = map_around(settings.ndt.matcher, point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
         self.prior_frame = PriorFrame()
@@ -226,13 +226,13 @@ class Localiser:
     def _verdict(self) -> Verdict:
         fix = self._waiting[-1].fix
         T_map_lidar = fix.registration.T_map_lidar
-        ndt_map = self.map_around(T_map_lidar[:3, 3])
+        around = self.map_around(T_map_lidar[:3, 3])
         few = solid_sample(fix.points, LEVELS[-1].points_m)
         if self._confirmed:  # a track that held is held again at less cost; where it is doubted, nothing is saved
-            verdict = self.judge.judge(ndt_map, few, T_map_lidar, quick=True)
+            verdict = self.judge.judge(around, few, T_map_lidar, quick=True)
             if self.judge.holds(verdict):
                 return verdict
-        return self.judge.judge(ndt_map, few, T_map_lidar)
+        return self.judge.judge(around, few, T_map_lidar)
 
     def _move(self, T_map_lidar: F64) -> None:
         """The newest scan was taken here: it and all that wait are registered anew, the track goes on from here."""
@@ -251,9 +251,9 @@ class Localiser:
         self._go_on()
 
     def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
-        before, ndt_map = waiting.fix.registration.T_map_lidar, self.map_around(guess[:3, 3])
+        before, around = waiting.fix.registration.T_map_lidar, self.map_around(guess[:3, 3])
         points = deskew(waiting.fix.scan, twist)
-        result = refine(ndt_map, thin_for_levels(points), guess)
+        result = around.refine(thin_for_levels(points), guess)
         waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
         waiting.nowhere = False
         if waiting.misfit is not None:

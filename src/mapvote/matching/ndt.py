@@ -2,7 +2,7 @@
 
 One level is compiled as a whole: points are paired with the voxels around them, Gauss-Newton steps are summed over the
 pairs and solved, and the pose moves until it stands still. Equation numbers are those of Magnusson, The
-Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; :mod:`mapvote.matching.ndt_map` lists what is
+Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; :mod:`mapvote.matching.ndt_voxels` lists what is
 done otherwise. A point is compared with its own voxel and the six beside it (DIRECT7). Pairs lie in columns, so that
 the sums run over vectors of them, in float32 about the sensor; they serve until the pose has moved by a share of a
 voxel. Pose errors are (6,) vectors (rho, phi) in map axes about the sensor: t' = t + rho, R' = exp(phi) R.
@@ -10,21 +10,16 @@ voxel. Pose errors are (6,) vectors (rho, phi) in map axes about the sensor: t' 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from mapvote.core.kernel import fast_math, inlined, kernel
-from mapvote.core.types import F32, F64, I32, I64, PosePrior, Registration
-from mapvote.matching.ndt_map import SEVEN, NdtMap, Vector, Window, holds, voxel_of
+from mapvote.core.types import F32, F64, I32, I64
+from mapvote.matching.ndt_voxels import SEVEN, Vector, Window, holds, voxel_of
 
-SETTLED = 0.05, 0.01
-"""A step shorter than this share of a level's floor has converged: on the way, and at the finest level."""
 COVARIANCE_SCALE = 5.0
 """What neighbouring residuals have in common, calibrated so that normalised squared errors average 6."""
-MAP_SIGMA_M, MAP_SIGMA_RAD = 0.01, float(np.radians(0.03))
-"""What the map itself is off by around a scan, which no residual shows."""
 INLIER_E = 7.81
 """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
 CUTOFF_E = 25.0
@@ -419,62 +414,3 @@ def align(
     if iterations and not has_prior:
         _covariance(H_inv, M, floor, map_variance, half, covariance)
     return likelihood, inliers, iterations, converged
-
-
-def refine(
-    ndt_map: NdtMap,
-    clouds: list[F32],
-    T_map_lidar_guess: F64,
-    prior: PosePrior | None = None,
-    first_level: int = 0,
-    settled: tuple[float, float] = SETTLED,
-) -> Registration:
-    """The pose in the map of a de-skewed scan, thinned for each level, from a guess.
-
-    ``prior`` enters as a factor at the finest level; ``settled``: see SETTLED. Never raises for bad overlap: the inlier
-    share and the score are low instead, and the caller abstains.
-    """
-    T = np.array(T_map_lidar_guess, dtype=np.float64)
-    map_variance = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
-    iterations, covariance, last = 0, np.empty((6, 6)), len(ndt_map.levels) - 1
-    for i in range(first_level, last + 1):
-        grid = ndt_map.levels[i]
-        tolerance_m = max(0.001, settled[i == last] * grid.level.floor_m)
-        believed = (np.eye(4), np.zeros((6, 6)))
-        if prior is not None and i == last:
-            believed = np.ascontiguousarray(prior.T_map_lidar), prior.information
-        where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, map_variance
-        room = room_for(clouds[i].shape[1])
-        score, inlier_share, more, converged = align(clouds[i], T, *where, *believed, room, covariance)
-        iterations += more
-    return Registration(T, covariance, score, inlier_share, iterations, converged)
-
-
-def best_of(
-    ndt_map: NdtMap, clouds: list[F32], guesses: Sequence[F64], most: int, prior: PosePrior | None = None,
-    points: int = 1 << 30,
-) -> Registration:  # fmt: skip
-    """The ``most`` likeliest of guessed poses (4, 4), see :func:`likeliest`, refined: the one with the best score."""
-    chosen = likeliest(ndt_map, clouds[0], guesses, most, points)
-    return max((refine(ndt_map, clouds, guess, prior) for guess in chosen), key=lambda found: found.score)
-
-
-def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:
-    """Mean likelihood of the scan at a pose, in [0, 1], at one level: to rank guesses before any is refined."""
-    return float(fitnesses(ndt_map, clouds[level], T_map_lidar[None], level)[0])
-
-
-def likeliest(ndt_map: NdtMap, cloud: F32, guesses: Sequence[F64], most: int, points: int = 1 << 30) -> list[F64]:
-    """The ``most`` of guessed poses (4, 4) at which a cloud (3, n) fits the coarsest level best, best first, by some
-    ``points`` of it."""
-    few = np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // points)])
-    fits = fitnesses(ndt_map, few, np.array(guesses))
-    return [guesses[k] for k in np.argsort(-fits, kind="stable")[:most]]
-
-
-def fitnesses(ndt_map: NdtMap, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:
-    """(m,) :func:`fitness` of a cloud (3, n) at many poses (m, 4, 4)."""
-    grid = ndt_map.levels[level]
-    out = np.empty(len(T_map_lidar))
-    likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.voxels.cells, out)
-    return out

@@ -1,375 +1,62 @@
-"""The map side of NDT: points become a normal distribution per voxel, in a window around a vehicle.
+"""The map around a vehicle as NDT matches scans with it: all levels over one window, laid out from tiles ahead of need.
 
-Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6, whose numbers the equations have, with
-three changes: every voxel's distribution is widened by an isotropic floor instead of an eigenvalue clamp; Gauss-Newton
-steps on the reweighted form (:mod:`mapvote.matching.ndt`) replace full Newton, which diverges from 0.4 m; voxels
-are found through a dense index over a bounded window. In a finished map the window is made of tiles, whose voxels are
-summed up before they are needed. numba inlines the steps; docs/measurements/speed.md has the cost.
+This is the matcher ``ndt`` of :mod:`mapvote.matching.matcher`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TILE_CELLS, TileIndex, window_around
-from mapvote.core.kernel import inlined, kernel
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, I32, I64
+from mapvote.core.types import F32, F64, Bool, PosePrior, Registration
+from mapvote.matching.matcher import SETTLED
+from mapvote.matching.ndt import align, likelihoods, room_for
+from mapvote.matching.ndt_voxels import LEVELS, SEVEN, Level, NdtGrid, Voxels, window_of
 
 
+@record(votes=True)
 @dataclass(frozen=True, slots=True)
-class Level:
-    """One step of the coarse-to-fine search."""
+class NdtWindow:
+    """Numbers of the part of a map that NDT holds, and of what the map itself is off by."""
 
-    voxel_m: float
-    """Side of the NDT voxels."""
-    floor_m: float
-    """Standard deviation added to every voxel's distribution, isotropic."""
-    points_m: float
-    """The scan is thinned to one point per voxel of this side."""
-    iterations: int
-    """Most Gauss-Newton steps at this level."""
-
-
-LEVELS = Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15)
-"""Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
-HALF_WINDOW_M, BELOW_M, ABOVE_M = 96.0, 24.0, 40.0
-"""How far the window reaches to the sides, below and above its centre: as far as a scan has enough points."""
-CENTRAL_M = 24.0
-"""A vehicle this far from the window's centre still has 72 m of map to all sides."""
-MIN_POINTS = 3
-"""A voxel with fewer points has no distribution: two make a line."""
-FLATNESS = 0.08
-"""A voxel whose points spread less than this share of its side in height is a flat patch."""
-_SLAB_M = 252.0
-"""Height of one block, a whole number of voxels at every level: a stray point costs no tower."""
-_AHEAD_M, _KEPT_M = HALF_WINDOW_M + 2 * CENTRAL_M, HALF_WINDOW_M + 4 * CENTRAL_M
-"""Tiles this near are made ready, and tiles this near are kept."""
-SEVEN = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
-"""(7, 3) ways to a point's own voxel and the six beside it (DIRECT7)."""
-
-Vector = tuple[float, float, float]
+    half_window_m: float = 96.0
+    """The window reaches this far to the sides of its centre: as far as a scan has enough points."""
+    below_m: float = 24.0
+    """The window reaches this far below its centre."""
+    above_m: float = 40.0
+    """The window reaches this far above its centre."""
+    central_m: float = 24.0
+    """A vehicle this far from the window's centre still has 72 m of map to all sides."""
+    slab_m: float = 252.0
+    """Height of one block, a whole number of voxels at every level: a stray point costs no tower."""
+    ahead_m: float = 144.0
+    """Tiles this near are made ready ahead of need: the window and twice ``central_m``."""
+    kept_m: float = 192.0
+    """Tiles this near are kept: the window and four times ``central_m``."""
+    map_sigma_m: float = 0.01
+    """Standard deviation of the map around a scan, which no residual shows."""
+    map_sigma_deg: float = 0.03
+    """Standard deviation of the map's attitude around a scan, likewise."""
 
 
-class Window(NamedTuple):
-    """The part of space in which voxels are found."""
-
-    rows: I32
-    """(nx, ny, nz) row of each voxel in :class:`Voxels`, or -1."""
-    lowest: I64
-    """(3,) world voxel of rows[0, 0, 0]."""
-    size: float
-    """Side of a voxel, metres."""
-    flat: I32
-    """The rows, flat ..."""
-    beside: I64
-    """... and (7,) ways there to a voxel and the six beside it."""
-
-
-def window_of(shape: I64, lowest: I64, size: float) -> Window:
-    """An empty one of ``shape`` (3,)."""
-    nx, ny, nz = shape.tolist()
-    rows = np.full((nx, ny, nz), -1, dtype=np.int32)
-    return Window(rows, lowest, size, rows.reshape(-1), SEVEN @ [ny * nz, nz, 1])
-
-
-class Voxels(NamedTuple):
-    """All voxels that points ever fell into, inside the window or not."""
-
-    place: I64
-    """(m, 3) world voxel of each row."""
-    sums: F64
-    """(m, 11) count, first and second moments about the voxel's centre (x y z xx xy xz yy yz zz), 1 if the distribution
-    is older than they are."""
-    cells: F64
-    """(m, 9) mean from the voxel's centre, and the precision xx, xy, xz, yy, yz, zz; zeros without a distribution."""
-
-
-@inlined
-def _diagonalise(A: F64, V: F64) -> None:
-    """Jacobi's method on the upper triangle of a symmetric (3, 3) A, in place; the columns of V are eigenvectors."""
-    for r in range(3):
-        for k in range(3):
-            V[r, k] = 1.0 if r == k else 0.0
-    for _ in range(8):
-        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
-        if off < 1e-10 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
-            return
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            if A[p, q] == 0.0:
-                continue
-            theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
-            t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-            c = 1.0 / np.sqrt(t * t + 1.0)
-            s = t * c
-            A[p, p] -= t * A[p, q]
-            A[q, q] += t * A[p, q]
-            A[p, q] = 0.0
-            rp = A[min(r, p), max(r, p)]
-            rq = A[min(r, q), max(r, q)]
-            A[min(r, p), max(r, p)] = c * rp - s * rq
-            A[min(r, q), max(r, q)] = s * rp + c * rq
-            for k in range(3):
-                vp, vq = V[k, p], V[k, q]
-                V[k, p] = c * vp - s * vq
-                V[k, q] = s * vp + c * vq
-
-
-@inlined
-def _order(A: F64, V: F64) -> None:
-    """Eigenvalues (diagonal of A) and eigenvectors (columns of V) in ascending order."""
-    for p, q in ((0, 1), (1, 2), (0, 1)):
-        if A[p, p] > A[q, q]:
-            A[p, p], A[q, q] = A[q, q], A[p, p]
-            for k in range(3):
-                V[k, p], V[k, q] = V[k, q], V[k, p]
-
-
-@inlined
-def _upright(V: F64) -> None:
-    """The first column becomes the upward direction across the last one."""
-    x, y, z = V[0, 2], V[1, 2], V[2, 2]
-    length = np.sqrt(max(1.0 - z * z, 1e-12))
-    V[0, 0], V[1, 0], V[2, 0] = -x * z / length, -y * z / length, (1.0 - z * z) / length
-
-
-@inlined
-def voxel_of(size: float, x: float, y: float, z: float) -> tuple[np.int64, np.int64, np.int64]:
-    """World voxel of a point, map metres."""
-    return np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
-
-
-@inlined
-def holds(rows: I32, ix: np.int64, iy: np.int64, iz: np.int64, margin: int) -> bool:
-    """Whether the window has this voxel (counted from its lowest), and ``margin`` more to all sides."""
-    nx, ny, nz = rows.shape
-    return margin <= ix < nx - margin and margin <= iy < ny - margin and margin <= iz < nz - margin
-
-
-@inlined
-def _add_moments(sums: F64, k: int, x: float, y: float, z: float) -> None:
-    """One more point in voxel ``k``, from its centre: the sums behind Eqs. (6.2) and (6.3)."""
-    sums[k, 0] += 1.0
-    sums[k, 1] += x
-    sums[k, 2] += y
-    sums[k, 3] += z
-    sums[k, 4] += x * x
-    sums[k, 5] += x * y
-    sums[k, 6] += x * z
-    sums[k, 7] += y * y
-    sums[k, 8] += y * z
-    sums[k, 9] += z * z
-
-
-@inlined
-def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
-    """Eqs. (6.2) and (6.3), divided by the count: the mean is returned, the upper triangle of A is the covariance."""
-    m = sums[k, 0]
-    mx, my, mz = sums[k, 1] / m, sums[k, 2] / m, sums[k, 3] / m
-    A[0, 0], A[0, 1], A[0, 2] = sums[k, 4] / m - mx * mx, sums[k, 5] / m - mx * my, sums[k, 6] / m - mx * mz
-    A[1, 1], A[1, 2], A[2, 2] = sums[k, 7] / m - my * my, sums[k, 8] / m - my * mz, sums[k, 9] / m - mz * mz
-    return mx, my, mz
-
-
-@inlined
-def _flatten(A: F64, V: F64, thin: float) -> None:
-    """A flat patch constrains its height only. One ring on the road is a line, thin to all sides: taken literally it
-    would hold the next scan's rings where the last ones were. ``thin``: variances below it are none; A is diagonal."""
-    if A[1, 1] < thin:
-        _upright(V)
-    A[1, 1] = A[2, 2] = np.inf
-
-
-@inlined
-def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, even: float) -> None:
-    """The inverse covariance of voxel ``k`` from eigenvalues (diagonal of A) and eigenvectors (columns of V).
-
-    A voxel does not constrain the position along a direction in which it is filled evenly. The precision of an even
-    filling, less two standard deviations of its sample variance, is taken off (``even``); otherwise the rhythm of the
-    voxels would hold a vehicle in place on a bare road.
-    """
-    for c in range(3, 9):
-        cells[k, c] = 0.0
-    for d in range(3):
-        b = max(0.0, 1.0 / (max(A[d, d], 0.0) + floor_variance) - even)
-        cells[k, 3] += b * V[0, d] * V[0, d]
-        cells[k, 4] += b * V[0, d] * V[1, d]
-        cells[k, 5] += b * V[0, d] * V[2, d]
-        cells[k, 6] += b * V[1, d] * V[1, d]
-        cells[k, 7] += b * V[1, d] * V[2, d]
-        cells[k, 8] += b * V[2, d] * V[2, d]
-
-
-@kernel
-def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, scratch: F64) -> None:
-    """The distributions of the rows ``touched`` (m,), from their sums. A distribution needs MIN_POINTS, and is
-    widened by ``floor_m`` to all sides; ``size``: side of a voxel, metres; ``scratch`` (2, 3, 3)."""
-    A, V = scratch[0], scratch[1]
-    sums = voxels.sums
-    thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
-    for k in touched:
-        sums[k, 10] = 0.0
-        m = sums[k, 0]
-        if m < MIN_POINTS:
-            for c in range(9):
-                voxels.cells[k, c] = 0.0
-            continue
-        voxels.cells[k, 0], voxels.cells[k, 1], voxels.cells[k, 2] = _mean_and_covariance(sums, k, A)
-        flat = A[2, 2] < thin
-        _diagonalise(A, V)
-        _order(A, V)
-        if flat:
-            _flatten(A, V, thin)
-        even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
-        _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
-
-
-@kernel
-def enter_points(points: F64, window: Window, voxels: Voxels, n: int, touched: I64) -> tuple[int, int, int]:
-    """Enter points (n, 3) in map metres into the sums of their voxels.
-
-    Returns (the new number of rows, how many points were read, how many rows to :func:`refresh` are new in
-    ``touched`` (n,)): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not
-    for points. Points outside ``window`` are left out.
-    """
-    rows, lowest, size = window.rows, window.lowest, window.size
-    sums = voxels.sums
-    n_touched, looked_at = 0, len(points)
-    for i in range(len(points)):
-        ax, ay, az = voxel_of(size, points[i, 0], points[i, 1], points[i, 2])
-        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
-        if not holds(rows, ix, iy, iz, 0):
-            continue
-        k = rows[ix, iy, iz]
-        if k < 0:
-            if n == len(sums):
-                looked_at = i
-                break
-            k = n
-            n += 1
-            rows[ix, iy, iz] = k
-            voxels.place[k, 0], voxels.place[k, 1], voxels.place[k, 2] = ax, ay, az
-            for c in range(11):
-                sums[k, c] = 0.0
-        if sums[k, 10] == 0.0:
-            sums[k, 10] = 1.0
-            touched[n_touched] = k
-            n_touched += 1
-        x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
-        _add_moments(sums, k, x, y, z)
-    return n, looked_at, n_touched
-
-
-@kernel
-def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: I64) -> tuple[int, int]:
-    """Add the voxels (m,) of points that are not in ``voxels`` yet. ``voxels`` must have a row left for each.
-
-    Returns (the new number of rows, how many of ``shared`` (m,) are filled): rows that both have, to :func:`refresh`.
-    What lies outside ``window`` is left out.
-    """
-    rows, lowest = window.rows, window.lowest
-    n_shared = 0
-    for j in range(len(others.place)):
-        ix, iy, iz = others.place[j, 0] - lowest[0], others.place[j, 1] - lowest[1], others.place[j, 2] - lowest[2]
-        if not holds(rows, ix, iy, iz, 0):
-            continue
-        k = rows[ix, iy, iz]
-        if k >= 0:
-            for c in range(11):
-                voxels.sums[k, c] += others.sums[j, c]
-            shared[n_shared] = k
-            n_shared += 1
-            continue
-        rows[ix, iy, iz] = n
-        for c in range(3):
-            voxels.place[n, c] = others.place[j, c]
-        for c in range(11):
-            voxels.sums[n, c] = others.sums[j, c]
-        for c in range(9):
-            voxels.cells[n, c] = others.cells[j, c]
-        n += 1
-    return n, n_shared
-
-
-@kernel
-def reindex(window: Window, place: I64, n: int) -> None:
-    """Enter the first ``n`` voxels, whose world voxels are ``place`` (m, 3), into a window without any."""
-    rows, lowest = window.rows, window.lowest
-    for k in range(n):
-        ix, iy, iz = place[k, 0] - lowest[0], place[k, 1] - lowest[1], place[k, 2] - lowest[2]
-        if holds(rows, ix, iy, iz, 0):
-            rows[ix, iy, iz] = k
-
-
-class NdtGrid:
-    """One level of the map: voxels of one size. All are kept; those inside the window can be found."""
-
-    def __init__(self, level: Level, window: Window) -> None:
-        self.level, self.window, self.n = level, window, 0
-        self._voxels, self._stale = _room_for(1024), list[I64]()
-
-    @property
-    def voxels(self) -> Voxels:
-        """With the distributions of all entered points, computed when they are read: of a map that grows the
-        coarse levels hardly ever are."""
-        for rows in self._stale:
-            self._refresh(rows)
-        self._stale.clear()
-        return self._voxels
-
-    def _refresh(self, rows: I64) -> None:
-        refresh(self._voxels, rows, self.level.voxel_m, self.level.floor_m, np.empty((2, 3, 3)))
-
-    def clear(self) -> None:
-        """Forget all voxels; their memory stays."""
-        self.n = 0
-        self._stale.clear()
-
-    def move(self, lowest_map: F64) -> None:
-        """Let the window begin at this corner (3,), map metres: what was entered and lies inside is found again."""
-        self.window.lowest[:] = np.round(lowest_map / self.level.voxel_m).astype(np.int64)
-        self.window.rows.fill(-1)
-        reindex(self.window, self._voxels.place, self.n)
-
-    def enter(self, points_map: F64) -> None:
-        """Enter points (n, 3) in map metres; those outside the window are left out."""
-        left = points_map
-        while len(left):
-            if self.n == len(self._voxels.place):
-                self._voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in self._voxels))
-            touched = np.empty(len(left), dtype=np.int64)
-            self.n, looked_at, n_touched = enter_points(left, self.window, self._voxels, self.n, touched)
-            self._stale.append(touched[:n_touched].copy())
-            left = left[looked_at:]
-
-    def join(self, others: Sequence[Voxels]) -> None:
-        """Add voxels of this level, of points that were not entered; those outside the window are left out."""
-        room = self.n + sum(len(more.place) for more in others)
-        if room > len(self._voxels.place):
-            more = _room_for(room - self.n)
-            self._voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self._voxels, more, strict=True)))
-        for part in others:
-            shared = np.empty(len(part.place), dtype=np.int64)
-            self.n, n_shared = join_voxels(part, self.window, self._voxels, self.n, shared)
-            self._refresh(shared[:n_shared])
-
-
-def _room_for(n: int) -> Voxels:
-    return Voxels(np.zeros((n, 3), dtype=np.int64), np.zeros((n, 11)), np.zeros((n, 9)))
+NDT_WINDOW = NdtWindow()
 
 
 class NdtMap:
     """All levels over one bounded window around ``centre`` (map metres), coarse to fine. Grows by :meth:`enter`."""
 
-    def __init__(self, centre: F64, levels: Sequence[Level] = LEVELS, half_window_m: float = HALF_WINDOW_M) -> None:
-        self._reach = np.array([half_window_m, half_window_m, BELOW_M])
-        sides = self._reach + np.array([half_window_m, half_window_m, ABOVE_M])
+    def __init__(self, centre: F64, levels: Sequence[Level] = LEVELS, numbers: NdtWindow = NDT_WINDOW) -> None:
+        self.numbers = numbers
+        half_m = numbers.half_window_m
+        self._reach = np.array([half_m, half_m, numbers.below_m])
+        sides = self._reach + np.array([half_m, half_m, numbers.above_m])
         self.levels = [
             NdtGrid(one, window_of(np.round(sides / one.voxel_m).astype(np.int64), np.zeros(3, np.int64), one.voxel_m))
             for one in levels
@@ -391,7 +78,7 @@ class NdtMap:
 
     def is_central(self, position: F64) -> bool:
         """Whether ``position`` (3,) is near enough to the middle for the window to hold what a scan reaches."""
-        return bool(np.abs(np.asarray(position) - self.centre).max() <= CENTRAL_M)
+        return bool(np.abs(np.asarray(position) - self.centre).max() <= self.numbers.central_m)
 
     def around(self, position: F64) -> NdtMap:
         """Itself, with a window that holds what a scan from ``position`` (3,) reaches."""
@@ -404,6 +91,44 @@ class NdtMap:
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         for grid in self.levels:
             grid.enter(points)
+
+    def refine(
+        self,
+        clouds: Sequence[F32],
+        T_map_lidar_guess: F64,
+        prior: PosePrior | None = None,
+        first_level: int = 0,
+        settled: tuple[float, float] = SETTLED,
+    ) -> Registration:
+        """See :class:`mapvote.matching.matcher.LocalMatcher`. ``prior`` enters as a factor at the finest level."""
+        T = np.array(T_map_lidar_guess, dtype=np.float64)
+        map_variance = np.array([self.numbers.map_sigma_m**2] * 3 + [np.radians(self.numbers.map_sigma_deg) ** 2] * 3)
+        iterations = 0
+        covariance = np.empty((6, 6))
+        last = len(self.levels) - 1
+        for i in range(first_level, last + 1):
+            grid = self.levels[i]
+            tolerance_m = max(0.001, settled[i == last] * grid.level.floor_m)
+            believed = (np.eye(4), np.zeros((6, 6)))
+            if prior is not None and i == last:
+                believed = np.ascontiguousarray(prior.T_map_lidar), prior.information
+            where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, map_variance
+            cloud = clouds[i - len(self.levels)]
+            room = room_for(cloud.shape[1])
+            score, inlier_share, more, converged = align(cloud, T, *where, *believed, room, covariance)
+            iterations += more
+        return Registration(T, covariance, score, inlier_share, iterations, converged)
+
+    def likelihood(self, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:
+        """See :class:`mapvote.matching.matcher.LocalMatcher`."""
+        grid = self.levels[level]
+        out = np.empty(len(T_map_lidar))
+        likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.voxels.cells, out)
+        return out
+
+    def expected(self, points_map: F64, noise_m: float) -> tuple[F64, Bool]:
+        """See :class:`mapvote.matching.matcher.LocalMatcher`."""
+        return _self_likelihood(points_map, self.levels[-1], noise_m), _is_near_map(points_map, self.levels[0])
 
 
 def build_ndt(points_map: NDArray[np.floating], centre: F64 | None = None) -> NdtMap:
@@ -443,7 +168,7 @@ class MapWindow:
         """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
         ahead = [
             tile
-            for tile in tiles_within(self.point_map, position, _AHEAD_M)
+            for tile in tiles_within(self.point_map, position, NDT_WINDOW.ahead_m)
             if len(self._ready.get(tile, [])) < len(LEVELS)
         ]
         if ahead:
@@ -457,7 +182,7 @@ class MapWindow:
         ready.append(_voxels_of(self.point_map.tiles[tile], LEVELS[len(ready)]))
 
     def _laid_out(self, position: F64) -> NdtMap:
-        kept = set(tiles_within(self.point_map, position, _KEPT_M))
+        kept = set(tiles_within(self.point_map, position, NDT_WINDOW.kept_m))
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in kept}
         here = tiles_within(self.point_map, position)
         for tile in here:
@@ -472,7 +197,7 @@ class MapWindow:
         return self.ndt_map
 
 
-def tiles_within(point_map: PointMap, position: F64, half_m: float = HALF_WINDOW_M) -> list[TileIndex]:
+def tiles_within(point_map: PointMap, position: F64, half_m: float = NDT_WINDOW.half_window_m) -> list[TileIndex]:
     """The map's tiles that a square around ``position`` (3,) touches, in ascending order."""
     window = window_around(point_map.lattice, float(position[0]), float(position[1]), 2 * half_m)
     return [tile for tile in window.tiles() if tile in point_map.tiles]
@@ -481,7 +206,7 @@ def tiles_within(point_map: PointMap, position: F64, half_m: float = HALF_WINDOW
 def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
     """The voxels of all points of a tile, in one piece for each slab of height."""
     points, pieces = tile.points_map, []
-    slab = np.floor(points[:, 2] / _SLAB_M)
+    slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
     for height in np.unique(slab):
         piece = points[slab == height]
         low, high = np.floor(np.array([piece.min(axis=0), piece.max(axis=0)]) / level.voxel_m).astype(np.int64)
@@ -490,3 +215,47 @@ def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
         place, sums, cells = grid.voxels
         pieces.append(Voxels(place[: grid.n].copy(), sums[: grid.n].copy(), cells[: grid.n].copy()))
     return pieces
+
+
+def _is_near_map(points: F64, grid: NdtGrid) -> Bool:
+    """(n,) whether the point's voxel, or one beside it, holds anything."""
+    rows = grid.window.rows
+    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
+    here = np.flatnonzero(((at >= 1) & (at < np.array(rows.shape) - 1)).all(axis=1))
+    out = np.zeros(len(points), dtype=np.bool_)
+    beside = at[here, None] + SEVEN
+    out[here] = (rows[beside[..., 0], beside[..., 1], beside[..., 2]] >= 0).any(axis=1)
+    return out
+
+
+def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
+    """Expected likelihood of each point (n, 3) drawn, with the sensor's noise, from its voxel's own distribution; (k,)
+    of those whose voxel has one.
+
+    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2.
+    """
+    rows = grid.window.rows
+    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
+    at = at[((at >= 0) & (at < rows.shape)).all(axis=1)]
+    k = rows[at[:, 0], at[:, 1], at[:, 2]]
+    k = k[k >= 0]
+    cells = grid.voxels.cells[k]
+    k, cells = (kept[cells[:, 3] + cells[:, 6] + cells[:, 8] != 0.0] for kept in (k, cells))
+    sums = grid.voxels.sums[k]
+    m, (a, b, c) = sums[:, 0], cells[:, :3].T
+    moments = sums[:, 4:10].T / m - np.stack([a * a, a * b, a * c, b * b, b * c, c * c])
+    moments[[0, 3, 5]] += noise_m * noise_m
+    S, C = _symmetric(moments), _symmetric(cells[:, 3:9].T)
+    A = [[(r == s) + S[r][0] * C[0][s] + S[r][1] * C[1][s] + S[r][2] * C[2][s] for s in range(3)] for r in range(3)]
+    determinant = (
+        A[0][0] * (A[1][1] * A[2][2] - A[1][2] * A[2][1])
+        - A[0][1] * (A[1][0] * A[2][2] - A[1][2] * A[2][0])
+        + A[0][2] * (A[1][0] * A[2][1] - A[1][1] * A[2][0])
+    )
+    return np.asarray(1.0 / np.sqrt(np.maximum(determinant, 1.0)))
+
+
+def _symmetric(upper: F64) -> list[list[F64]]:
+    """(3, 3) of numbers (n,) from the upper triangle (6, n)."""
+    xx, xy, xz, yy, yz, zz = upper
+    return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]

@@ -13,8 +13,8 @@ import numpy as np
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F32, F64, PosePrior, Registration, Scan
-from mapvote.matching.ndt import best_of, fitnesses, refine
-from mapvote.matching.ndt_map import LEVELS, NdtMap
+from mapvote.matching.matcher import LocalMatcher, best_of
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, deskew, twist_between
 
 _REFINED = 3
@@ -55,11 +55,11 @@ class Fix:
 class Tracker:
     """Follows one vehicle. Scans must come in order of time.
 
-    ``map_around``: the NDT map to use near a position (3,), for a finished map a
-    :class:`mapvote.matching.ndt_map.MapWindow`.
+    ``map_around``: the matcher to use near a position (3,), for a finished map a
+    :class:`mapvote.matching.matcher.MapAround`.
     """
 
-    def __init__(self, map_around: Callable[[F64], NdtMap], settings: NdtSettings) -> None:
+    def __init__(self, map_around: Callable[[F64], LocalMatcher], settings: NdtSettings) -> None:
         self.map_around = map_around
         self.settings = settings
         self.twist = np.zeros(6)
@@ -77,28 +77,28 @@ class Tracker:
         A prior is a guess and a factor, no gate: whether a pose can be voted with is the Localiser's to say.
         """
         seed, reach = self._seed(scan.stamp_ns, prior)
-        ndt_map = self.map_around(seed[:3, 3])
+        around = self.map_around(seed[:3, 3])
         sample = Sample(scan)
         if reach >= _STEP_M:
-            seed = self._levelled(ndt_map, sample, seed)
+            seed = self._levelled(around, sample, seed)
         twist = (
-            self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan.stamp_ns, sample, seed, prior)
+            self.twist if self._knows_motion(scan) else self.guess_motion(around, scan.stamp_ns, sample, seed, prior)
         )
         clouds = sample.clouds(twist)
-        result = refine(ndt_map, clouds, seed, prior, self._first_level(reach))
+        result = around.refine(clouds, seed, prior, self._first_level(reach))
         if result.score < _POOR * self._usual_score:
-            result = self._reconsider(ndt_map, clouds, scan.stamp_ns, result, prior)
+            result = self._reconsider(around, clouds, scan.stamp_ns, result, prior)
         trusted = self.is_sound(result)
         if not trusted:
             centre = prior.T_map_lidar if prior is not None else seed
-            result = self._search(ndt_map, clouds, centre, reach, prior)
+            result = self._search(around, clouds, centre, reach, prior)
             trusted = self.is_sound(result)
         found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         for _ in range(_ROUNDS):
             if scan.time_s is None or found is None or not _differ(twist, found):
                 break
             twist = found
-            result = refine(ndt_map, sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
+            result = around.refine(sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
             trusted = self.is_sound(result)
             found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         if trusted:
@@ -117,7 +117,7 @@ class Tracker:
         return scan.time_s is None or bool(self.twist.any()) or self._measured
 
     def guess_motion(
-        self, ndt_map: NdtMap, stamp_ns: int, sample: Sample, seed: F64, prior: PosePrior | None = None
+        self, around: LocalMatcher, stamp_ns: int, sample: Sample, seed: F64, prior: PosePrior | None = None
     ) -> F64:
         """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
         age = 1e-9 * (stamp_ns - self.last_stamp_ns)
@@ -125,7 +125,7 @@ class Tracker:
         for speed in _SPEEDS_MPS:
             twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
             start = seed if self.last_pose is None else self.last_pose @ exp(age * twist)
-            moved.append((refine(ndt_map, sample.coarse(twist), start, prior).score, twist))
+            moved.append((around.refine(sample.coarse(twist), start, prior).score, twist))
         return max(moved, key=lambda found: found[0])[1]
 
     def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
@@ -146,12 +146,12 @@ class Tracker:
             return np.eye(4), _REACH_M
         return prior.T_map_lidar, 2.0 * prior.sigma_m
 
-    def _levelled(self, ndt_map: NdtMap, sample: Sample, seed: F64) -> F64:
+    def _levelled(self, around: LocalMatcher, sample: Sample, seed: F64) -> F64:
         """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
         road that lies metres from the scan's own."""
         steps = np.arange(_STEP_M, _REACH_M + 1e-6)
         guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
-        fits = fitnesses(ndt_map, sample.coarse(np.zeros(6))[0], np.array(guesses))
+        fits = around.likelihood(sample.coarse(np.zeros(6))[0], np.array(guesses))
         best = int(np.argmax(fits))
         return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
 
@@ -175,7 +175,7 @@ class Tracker:
         return bool(np.sqrt(np.linalg.eigvalsh(position)[-1]) <= s.max_sigma_m)
 
     def _reconsider(
-        self, ndt_map: NdtMap, clouds: list[F32], stamp_ns: int, result: Registration, prior: PosePrior | None
+        self, around: LocalMatcher, clouds: list[F32], stamp_ns: int, result: Registration, prior: PosePrior | None
     ) -> Registration:
         """The best of ``result``, the prior's place, and every speed that a vehicle may have had since the last scan.
 
@@ -185,11 +185,11 @@ class Tracker:
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
             guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
-        found = best_of(ndt_map, clouds, guesses, _RECONSIDERED, prior)
+        found = best_of(around, clouds, guesses, _RECONSIDERED, prior)
         return found if found.score > result.score else result
 
     def _search(
-        self, ndt_map: NdtMap, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
+        self, around: LocalMatcher, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
     ) -> Registration:
         """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
         rings = int(np.ceil(min(max(reach, _STEP_M), _REACH_M) / _STEP_M))
@@ -197,7 +197,7 @@ class Tracker:
         guesses = [
             centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
         ]
-        return best_of(ndt_map, clouds, guesses, _REFINED, prior, 1000)
+        return best_of(around, clouds, guesses, _REFINED, prior, 1000)
 
     def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
         """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""

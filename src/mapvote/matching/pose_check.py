@@ -14,8 +14,8 @@ import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, Bool
-from mapvote.matching.ndt import SETTLED, fitness, fitnesses, refine
-from mapvote.matching.ndt_map import SEVEN, NdtGrid, NdtMap
+from mapvote.matching.matcher import SETTLED, LocalMatcher
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import in_rows
 
 MIN_FIT = 0.6
@@ -79,61 +79,63 @@ class Judge:
     def __init__(self, range_sigma_m: float, most_points: int = _POINTS) -> None:
         self.range_sigma_m, self.most_points = range_sigma_m, most_points
 
-    def judge(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
+    def judge(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty. ``quick``: other places are found
         less well, for a third less work; what does not hold then should be judged again."""
-        few, standing, expected, known, here = self._here(ndt_map, points_lidar, T_map_lidar)
+        few, standing, expected, known, here = self._here(around, points_lidar, T_map_lidar)
         best, lead = None, here
-        for other in self._others(ndt_map, few, standing, T_map_lidar, quick):
-            ahead = here - self._likelihood(ndt_map, standing, other) / expected
+        for other in self._others(around, few, standing, T_map_lidar, quick):
+            ahead = here - self._likelihood(around, standing, other) / expected
             away = float(np.linalg.norm(other[:2, 3] - T_map_lidar[:2, 3]))
             away = away if float(other[:2, 0] @ T_map_lidar[:2, 0]) > 0.0 else np.inf
             if ahead < lead and (away > _SAME_PLACE_M or (ahead < 0.0 and away > _SETTLED_M)):
                 best, lead = other, ahead
         return Verdict(here, known, lead, best)
 
-    def fit(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> float:
+    def fit(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64) -> float:
         """The verdict's fit alone; 0 where too little is known."""
-        *_, known, here = self._here(ndt_map, points_lidar, T_map_lidar)
+        *_, known, here = self._here(around, points_lidar, T_map_lidar)
         return here if known >= MIN_KNOWN else 0.0
 
     def holds(self, verdict: Verdict) -> bool:
         """Whether the verdict confirms the pose."""
         return verdict.fit >= MIN_FIT and verdict.known >= MIN_KNOWN and verdict.lead >= MIN_LEAD
 
-    def _here(self, ndt_map: NdtMap, points_lidar: F64, T: F64) -> tuple[F64, F64, float, float, float]:
+    def _here(self, around: LocalMatcher, points_lidar: F64, T: F64) -> tuple[F64, F64, float, float, float]:
         """(points that are looked at; those of them that stand; mean likelihood that these should have; share of them
         where the map has been; how well they fit)."""
         few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
         standing = few[stands_above_ground(few, T)]
         points = standing @ T[:3, :3].T + T[:3, 3]
-        near, expected, known = _is_near_map(points, ndt_map.levels[0]), 1.0, 0.0
+        mapped, near = around.expected(points, self.range_sigma_m)
+        expected = 1.0
+        known = 0.0
         if near.any():
-            mapped, known = _self_likelihood(points, ndt_map.levels[-1], self.range_sigma_m), float(near.mean())
+            known = float(near.mean())
             expected = max((float(mapped.mean()) if len(mapped) else 1.0) * known, 1e-6)
-        return few, standing, expected, known, self._likelihood(ndt_map, standing, T) / expected
+        return few, standing, expected, known, self._likelihood(around, standing, T) / expected
 
-    def _likelihood(self, ndt_map: NdtMap, standing: F64, T: F64) -> float:
-        return fitness(ndt_map, [in_rows(standing)] * len(ndt_map.levels), T, len(ndt_map.levels) - 1)
+    def _likelihood(self, around: LocalMatcher, standing: F64, T: F64) -> float:
+        return float(around.likelihood(in_rows(standing), T[None], -1)[0])
 
-    def _others(self, ndt_map: NdtMap, few: F64, standing: F64, T: F64, quick: bool) -> list[F64]:
+    def _others(self, around: LocalMatcher, few: F64, standing: F64, T: F64, quick: bool) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
         coarse = in_rows(standing[:: max(1, len(standing) // _COARSE)])
         peaks = []
         for arm in _ARMS:
             guesses = T @ arm
-            fits = fitnesses(ndt_map, coarse, guesses)
+            fits = around.likelihood(coarse, guesses)
             rising = fits[1:] > fits[:-1]
             falling = np.append(fits[1:-1] >= fits[2:], True)
             peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
         peaks.sort(key=lambda peak: -peak[0])
         unsettled = [T @ _ARMS[0][0], T @ _ARMS[1][0]]
         on_the_way = in_rows(few[:: _QUICK_EVERY if quick else 1])
-        clouds = [*[on_the_way] * (len(ndt_map.levels) - 1), in_rows(few)]
+        clouds = [*[on_the_way] * (len(LEVELS) - 1), in_rows(few)]
         starts = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
         settled = _QUICK_SETTLED if quick else SETTLED
-        return [refine(ndt_map, clouds, start, settled=settled).T_map_lidar for start in starts]
+        return [around.refine(clouds, start, settled=settled).T_map_lidar for start in starts]
 
 
 def stands_above_ground(points_lidar: F64, T_map_lidar: F64) -> Bool:
@@ -152,47 +154,3 @@ def height_above_lowest(points: F64) -> F64:
     out = np.full(len(points), -np.inf)
     out[here] = z - np.min([low[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
     return out
-
-
-def _is_near_map(points: F64, grid: NdtGrid) -> Bool:
-    """(n,) whether the point's voxel, or one beside it, holds anything."""
-    rows = grid.window.rows
-    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
-    here = np.flatnonzero(((at >= 1) & (at < np.array(rows.shape) - 1)).all(axis=1))
-    out = np.zeros(len(points), dtype=np.bool_)
-    beside = at[here, None] + SEVEN
-    out[here] = (rows[beside[..., 0], beside[..., 1], beside[..., 2]] >= 0).any(axis=1)
-    return out
-
-
-def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
-    """Expected likelihood of each point (n, 3) drawn, with the sensor's noise, from its voxel's own distribution; (k,)
-    of those whose voxel has one.
-
-    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2.
-    """
-    rows = grid.window.rows
-    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
-    at = at[((at >= 0) & (at < rows.shape)).all(axis=1)]
-    k = rows[at[:, 0], at[:, 1], at[:, 2]]
-    k = k[k >= 0]
-    cells = grid.voxels.cells[k]
-    k, cells = (kept[cells[:, 3] + cells[:, 6] + cells[:, 8] != 0.0] for kept in (k, cells))
-    sums = grid.voxels.sums[k]
-    m, (a, b, c) = sums[:, 0], cells[:, :3].T
-    moments = sums[:, 4:10].T / m - np.stack([a * a, a * b, a * c, b * b, b * c, c * c])
-    moments[[0, 3, 5]] += noise_m * noise_m
-    S, C = _symmetric(moments), _symmetric(cells[:, 3:9].T)
-    A = [[(r == s) + S[r][0] * C[0][s] + S[r][1] * C[1][s] + S[r][2] * C[2][s] for s in range(3)] for r in range(3)]
-    determinant = (
-        A[0][0] * (A[1][1] * A[2][2] - A[1][2] * A[2][1])
-        - A[0][1] * (A[1][0] * A[2][2] - A[1][2] * A[2][0])
-        + A[0][2] * (A[1][0] * A[2][1] - A[1][1] * A[2][0])
-    )
-    return np.asarray(1.0 / np.sqrt(np.maximum(determinant, 1.0)))
-
-
-def _symmetric(upper: F64) -> list[list[F64]]:
-    """(3, 3) of numbers (n,) from the upper triangle (6, n)."""
-    xx, xy, xz, yy, yz, zz = upper
-    return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]

@@ -13,7 +13,7 @@ from mapvote.core.geometry import inverse, log
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I64, Scan
 from mapvote.core.voxels import slot_of, thin, voxel_key
-from mapvote.matching.ndt_map import LEVELS
+from mapvote.matching.ndt_voxels import LEVELS
 
 _ENOUGH = 20_000
 """Points that are thinned at least: of a dense scan every third, fifth .. is used. Odd, so that no beam is left

@@ -27,8 +27,8 @@ from mapvote.core.point_map import PointMap, lattice_of, map_from_points
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
-from mapvote.matching.ndt import refine
-from mapvote.matching.ndt_map import LEVELS, NdtMap
+from mapvote.matching.ndt_map import NdtMap
+from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.matching.prepare import in_rows, twist_between
 from mapvote.survey.clean_map import Mapper
@@ -236,7 +236,7 @@ class Surveyor:
         if self.fine_map is None:
             return fix
         points = in_rows(fix.points[thin(fix.points, _FINE.points_m)])
-        found = refine(self.fine_map.around(T_map_lidar[:3, 3]), [points], T_map_lidar)
+        found = self.fine_map.around(T_map_lidar[:3, 3]).refine([points], T_map_lidar)
         if not found.converged or np.linalg.norm(found.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]) > _POLISH_M:
             return fix
         tracker.correct(found.T_map_lidar, twist_between(last_pose, found.T_map_lidar, age))
