@@ -46,24 +46,24 @@ class Mount:
         T = drive.T_map_lidar_prior
         return replace(
             drive,
-            read_scan=lambda i: _turned(drive.read_scan(i), self.C),
+            read_scan=lambda i: self.scan(drive.read_scan(i)),
             T_map_lidar_prior=None if T is None else T @ self.C.T,
             T_base_lidar=drive.T_base_lidar @ self.C.T,
         )
+
+    def scan(self, scan: Scan) -> Scan:
+        """A scan in the usual axes."""
+        R = self.C[:3, :3]
+        origin = None if scan.origin is None else R @ scan.origin
+        others = tuple((start, R @ origin_of) for start, origin_of in scan.others)
+        points = np.ascontiguousarray(scan.points @ R.T, dtype=np.float32)
+        return replace(scan, points=points, origin=origin, others=others)
 
     def in_steps(self) -> Mount:
         """The mount by roll, pitch and yaw in steps of ``MountRules.step_deg`` that is nearest: a prior knows up and
         ahead to some degrees, and matching takes care of what is left, as of any sensor's."""
         nearest = int(np.argmax(np.einsum("nij,ij->n", _STEPS, self.C[:3, :3])))
         return replace(self, C=poses_at([np.zeros(3)], _STEPS[nearest][None])[0])
-
-
-def _turned(scan: Scan, C: F64) -> Scan:
-    R = C[:3, :3]
-    origin = None if scan.origin is None else R @ scan.origin
-    others = tuple((start, R @ origin_of) for start, origin_of in scan.others)
-    points = np.ascontiguousarray(scan.points @ R.T, dtype=np.float32)
-    return replace(scan, points=points, origin=origin, others=others)
 
 
 def mount_of_prior(T: F64, rules: MountRules = RULES) -> Mount | None:

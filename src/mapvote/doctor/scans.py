@@ -362,7 +362,15 @@ def _beams(drive: Drive, looks: Looks) -> Iterator[Finding]:
     if drive.sensor_told.startswith("measured"):
         return
     some = (drive.read_scan(int(looks["index"][k])) for k in sorted({0, len(looks) // 2, len(looks) - 1}))
-    what = next(filter(None, (contradiction(drive.sensor, scan.by_lidar()[0][1]) for scan in some)), "")
+    mount = None if drive.T_map_lidar_prior is None else mount_of_prior(drive.T_map_lidar_prior)
+
+    def contradicted(scan: Scan) -> str:
+        own = contradiction(drive.sensor, scan.by_lidar()[0][1])
+        # Clouds in the axes of the vehicle have the rings of the sensor about the vertical, however it is mounted.
+        upright = own if mount is None else contradiction(drive.sensor, mount.in_steps().scan(scan).by_lidar()[0][1])
+        return own if upright else ""
+
+    what = next(filter(None, map(contradicted, some)), "")
     if what:
         yield Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")
 
