@@ -63,7 +63,7 @@ def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
     assert serious(diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings) == []
 
 
-MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (45, 45, 45), (0, 0, 90), (20, 100, 200)]
+MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (0, 270, 0), (45, 45, 45), (0, 0, 90), (20, 100, 200)]
 """Roll, pitch and yaw of the points, degrees."""
 
 

@@ -109,11 +109,12 @@ def diagnose(
 
 
 def _opened(path: Path, options: Mapping[str, Any], point_map: PointMap | None) -> tuple[Drive | None, list[Finding]]:
-    """(the drive as `vote` opens it, what stopped it from opening so): a broken prior hides nothing else."""
+    """(the drive as `vote` opens it, what stopped it from opening so): neither a broken prior nor points whose times
+    cannot be told hide anything else."""
     found: list[Finding] = []
-    for prior in (options.get("prior"), "none"):
+    for without in ({}, {"prior": "none"}, {"motion_compensated": True}, {"prior": "none", "motion_compensated": True}):
         try:
-            return open_drive_on(point_map, path, **{**options, "prior": prior}), found
+            return open_drive_on(point_map, path, **{**options, **without}), found
         except MapvoteError as error:
             found = found or [Finding("error", str(error))]
     return None, found

@@ -23,6 +23,8 @@ from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 from mapvote.formats.listing import entry
 
+_FACES_Z = 0.7
+"""Cosine between the way a camera looks and the z axis of its own world, somewhere on a drive."""
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
 _TIMES = ("timestamp", "time", "stamp", "t", "gpstime", "rostime", "sec", "secs")
@@ -142,7 +144,9 @@ def read_T_map_lidar(file: Path, folder: Path) -> F64:
     poses = read_poses(file)
     calib = entry(folder, "calib.txt")
     axis = _travels_along(poses)
-    if axis == "+z" or (calib.is_file() and axis == "" and file.name.lower() != "prior.txt"):
+    # A sensor that is mounted with its z axis ahead moves along z, too, but its z axis is level in the map.
+    camera = axis == "+z" and bool(np.abs(poses[:, 2, 2]).max() > _FACES_Z)
+    if camera or (calib.is_file() and axis == "" and file.name.lower() != "prior.txt"):
         if not calib.is_file():
             raise MapvoteError(
                 f"{file}: these are camera poses (the vehicle moves along z, not x); put KITTI's calib.txt into "
