@@ -23,7 +23,7 @@ from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 from mapvote.formats.listing import entry
 
-_FACES_Z = 0.7
+_FACES_Z = 0.9
 """Cosine between the way a camera looks and the z axis of its own world, somewhere on a drive."""
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
