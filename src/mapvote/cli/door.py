@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
     from mapvote.doctor import Finding
+    from mapvote.doctor.localised import LocalisedDrive
     from mapvote.doctor.scans import Looking
     from mapvote.formats.maps.tiling import Look, Pieces
     from mapvote.perception.frontend import DriveReport
@@ -193,32 +194,34 @@ def when(stamp_ns: int) -> str:
 
 
 @contextmanager
-def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
+def usable_drives(drives: Sequence[Drive], *, unchecked: bool = False) -> Iterator[list[Drive]]:
     """The drives, checked while they are read; nothing may be written before this ends.
 
     MapvoteError for one that cannot be used so: at once if some of its scans show it, else at the end. Whatever else
-    stops the work, what is wrong with a drive is told rather than what came of it.
+    stops the work, what is wrong with a drive is told rather than what came of it. ``unchecked``: an error is told as a
+    warning.
     """
-    from mapvote.doctor.scans import looked_at
+    from mapvote.doctor.scans import Looking, looked_at
 
     watching = []
     for drive in drives:
         with progress(f"looking at {drive.path}") as tell:
-            watching.append(looked_at(drive, tell))
+            watching.append(Looking(drive) if unchecked else looked_at(drive, tell))
     try:
         yield [one.drive for one in watching]
     except MapvoteError:
-        _warnings_of(watching)
+        if not unchecked:
+            _warnings_of(watching, unchecked)
         raise
-    for path, found in _warnings_of(watching):
+    for path, found in _warnings_of(watching, unchecked):
         _warn(path, found)
 
 
-def _warnings_of(watching: list[Looking]) -> list[tuple[str, list[Finding]]]:
+def _warnings_of(watching: list[Looking], unchecked: bool) -> list[tuple[str, list[Finding]]]:
     found = []
     for one in watching:
         with progress(f"looking at {one.drive.path}") as tell:
-            found.append((str(one.drive.path), one.warnings(tell)))
+            found.append((str(one.drive.path), one.warnings(tell, unchecked=unchecked)))
     return found
 
 
@@ -230,6 +233,19 @@ def require_straight(drive: Drive, report: DriveReport, point_map: PointMap, *, 
     for finding in check_bent(drive, report.T_map_lidar, point_map):
         if finding.severity == "error" and not unchecked:
             raise MapvoteError(f"{drive.path}: {finding.what}. {finding.mend}; nothing was written")
+        _warn(str(drive.path), [finding])
+
+
+def require_localised(localised: LocalisedDrive, drive: Drive, point_map: PointMap | None, unchecked: bool) -> None:
+    """MapvoteError for a drive that did not know where it was: no ballot and no map comes of it. ``unchecked``: a
+    warning."""
+    from mapvote.doctor.localised import check_localised
+
+    for finding in check_localised(localised, point_map):
+        if not unchecked:
+            raise MapvoteError(
+                f"{drive.path}: {finding.what}. {finding.mend} Nothing was written (--unchecked writes all the same)"
+            )
         _warn(str(drive.path), [finding])
 
 

@@ -18,10 +18,11 @@ from mapvote.cli.door import (
     map_at,
     named_after,
     region_in,
+    require_localised,
     require_straight,
     usable_drives,
 )
-from mapvote.cli.options import Config, KeyFile, with_drive_options
+from mapvote.cli.options import Config, KeyFile, Unchecked, with_drive_options
 from mapvote.cli.terminal import print_table, progress, waiting
 from mapvote.core.types import MapvoteError
 
@@ -43,6 +44,7 @@ def build(
         Path | None,
         typer.Option("--report", metavar="PNG", help="write a picture of the drives' distance from their priors"),
     ] = None,
+    unchecked: Unchecked = False,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
@@ -55,6 +57,7 @@ def build(
         mapvote build MY_DRIVE --out my_map
     """
     from mapvote.config import load_settings
+    from mapvote.doctor.localised import LocalisedDrive
     from mapvote.formats import open_drive, write_map
     from mapvote.survey.build import build_map
 
@@ -63,8 +66,12 @@ def build(
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
     settings = load_settings(config)
     opened = [open_drive(path, **drive_options) for path in drives]
-    with usable_drives(opened) as looked_at, progress("mapping") as tell:
+    with usable_drives(opened, unchecked=unchecked) as looked_at, progress("mapping") as tell:
         point_map, report = build_map(looked_at, settings, progress=tell)
+    for track in report.tracks:
+        require_localised(
+            LocalisedDrive.of(track.drive, track.T_map_lidar, track.registered), track.drive, None, unchecked
+        )
     with waiting(f"writing {out}"):
         write_map(named_after(out, point_map), out)
     _tell(report, out)
@@ -167,6 +174,7 @@ def vote(
         Path | None,
         typer.Option(metavar="FILE", help="for a cloud: the sensor's poses in the cloud's frame, rows of 3 x 4 or TUM"),
     ] = None,
+    unchecked: Unchecked = False,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
@@ -215,7 +223,7 @@ def vote(
             if cuts:
                 _vote_in_cuts(drive, point_map, settings, every_m, _Outlets(out, send, key))
                 return
-            ballot, report = _drive_once(drive, point_map, settings, trust_prior)
+            ballot, report = _drive_once(drive, point_map, settings, trust_prior, unchecked)
     data = encode(ballot)
     if out is not None:
         write_whole(out, data)
@@ -228,8 +236,9 @@ def vote(
 
 
 def _drive_once(
-    drive: Drive, point_map: PointMap, settings: Settings, trust_prior: bool
+    drive: Drive, point_map: PointMap, settings: Settings, trust_prior: bool, unchecked: bool
 ) -> tuple[Ballot, DriveReport | None]:
+    from mapvote.doctor.localised import LocalisedDrive
     from mapvote.matching.localiser import GivenPoses
     from mapvote.vehicle import vote_drive
 
@@ -239,9 +248,11 @@ def _drive_once(
             missing = "has no prior to trust; give one with --prior, or let it be localised"
             raise MapvoteError(f"{drive.path}: {missing}")
         localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-    with usable_drives([drive]) as (drive,), progress("voting") as tell:
+    with usable_drives([drive], unchecked=unchecked) as (drive,), progress("voting") as tell:
         ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
-    require_straight(drive, report, point_map)
+    if not trust_prior:
+        require_localised(LocalisedDrive.of_report(drive, report), drive, point_map, unchecked)
+    require_straight(drive, report, point_map, unchecked=unchecked)
     return ballot, report
 
 

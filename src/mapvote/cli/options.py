@@ -31,6 +31,10 @@ KeyFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="file with the key for the server; default: the key in $MAPVOTE_KEY")
 ]
 Reason = Annotated[str, typer.Option(metavar="TEXT", help="a comment that the log keeps")]
+Unchecked = Annotated[
+    bool,
+    typer.Option("--unchecked", help="write it even if a check of the drive finds an error, which becomes a warning"),
+]
 Rate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, for a drive without times")
 ]

@@ -144,10 +144,12 @@ class Looking:
         rows = np.array([self._rows[i] for i in sorted(self._rows)], dtype=_LOOK)
         return Looks(rows, Counter(self._times), self._intensity, dict(self._refused))
 
-    def warnings(self, progress: Callable[[int, int], None] | None = None) -> list[Finding]:
-        """The findings of all scans, read or not; MapvoteError with the first error, if there is one."""
+    def warnings(self, progress: Callable[[int, int], None] | None = None, *, unchecked: bool = False) -> list[Finding]:
+        """The findings of all scans, read or not; MapvoteError with the first error, if there is one and they are not
+        ``unchecked``."""
         found = cheap_checks(self.drive, self.look(range(len(self.drive)), progress))
-        return [f for f in usable(str(self.drive.path), found) if f != NO_PRIOR]
+        serious = [f for f in found if f.severity != "note"]
+        return [f for f in (serious if unchecked else usable(str(self.drive.path), found)) if f != NO_PRIOR]
 
 
 def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looking:

@@ -1,0 +1,159 @@
+"""Did the vehicle know where it was? What is asked of a drive once it is localised, before its ballot leaves.
+
+Nothing is registered again: the poses that were found are compared with each other and with the prior. A drive whose
+scans are out of order, or whose prior is read in another convention, is localised here and there; vehicles that share
+such a defect outvote any quorum. Sound drives pass: a prior may be off by a constant, scatter, stand still or turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, I64, Bool, Drive
+from mapvote.doctor import Finding
+from mapvote.perception.frontend import DriveReport
+
+
+@dataclass(frozen=True, slots=True)
+class LocalisedRules:
+    """What sound drives keep within."""
+
+    least_scans: int = 8
+    """Scans that show anything of a drive."""
+    least_share: float = 0.5
+    """Of the scans over the map's ground: so many have a sure place."""
+    leap_mps: float = 70.0
+    """No vehicle is faster between two scans in turn ..."""
+    leap_m: float = 2.0
+    """... nor is a leap shorter than this, which a track that is corrected may move."""
+    most_leaps: float = 0.05
+    """Share of the steps that may be leaps: a track is moved where another place fits better."""
+    way_m: float = 10.0
+    """Ways are compared over so many metres, at least."""
+    way_share: float = 0.25
+    """By so much of itself, and four of its sigmas, the way by the prior may differ."""
+    turn_deg: float = 20.0
+    """By so much, and four of its sigmas, the prior's attitude may differ."""
+    off_m: float = 3.0
+    """By so much, and four of its sigmas, half of the prior's positions may scatter about their mean difference."""
+
+
+LOCALISED_RULES = LocalisedRules()
+_MEND = (
+    "see `mapvote doctor DRIVE --map MAP`: are the scans in order, and is the prior of this drive and in this frame?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LocalisedDrive:
+    """The poses of a drive on a map, beside those that it believed."""
+
+    stamps_ns: I64
+    """(n,)"""
+    T_map_lidar: F64
+    """(n, 4, 4) found."""
+    sure: Bool
+    """(n,) which of them are trusted."""
+    T_prior: F64 | None
+    """(n, 4, 4) believed."""
+    sigma_m: float
+    sigma_deg: float
+    """The prior's, as stated."""
+
+    @classmethod
+    def of(cls, drive: Drive, T_map_lidar: Sequence[F64] | F64, sure: Bool) -> LocalisedDrive:
+        """Of a recorded ``drive`` whose scans were found at poses (n, 4, 4), those that are ``sure`` (n,)."""
+        prior, sigmas = drive.T_map_lidar_prior, (drive.prior_sigma_m, drive.prior_sigma_deg)
+        return cls(drive.stamps_ns, np.asarray(T_map_lidar), sure, prior, *sigmas)
+
+    @classmethod
+    def of_report(cls, drive: Drive, report: DriveReport) -> LocalisedDrive:
+        """Of a recorded ``drive`` that has voted."""
+        sure = np.ones(len(drive), dtype=np.bool_)
+        sure[report.lost] = False
+        return cls.of(drive, report.T_map_lidar, sure)
+
+
+def check_localised(
+    drive: LocalisedDrive, point_map: PointMap | None = None, rules: LocalisedRules = LOCALISED_RULES
+) -> Iterator[Finding]:
+    """The share of scans with a sure place, leaps, and how prior and found poses differ. ``point_map``: scans that lie
+    beside its ground need no place."""
+    if len(drive.stamps_ns) < rules.least_scans:
+        return
+    yield from _share(drive, point_map, rules)
+    found = np.flatnonzero(drive.sure)
+    if len(found) < rules.least_scans:
+        return
+    yield from _leaps(drive, found, rules)
+    if drive.T_prior is not None:
+        yield from _ways(drive, found, rules)
+        yield from _attitude(drive, found, rules)
+        yield from _positions(drive, found, rules)
+
+
+def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRules) -> Iterator[Finding]:
+    on_map = np.ones(len(drive.stamps_ns), dtype=np.bool_)
+    if point_map is not None:
+        believed = drive.T_map_lidar if drive.T_prior is None else drive.T_prior
+        on_map = np.isfinite(point_map.ground_under(believed[:, :3, 3])) | drive.sure
+    scans, sure = int(on_map.sum()), int(drive.sure.sum())
+    if scans >= rules.least_scans and sure < rules.least_share * scans:
+        what = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
+        yield Finding("error", what, f"is it the map of this street? {_MEND}")
+
+
+def _leaps(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+    """Steps between sure scans in turn that no vehicle drives."""
+    next_to = np.diff(found) == 1
+    step_m = np.linalg.norm(np.diff(drive.T_map_lidar[found, :3, 3], axis=0), axis=1)
+    step_s = np.diff(drive.stamps_ns[found]) * 1e-9
+    leaps = next_to & (step_m > rules.leap_m) & (step_m > rules.leap_mps * step_s)
+    if leaps.sum() >= 2 and leaps.sum() > rules.most_leaps * next_to.sum():
+        worst = int(np.argmax(np.where(leaps, step_m, 0.0)))
+        what = f"the localised path leaps {int(leaps.sum())} times, most before scan {found[worst + 1]} "
+        yield Finding("error", f"{what}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _MEND)
+
+
+def _ways(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+    """How far the vehicle came, by the poses found and by the prior, over pieces of the drive."""
+    assert drive.T_prior is not None
+    driven_m = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(drive.T_map_lidar[found, :3, 3], axis=0), axis=1))]
+    )
+    piece = max(rules.way_m, 6.0 * drive.sigma_m)
+    marks = np.searchsorted(driven_m, np.arange(0.0, driven_m[-1], piece))
+    if len(marks) < 3:
+        return
+    a, b = found[marks[:-1]], found[marks[1:]]
+    came_m = np.linalg.norm(drive.T_map_lidar[b, :3, 3] - drive.T_map_lidar[a, :3, 3], axis=1)
+    believed_m = np.linalg.norm(drive.T_prior[b, :3, 3] - drive.T_prior[a, :3, 3], axis=1)
+    slack_m = rules.way_share * np.maximum(came_m, believed_m) + 4.0 * drive.sigma_m
+    if np.median(np.abs(came_m - believed_m) - slack_m) > 0.0:
+        apart_m = float(np.median(np.abs(came_m - believed_m)))
+        what = f"over pieces of {piece:.0f} m the way found and the way by the prior differ by {apart_m:.1f} m (median)"
+        yield Finding("error", what, _MEND)
+
+
+def _attitude(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+    assert drive.T_prior is not None
+    apart = np.einsum("nji,njk->nik", drive.T_prior[found, :3, :3], drive.T_map_lidar[found, :3, :3])
+    apart_deg = np.degrees(scipy.spatial.transform.Rotation.from_matrix(apart).magnitude())
+    median_deg = float(np.median(apart_deg))
+    if median_deg > rules.turn_deg + 4.0 * drive.sigma_deg:
+        what = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the one found"
+        yield Finding("error", what, f"are the axes of prior and points the same (x forward, z up)? {_MEND}")
+
+
+def _positions(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+    assert drive.T_prior is not None
+    off = drive.T_map_lidar[found, :2, 3] - drive.T_prior[found, :2, 3]
+    scatter_m = float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
+    if scatter_m > rules.off_m + 4.0 * drive.sigma_m:
+        what = f"the prior lies {scatter_m:.1f} m (median) about its mean difference from the places found, but states "
+        yield Finding("error", f"{what}{drive.sigma_m:.2f} m", _MEND)

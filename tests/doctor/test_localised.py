@@ -1,0 +1,80 @@
+"""What is asked of a drive once it is localised: sound ones pass, those that were never sure of their place do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapvote.core.geometry import exp, from_xyz_rpy
+from mapvote.core.types import F64
+from mapvote.doctor.localised import LocalisedDrive, check_localised
+
+N = 60
+
+
+def _drive(bend: float = 0.02, step_m: float = 0.8) -> LocalisedDrive:
+    """A bend at 8 m/s, with a GNSS prior."""
+    T = np.array([exp(k * np.array([step_m, 0, 0, 0, 0, bend])) for k in range(N)])
+    prior = T.copy()
+    prior[:, :3, 3] += np.random.default_rng(0).normal(0, 0.6, (N, 3))
+    return LocalisedDrive(np.arange(N) * 10**8, T, np.ones(N, dtype=np.bool_), prior, 0.67, 1.0)
+
+
+def found(drive: LocalisedDrive) -> list[str]:
+    return [finding.what for finding in check_localised(drive)]
+
+
+def _prior(change: Callable[[F64], F64]) -> LocalisedDrive:
+    drive = _drive()
+    assert drive.T_prior is not None
+    return replace(drive, T_prior=change(drive.T_prior.copy()))
+
+
+def _moved(T: F64, by: F64) -> F64:
+    T[:, :3, 3] += by
+    return T
+
+
+SOUND = {
+    "a bend": _drive(),
+    "a U-turn": _drive(bend=np.pi / N),
+    "three rounds": _drive(bend=6 * np.pi / N),
+    "standing": _drive(bend=0.0, step_m=0.0),
+    "walking pace": _drive(step_m=0.05),
+    "a prior 8 m beside": _prior(lambda T: _moved(T, np.array([6.0, -5.0, 3.0]))),
+    "a prior that drifts by its sigma": _prior(lambda T: _moved(T, np.linspace(0, 2.0, N)[:, None] * [1.0, 0.5, 0.0])),
+    "no prior": replace(_drive(), T_prior=None),
+    "a third of the scans lost": replace(_drive(), sure=np.arange(N) % 3 > 0),
+    "short": replace(_drive(), stamps_ns=np.arange(5) * 10**8, sure=np.zeros(5, dtype=np.bool_)),
+}
+
+
+@pytest.mark.parametrize("kind", SOUND)
+def test_a_sound_drive_raises_no_alarm(kind: str) -> None:
+    assert found(SOUND[kind]) == []
+
+
+def _leaping() -> LocalisedDrive:
+    drive = _drive()
+    order = np.array(sorted(range(N), key=str))
+    return replace(drive, T_map_lidar=drive.T_map_lidar[order], T_prior=None)
+
+
+@pytest.mark.parametrize(
+    ("drive", "named"),
+    [
+        (replace(_drive(), sure=np.arange(N) % 3 == 0), "have a sure place"),
+        (_leaping(), "the localised path leaps"),
+        (_prior(lambda T: T[np.random.default_rng(1).permutation(N)]), "way by the prior"),
+        (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, yaw=np.pi / 2)), "attitude differs by 90 deg"),
+        (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, roll=np.pi)), "attitude differs by 180 deg"),
+        (_prior(lambda T: T[::-1]), "attitude differs|way by the prior|about its mean difference"),
+    ],
+)
+def test_a_drive_that_did_not_know_its_place_is_an_error(drive: LocalisedDrive, named: str) -> None:
+    findings = list(check_localised(drive))
+    assert any(np.any([word in one.what for word in named.split("|")]) for one in findings)
+    assert all(one.severity == "error" and one.mend for one in findings)
