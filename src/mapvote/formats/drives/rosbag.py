@@ -26,7 +26,7 @@ from mapvote.formats.drives.point_fields import PointReader, livox_table, log, p
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Trajectory, prior_of
 from mapvote.formats.extras import first_line, require
-from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
+from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 _SWEEP = 0.55
@@ -342,14 +342,16 @@ def _order_of_poses(bag: Bag, topic: str, times_ns: list[int], received_ns: list
 
 def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     rows = [
-        (stamp_of(m), received_ns, m.longitude, m.latitude, m.altitude)
+        (stamp_of(m), received_ns, m.longitude, m.latitude, m.altitude, m.status.status)
         for received_ns, m in bag.messages(topic)
-        if m.status.status >= 0 and np.isfinite([m.longitude, m.latitude]).all()
     ]
     if not rows:
-        raise MapvoteError(f"{bag.path}: {topic} holds no valid fix; choose another topic, or --prior none")
-    order = _order_of_poses(bag, topic, [row[0] for row in rows], [row[1] for row in rows])
-    place = np.nan_to_num(np.array([row[2:] for row in rows], dtype=np.float64))[order.chosen]
+        raise MapvoteError(f"{bag.path}: {topic} holds no fix; choose another topic, or --prior none")
+    table = np.array([row[2:] for row in rows], dtype=np.float64)
+    keep, place = sound_fixes(f"{bag.path}: {topic}", table[:, :3], table[:, 3])
+    sound = [row for row, kept in zip(rows, keep.tolist(), strict=True) if kept]
+    order = _order_of_poses(bag, topic, [row[0] for row in sound], [row[1] for row in sound])
+    place = place[order.chosen]
     T, known = poses_from_gnss(place, np.zeros((len(place), 3)), frame)
     return Trajectory(order.stamps_ns, yaw_from_track(T), of_vehicle=True, frame=known)
 

@@ -5,9 +5,9 @@ the others each line belongs to a scan. So a drive gets its prior.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +18,17 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
+from mapvote.formats.drives.point_fields import log
+from mapvote.formats.drives.pose_header import Column, find_header, split_row
 from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.extras import read_text
-from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
+from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 from mapvote.formats.listing import entry
 
 _FACES_Z = 0.9
 """Cosine between the way a camera looks and the z axis of its own world, somewhere on a drive."""
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
-_TIMES = ("timestamp", "time", "stamp", "t", "gpstime", "rostime", "sec", "secs")
-_COLUMNS = {
-    "x": ("x", "tx", "pos_x", "position_x", "easting", "east"),
-    "y": ("y", "ty", "pos_y", "position_y", "northing", "north"),
-    "z": ("z", "tz", "pos_z", "position_z", "altitude", "height", "up", "alt"),
-    "qx": ("qx", "quat_x", "orientation_x"),
-    "qy": ("qy", "quat_y", "orientation_y"),
-    "qz": ("qz", "quat_z", "orientation_z"),
-    "qw": ("qw", "quat_w", "orientation_w"),
-    "roll": ("roll",),
-    "pitch": ("pitch",),
-    "yaw": ("yaw",),
-    "down": ("down",),
-    "nanoseconds": ("nsec", "nanosec", "nsecs", "nanosecs"),
-    "heading": ("heading", "azimuth", "course"),
-    "latitude": ("latitude", "lat"),
-    "longitude": ("longitude", "lon", "lng"),
-}
 
 
 def read_numbers(file: Path, columns: int) -> F64:
@@ -195,31 +179,38 @@ def sorted_trajectory(times_ns: I64, T_map: F64, *, of_vehicle: bool, frame: Map
 
 def has_times(file: Path) -> bool:
     """Whether a text file of poses carries times: TUM's eight numbers a row, or a header of names."""
-    words = next((s for s in read_text(file).splitlines() if _holds(s)), "").replace(",", " ").split()
-    return len(words) == 8 or (bool(words) and not _is_number(words[0])) or _header(file) is not None
+    lines = read_text(file).splitlines()
+    words = split_row(next((line for line in lines if _holds(line)), ""))
+    return len(words) == 8 or (bool(words) and not _is_number(words[0])) or find_header(lines) is not None
 
 
 def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
-    """TUM (seconds, x, y, z, qx, qy, qz, qw) or CSV with names in its first line.
+    """TUM (seconds, x, y, z, qx, qy, qz, qw), or a table whose header names its columns, in whatever order.
 
     ``frame``: the frame of the map, into which latitudes and longitudes go; without one a plane at the first of them.
     MapvoteError names the line or the column that is wrong.
     """
-    if _header(file) is None:
+    lines = read_text(file).splitlines()
+    if find_header(lines) is None:
+        first = next((line for line in lines if _holds(line)), "")
+        if first and not _is_number(split_row(first)[0]):
+            raise MapvoteError(
+                f"{file}:{lines.index(first) + 1}: no known header: {first.strip()[:80]!r}; name a time, x, y, z and "
+                "qx, qy, qz, qw (or roll, pitch, yaw), or latitude, longitude"
+            )
         rows = read_numbers(file, 8)
-        T, times_ns = _motions_of_quaternions(file, rows[:, 1:]), _ns(file, rows[:, 0])
+        T, times_ns = _motions_of_quaternions(file, _in_tum_order(file, rows[:, 1:])), _ns(file, rows[:, 0])
         return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
     times_ns, columns = read_columns(file)
     zero = np.zeros(len(times_ns))
-    angles = {name: columns[name] for name in ("roll", "pitch", "yaw", "heading") if name in columns}
-    for name, angle in angles.items():  # beyond two turns of radians they can only be degrees
-        angles[name] = np.radians(angle) if float(np.abs(angle).max()) > 2.0 * np.pi + 0.01 else angle
-    yaw = angles.get("yaw", np.pi / 2 - angles.get("heading", zero))
-    rpy = np.column_stack([angles.get("roll", zero), angles.get("pitch", zero), yaw])
+    yaw = columns.get("yaw", np.pi / 2 - columns.get("heading", zero))
+    rpy = np.column_stack([columns.get("roll", zero), columns.get("pitch", zero), yaw])
     if {"latitude", "longitude"} <= set(columns):
         place = np.column_stack([columns["longitude"], columns["latitude"], columns.get("z", zero)])
-        T, frame = poses_from_gnss(place, rpy, frame)
-        return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
+        keep, place = sound_fixes(str(file), place, columns.get("status"))
+        T, frame = poses_from_gnss(place, rpy[keep], frame)
+        T = T if {"yaw", "heading", "qw"} & set(columns) else yaw_from_track(T)
+        return sorted_trajectory(times_ns[keep], T, of_vehicle=True, frame=frame)
     position = needed(file, columns, "x", "y", "z")
     if {"qx", "qy", "qz", "qw"} <= set(columns):
         quaternions = needed(file, columns, "qx", "qy", "qz", "qw")
@@ -235,51 +226,88 @@ def _motions_of_quaternions(file: Path, rows: F64) -> F64:
     """(n, 4, 4) of rows x, y, z, qx, qy, qz, qw."""
     off = np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0)
     if not (off < 0.05).all():
-        raise MapvoteError(f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion")
+        raise MapvoteError(
+            f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion; a header names the columns "
+            "(timestamp,x,y,z,qx,qy,qz,qw)"
+        )
     if not len(rows):
         return geometry.poses_at(rows[:, :3])
     return geometry.poses_at(rows[:, :3], scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix())
 
 
-def _header(file: Path) -> list[str] | None:
-    """The names in the first line, lower case without units, comments of TUM files left out; None if it has none."""
-    line = next((line for line in read_text(file).splitlines() if line.strip()), "")
-    words = [w.strip().strip('"').lower() for w in line.lstrip("#% ").replace(";", ",").split(",")]
-    names = [w.split("[")[0].split("(")[0].strip().removeprefix("field.") for w in words]
-    known = {alias for aliases in _COLUMNS.values() for alias in aliases} | set(_TIMES)
-    return names if len(names) > 3 and len(known & set(names)) >= 3 else None
+_STEADY, _UNSTEADY = 0.97, 0.9
+"""Length of the mean direction of travel in the sensor's axes: of poses that are read right, of others."""
+
+
+def _in_tum_order(file: Path, rows: F64) -> F64:
+    """Rows x, y, z, qx, qy, qz, qw of rows without a header, whose quaternions may have w first: only then a vehicle
+    always drives to the same side of itself, and the order is told."""
+    w_first = rows[:, [0, 1, 2, 4, 5, 6, 3]]
+    if len(rows) < 3 or _steadiness(rows) > _UNSTEADY or _steadiness(w_first) < _STEADY:
+        return rows
+    log.warning("%s: no header; read as time, x, y, z, qw, qx, qy, qz: so the vehicle drives straight ahead", file)
+    return w_first
+
+
+def _steadiness(rows: F64) -> float:
+    """How steady up and the way driven are in the axes of the poses of rows x, y, z, qx, qy, qz, qw: 1 if always the
+    same; 1 of a vehicle that stands."""
+    lengths = np.linalg.norm(rows[:, 3:], axis=1)
+    if not (np.abs(lengths - 1.0) < 0.05).all():
+        return 1.0
+    R = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix()
+    steps = np.diff(rows[:, :3], axis=0)
+    way_m = np.linalg.norm(steps, axis=1)
+    if way_m.sum() < 1.0:
+        return 1.0
+    ahead = np.einsum("nji,nj->i", R[:-1], steps) / way_m.sum()
+    return float(min(np.linalg.norm(ahead), np.linalg.norm(R[:, 2].mean(axis=0))))
 
 
 def read_columns(file: Path) -> tuple[I64, dict[str, F64]]:
-    """(times (n,) in nanoseconds, columns (n,) by the names that ``_COLUMNS`` gives them, NaN where a value is no
-    number) of a CSV file with names in its first line.
+    """(times (n,) in nanoseconds, columns (n,) by the roles of :mod:`mapvote.formats.drives.pose_header`, in metres,
+    radians and degrees of latitude, NaN where a value is no number) of a table with names in its header.
 
-    MapvoteError if the names are missing, there is no column of times, or a row is cut off.
+    Angles without a unit are degrees if any is beyond two turns of radians. MapvoteError if the names are missing,
+    there is no column of times, or a row is cut off.
     """
-    names = _header(file)
-    if names is None:
+    lines = read_text(file).splitlines()
+    header = find_header(lines)
+    if header is None:
         raise MapvoteError(f"{file}: its first line names no columns; copy it again")
-    numbered = ((number, line) for number, line in enumerate(read_text(file).splitlines(), 1) if line.strip())
     rows = []
-    for number, line in list(numbered)[1:]:
-        rows.append(next(csv.reader([line.replace(";", ",")])))
-        if len(rows[-1]) < len(names):
-            raise MapvoteError(f"{file}:{number}: {len(rows[-1])} values, but the header names {len(names)}")
+    for number, line in enumerate(lines[header.line :], header.line + 1):
+        if not _holds(line):
+            continue
+        rows.append(split_row(line))
+        if len(rows[-1]) < len(header.names):
+            raise MapvoteError(f"{file}:{number}: {len(rows[-1])} values, but the header names {len(header.names)}")
     if not rows:
         raise MapvoteError(f"{file}: a header, but no poses")
-    time = next((i for i, name in enumerate(names) if name in _TIMES), None)
+    time = header.columns.get("time")
     if time is None:
-        raise MapvoteError(f"{file}: no column of times among {', '.join(names)}; name one timestamp, time or t")
-    times_ns = exact_ns(file, [row[time] for row in rows])
-    columns = {
-        key: np.array([_number(row[i]) for row in rows])
-        for key, aliases in _COLUMNS.items()
-        for i, name in enumerate(names)
-        if name in aliases
-    }
+        raise MapvoteError(f"{file}: no column of times among {', '.join(header.names)}; name one timestamp, time or t")
+    times_ns = exact_ns(file, [row[time.index] for row in rows], time.scale)
+    columns = {}
+    for role, column in header.columns.items():
+        values = np.array([_number(row[column.index]) for row in rows])
+        columns[role] = _in_radians(values, column) if role in _ANGLES else values * _metres(role, column)
     if "nanoseconds" in columns:
         times_ns += needed(file, columns, "nanoseconds")[:, 0].astype(np.int64)
     return times_ns, columns
+
+
+_ANGLES = ("roll", "pitch", "yaw", "heading")
+
+
+def _in_radians(values: F64, column: Column) -> F64:
+    if column.scale is not None:
+        return values * column.scale
+    return np.radians(values) if float(np.nanmax(np.abs(values), initial=0.0)) > 2.0 * np.pi + 0.01 else values
+
+
+def _metres(role: str, column: Column) -> float:
+    return column.scale or 1.0 if role in ("x", "y", "z", "down") else 1.0
 
 
 def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
@@ -294,9 +322,11 @@ def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
     return found
 
 
-def exact_ns(file: Path, texts: Sequence[str]) -> I64:
+def exact_ns(file: Path, texts: Sequence[str], unit_ns: float | None = None) -> I64:
     """(n,) nanoseconds of times written as seconds, or as whole milli-, micro- or nanoseconds since 1970. Whole numbers
-    are exact: float64 holds no nanoseconds since 1970."""
+    are exact: float64 holds no nanoseconds since 1970. ``unit_ns``: the unit, where it is known."""
+    if unit_ns is not None and all(_is_number(text) for text in texts):
+        return np.array([round(Fraction(text) * int(unit_ns)) for text in texts], dtype=np.int64)
     if not all(text.strip().lstrip("-").isdigit() for text in texts):
         return _ns(file, np.array([_number(text) for text in texts]))
     whole = [int(text) for text in texts]

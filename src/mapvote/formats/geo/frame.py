@@ -22,7 +22,7 @@ import yaml
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import poses_at
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.extras import read_text, require
 
 LOCAL = "local"
@@ -196,6 +196,36 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
         frame = enu_frame(lat, lon, height)
     R_enu_base = scipy.spatial.transform.Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
     return poses_at(frame.from_lonlat(lonlat), frame.axes_at(lonlat) @ R_enu_base), frame
+
+
+_NO_FIX_DEG = 1e-6
+"""Degrees from latitude 0, longitude 0, in the Gulf of Guinea: no vehicle is there."""
+
+
+def sound_fixes(where: str, lonlat: F64, status: F64 | None = None) -> tuple[Bool, F64]:
+    """(which of the fixes (n, 3), longitude, latitude in degrees, height in metres, are ones (n,), these (m, 3)).
+
+    Left out and counted: no fix by its ``status`` (n,), not a number, and (0, 0), which receivers send before their
+    first fix. A height that is not a number is interpolated between its neighbours, or 0 where there is none, and
+    counted. MapvoteError if none is left.
+    """
+    finite = np.isfinite(lonlat[:, :2]).all(axis=1)
+    at_zero = finite & (np.abs(lonlat[:, :2]) < _NO_FIX_DEG).all(axis=1)
+    no_fix = np.zeros(len(lonlat), dtype=np.bool_) if status is None else status < 0
+    keep = finite & ~at_zero & ~no_fix
+    if not keep.all():
+        what = "%s: %d of %d fixes are left out: %d by their status, %d at latitude 0, longitude 0, %d without a place"
+        log.warning(what, where, (~keep).sum(), len(keep), no_fix.sum(), (at_zero & ~no_fix).sum(), (~finite).sum())
+    if not keep.any():
+        raise MapvoteError(f"{where}: none of its {len(keep)} fixes is one; choose another prior, or --prior none")
+    place = np.array(lonlat[keep], dtype=np.float64)
+    high = np.isfinite(place[:, 2])
+    if not high.all():
+        how = "interpolated" if high.any() else "taken as 0 m: only the map can tell them"
+        log.warning("%s: %d of %d fixes have no altitude; theirs are %s", where, (~high).sum(), len(high), how)
+        at = np.arange(len(place))
+        place[:, 2] = np.interp(at, at[high], place[high, 2]) if high.any() else 0.0
+    return keep, place
 
 
 def yaw_from_track(T: F64) -> F64:

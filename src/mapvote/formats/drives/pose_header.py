@@ -1,0 +1,126 @@
+"""What the header of a table of poses says: which column is which, and in which unit.
+
+Headers of EuRoC (``#timestamp [ns], p_RS_R_x [m], .., q_RS_w [], q_RS_x []``), of ``rostopic echo -p``
+(``%time,field.pose.pose.position.x``), of TUM files with a comment, of CSV. Whatever order they name is obeyed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_AXES = {"x": "x|east|easting", "y": "y|north|northing", "z": "z|up|altitude|alt|height"}
+_PLACE = r"(?:.*_)?(?:position|pos|translation|trans|location|loc)(?:_[a-z]+)*?_?"
+_TURN = r"(?:.*_)?(?:quaternion|quat|orientation|ori|rotation|rot)(?:_[a-z]+)*?_?"
+_ROLES = [
+    *((axis, rf"(?:utm_?|map_?|world_?|enu_?)?(?:{names})|t_?{axis}|p{axis}|p(?:_[a-z]+)*_{axis}|{_PLACE}{axis}")
+      for axis, names in _AXES.items()),
+    *((f"q{axis}", rf"q_?{axis}|q(?:_[a-z]+)*_{axis}|{_TURN}{axis}") for axis in "xyzw"),
+    *((angle, rf"(?:.*_)?{angle}") for angle in ("roll", "pitch", "yaw")),
+    ("heading", "(?:.*_)?(?:heading|azimuth|course)"),
+    ("down", "down"),
+    ("latitude", "(?:.*_)?lat(?:itude)?"),
+    ("longitude", "(?:.*_)?(?:lon|lng|long|longitude)"),
+    ("status", "(?:.*_)?status"),
+    ("nanoseconds", "(?:.*_)?(?:nsecs?|nanosecs?|nanoseconds)"),
+    ("stamp", "header_stamp(?:_secs?|_seconds)?"),
+    ("time", "(?:ros|gps|unix)?_?(?:timestamp|time|stamp)|t|secs?|seconds"),
+]  # fmt: skip
+"""Roles and what names them, in the order in which they are tried."""
+_NOT_A_POSE = re.compile(
+    r"(?:^|_)(?:v|vel|velocity|twist|linear|angular|acc|acceleration|bias|b|cov|covariance)(?:_|\d|$)"
+)
+_UNITS = {
+    "m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048,
+    "rad": 1.0, "radian": 1.0, "radians": 1.0, "deg": 0.017453292519943295, "degree": 0.017453292519943295,
+    "degrees": 0.017453292519943295, "s": 1e9, "sec": 1e9, "seconds": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0,
+}  # fmt: skip
+"""Metres, radians or nanoseconds in one."""
+_LEAST_NAMED = 3
+"""Roles that make a line a header."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a table."""
+
+    index: int
+    name: str
+    """As the header has it."""
+    unit: str
+    """"deg" of "yaw [deg]" or of "yaw_deg"; "" without one."""
+
+    @property
+    def scale(self) -> float | None:
+        """Metres, radians or nanoseconds in one; None if the header names no unit."""
+        return _UNITS.get(self.unit)
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The line of a table that names its columns."""
+
+    line: int
+    """From 1."""
+    names: tuple[str, ...]
+    columns: dict[str, Column]
+    """By role: x, y, z, qx, .., roll, .., latitude, time."""
+
+
+def split_row(line: str) -> list[str]:
+    """The values of one line, between commas, semicolons, tabs or blanks; quotes are taken off."""
+    text = line.strip().replace(";", ",").replace("\t", ",")
+    words = text.split(",") if "," in text else text.split()
+    return [word.strip().strip("\"'").strip() for word in words]
+
+
+def find_header(lines: Sequence[str]) -> Header | None:
+    """The last line before the first row of numbers that names at least three columns; comments may do so. None if no
+    line does."""
+    found = None
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        words = split_row(line)
+        if words and _is_number(words[0]):
+            break
+        header = _header_of(number, line)
+        found = header or found
+        if header is None and not line.lstrip().startswith(("#", "%", "//")):
+            break
+    return found
+
+
+def _header_of(number: int, line: str) -> Header | None:
+    text = re.sub(r"\s+([\[(])", r"\1", line.lstrip("\ufeff#%/ \t"))
+    names = split_row(text)
+    columns: dict[str, Column] = {}
+    for index, name in enumerate(names):
+        role, unit = _role(name)
+        if role and role not in columns:
+            columns[role] = Column(index, name, unit)
+    if "stamp" in columns:  # of the header: when it was measured, not when it was received
+        columns["time"] = columns.pop("stamp")
+    return Header(number, tuple(names), columns) if len(columns) >= _LEAST_NAMED else None
+
+
+def _role(name: str) -> tuple[str, str]:
+    """(the role of a column or "", the unit that its name tells)."""
+    bracket = re.search(r"[\[(]([^\])]*)[\])]", name)
+    unit = bracket.group(1).strip().lower() if bracket else ""
+    word = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name).lower()).strip("_").removeprefix("field_")
+    last = word.rpartition("_")
+    if (not unit and last[0] and last[2] in _UNITS and last[2] not in ("s", "m")) or re.fullmatch(r".+_[ms]", word):
+        word, unit = last[0], last[2]
+    if _NOT_A_POSE.search(word):
+        return "", ""
+    return next((role for role, pattern in _ROLES if re.fullmatch(pattern, word)), ""), unit
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
