@@ -26,6 +26,7 @@ from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
+from mapvote.formats.maps.las import beside_its_box
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.marked_points import MarkedPoints
 from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of
@@ -201,14 +202,25 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
     try:
         if not is_map_folder(path):
             sieve = MarkedPoints()
-            findings, made = examine_points(str(path), joined(sieve.without(stream_cloud(path))))
-            return in_order([*findings, *(Finding("note", line) for line in sieve.told())]), made
+            cloud = joined(sieve.without(stream_cloud(path)))
+            findings, made = examine_points(str(path), cloud)
+            told = [Finding("note", line) for line in sieve.told()]
+            return in_order([*findings, *_check_box(path, cloud.points), *told]), made
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
     return in_order(
         [*check_cloud(tile_by_tile(point_map), classified_ground(point_map)), *check_map(point_map)]
     ), point_map
+
+
+def _check_box(path: Path, points: NDArray[np.floating]) -> Iterator[Finding]:
+    """Do the points of a LAS file lie in the box that its header states?"""
+    if path.suffix.lower() in (".las", ".laz") and len(points):
+        beside = beside_its_box(path, points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64))
+        if beside:
+            what, _, mend = beside.partition(". ")
+            yield Finding("error", what, mend)
 
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:

@@ -94,12 +94,43 @@ def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
     others = tuple(name for name in other_fields(head.dimensions) if name not in (*FLAGS, *"XYZ"))
     times = "" if "gps_time" not in head.dimensions else "adjusted standard" if head.adjusted_time else "week"
     done = 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for points, fields in pieces:
         done += len(points)
+        low, high = np.fmin(low, points.min(axis=0, initial=np.inf)), np.fmax(high, points.max(axis=0, initial=-np.inf))
         yield Cloud(points, others, frame, fields, times)
     _check_whole(path, head.promised, done)
+    beside = beside_its_box(path, low, high)
+    if beside:
+        log.warning("%s: %s", path, beside)
     if not done:
         yield Cloud(np.empty((0, 3)), others, frame)
+
+
+_BOX = struct.Struct("<6d"), 179
+"""Highest and lowest x, y, z of a LAS header, and where they stand in it."""
+
+
+def beside_its_box(path: Path, low: F64, high: F64) -> str:
+    """How far the points from ``low`` (3,) to ``high`` (3,) lie beside the box that the file's header states; "" if
+    they share a part of it, or if it states none. So an offset shows that was lost."""
+    layout, start = _BOX
+    with path.open("rb") as file:
+        file.seek(start)
+        numbers = file.read(layout.size)
+    if len(numbers) < layout.size or not np.isfinite(low).all():
+        return ""
+    box = np.array(layout.unpack(numbers)).reshape(3, 2)
+    stated_high, stated_low = box[:, 0], box[:, 1]
+    stated = bool(np.isfinite(box).all()) and bool((stated_high > stated_low).any())
+    margin_m = 1.0 + (high - low)
+    if not stated or not ((low > stated_high + margin_m) | (high < stated_low - margin_m)).any():
+        return ""
+    x, y, z = (stated_low + stated_high - low - high) / 2.0
+    return (
+        f"the points lie beside the box of the file's header: {x:+.2f}, {y:+.2f}, {z:+.2f} m would bring them into it. "
+        "Was the header's offset lost? Write it anew; if the points are right, the box is stale (lasinfo -repair)"
+    )
 
 
 def _frame(where: str, head: Head) -> MapFrame:
