@@ -221,7 +221,7 @@ def vote(
             if cuts and (poses is not None or trust_prior):
                 raise MapvoteError("vote: --cuts goes with neither --poses nor --trust-prior")
             if cuts:
-                _vote_in_cuts(drive, point_map, settings, every_m, _Outlets(out, send, key))
+                _vote_in_cuts(drive, point_map, settings, every_m, _Outlets(out, send, key, unchecked))
                 return
             ballot, report = _drive_once(drive, point_map, settings, trust_prior, unchecked)
     data = encode(ballot)
@@ -262,6 +262,8 @@ class _Outlets(NamedTuple):
     folder: Path | None
     url: str | None
     key: str | None
+    unchecked: bool
+    """Whether errors of the drive are warnings."""
 
 
 def _vote_in_cuts(drive: Drive, point_map: PointMap, settings: Settings, every_m: float, outlets: _Outlets) -> None:
@@ -271,7 +273,7 @@ def _vote_in_cuts(drive: Drive, point_map: PointMap, settings: Settings, every_m
     from mapvote.formats.atomic import write_whole
     from mapvote.vehicle import Cuts, vehicle_on, vote_in_stretches
 
-    with usable_drives([drive]) as (looked,), progress("voting") as tell:
+    with usable_drives([drive], unchecked=outlets.unchecked) as (looked,), progress("voting") as tell:
         vehicle = vehicle_on(looked, point_map, settings)
         closed = list(vote_in_stretches(looked, vehicle, Cuts(length_m=every_m), tell))
     for drive_id, written in closed:

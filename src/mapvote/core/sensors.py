@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+"""Axes of a sensor whose points lie in its own frame."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
@@ -24,6 +27,9 @@ class Sensor:
     """False: the beams do not lie on rings (solid-state, non-repeating); ``elevations_deg`` is then an even grid."""
     blind_sectors_deg: tuple[tuple[float, float], ...] = ()
     """Azimuths (from, to) where the vehicle itself, or the sensor's window, hides everything."""
+    azimuth_axes: tuple[tuple[float, float, float], ...] = UPRIGHT
+    """Forward, to which it looks in the middle of a revolution, left, and up, about which it turns, in the frame of the
+    points: other ones where its points were turned. Points without times get them by azimuths in these axes."""
 
     @property
     def beams(self) -> int:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy
+from numpy.typing import NDArray
 
 from mapvote.core.geometry import exp
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.formats.drives.trajectory import read_trajectory
 from mapvote.formats.geo.frame import sound_fixes
 
@@ -17,7 +19,7 @@ N = 12
 T = np.array([exp(k * np.array([0.9, 0, 0.01, 0.002, 0.001, 0.12])) for k in range(N)])
 Q = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
 EULER = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")
-VALUES: dict[str, F64] = {
+VALUES: dict[str, NDArray[Any]] = {
     "ns": 1_700_000_000_000_000_000 + np.arange(N) * 10**8,
     "s": np.arange(N) * 0.1,
     "x": T[:, 0, 3], "y": T[:, 1, 3], "z": T[:, 2, 3], "mm": 1000.0 * T[:, 0, 3],

@@ -19,7 +19,13 @@ from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
 from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
-from mapvote.formats.drives.sensor_estimate import MEASURED_SCANS, UNKNOWN, estimate_sensor, rate_of_first
+from mapvote.formats.drives.sensor_estimate import (
+    MEASURED_SCANS,
+    UNKNOWN,
+    estimate_sensor,
+    rate_of_first,
+    turning_about,
+)
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 from mapvote.formats.listing import entry
@@ -251,6 +257,9 @@ def make_drive(
         if not 0.1 <= rate_hz <= 100:
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
         sensor = replace(sensor, rate_hz=rate_hz)
+    T_map_lidar = None if T_map_lidar_prior is None else T_map_lidar_prior[chosen]
+    if options.motion_compensated is False and T_map_lidar is not None:
+        sensor = turning_about(sensor, T_map_lidar, read_scan(int(chosen[len(chosen) // 2]), sensor))
 
     return Drive(
         path=path,
@@ -259,7 +268,7 @@ def make_drive(
         sensor=sensor,
         stamps_ns=stamps_ns[chosen],
         read_scan=lambda i: read_scan(int(chosen[i]), sensor),
-        T_map_lidar_prior=None if T_map_lidar_prior is None else T_map_lidar_prior[chosen],
+        T_map_lidar_prior=T_map_lidar,
         prior_sigma_m=options.prior_sigma_m,
         prior_sigma_deg=options.prior_sigma_deg,
         T_base_lidar=mount_of(options, T_base_lidar, where),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.core.brightness import unit_intensity
 from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
-from mapvote.core.sensors import Sensor
+from mapvote.core.sensors import UPRIGHT, Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
 from mapvote.formats.drives.point_times import (
     ANOTHER,
@@ -155,6 +155,8 @@ class PointReader:
         self._refuse_known(where, found)
         if self.rules.motion_compensated is False:
             rate_hz = self._turning_rate_hz(where, sensor)
+            if sensor.azimuth_axes != UPRIGHT:
+                points = np.ascontiguousarray(points @ np.array(sensor.azimuth_axes).T, dtype=np.float32)
             time_s = spinning_time_s(points, rate_hz, clockwise=sensor.clockwise)
             return time_s, TimesTold("azimuth", f"from the azimuths, at {rate_hz:g} Hz")
         doubtful = bool(found.candidates) or any(refusal.varies for refusal in found.refused.values())

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapvote.core.mount import mount_of_prior
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Scan
 
@@ -112,6 +113,27 @@ def sensor_upright(sensor: Sensor, measured: bool, scan: Scan, lean_deg: float) 
     if lean_deg > 180.0 - _UPRIGHT_DEG:
         return replace(sensor, elevations_deg=tuple(-e for e in reversed(sensor.elevations_deg)))
     return sensor if lean_deg < _UPRIGHT_DEG else replace(sensor, rings=False)
+
+
+def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan) -> Sensor:
+    """The sensor with the axes in which azimuths tell times, by the mount that poses (n, 4, 4) state and one ``scan``.
+
+    A sensor that leans turns about its own z if its rings lie about that, else its points were turned, and it turns
+    about the vertical. It faces the way driven in the middle of a revolution.
+    """
+    mount = mount_of_prior(T_map_lidar)
+    if mount is None:
+        return sensor
+    if mount.lean_deg > _UPRIGHT_DEG:
+        first = scan.by_lidar()[0][1]
+        found = estimate_sensor([first], sensor.rate_hz)
+        level = estimate_sensor([mount.in_steps().scan(first)], sensor.rate_hz)
+        known = level.sensor.name in SENSORS and found.sensor.name not in SENSORS
+        rings = found.sensor.rings and found.on_rings >= _SURE and not contradiction(sensor, first)
+        if rings and not known:
+            return sensor
+    forward, left, up = mount.in_steps().C[:3, :3].tolist()
+    return replace(sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
 
 
 def _angles(scan: Scan) -> tuple[F64, F64, F64]:
