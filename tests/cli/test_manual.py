@@ -54,7 +54,7 @@ def test_a_shell_can_complete(shell: str) -> None:
 
 def test_drive_options_are_those_of_open_drive_for_every_verb_that_takes_a_drive() -> None:
     assert set(inspect.signature(open_drive).parameters) == {"path", "said"}
-    assert set(DRIVE_OPTIONS) | {"vehicle", "frame"} == set(SaidOfDrive.__annotations__)
+    assert set(DRIVE_OPTIONS) | {"vehicle", "frame", "as_live"} == set(SaidOfDrive.__annotations__)
     for verb in ("build", "vote", "doctor"):
         assert {p.name for p in get_command(app).commands[verb].params} >= set(DRIVE_OPTIONS)  # type: ignore[attr-defined]
 

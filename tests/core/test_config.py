@@ -46,5 +46,5 @@ def test_the_paper_cases_by_number_and_ours_by_name() -> None:
     assert choose_case(Settings(), "surfaces").voting.method == "surfaces"
     second = choose_case(Settings(), "2").voting
     assert (second.method, second.weighted, second.two_stage, second.skip_tall_cells) == ("paper", False, True, False)
-    with pytest.raises(MapvoteError, match="choose surfaces or one of 1, 2, 3, 4, 5"):
+    with pytest.raises(MapvoteError, match="choose one of paper, surfaces, 1, 2, 3, 4, 5"):
         choose_case(Settings(), "6")

@@ -125,7 +125,9 @@ def drive(
     parameter: Annotated[
         list[str] | None, typer.Option("-p", "--param", metavar="NAME:=VALUE", help="use_sim_time:=true")
     ] = None,
-    ros_args: Annotated[bool, typer.Option("--ros-args", hidden=True)] = False,
+    ros_args: Annotated[
+        bool, typer.Option("--ros-args", hidden=True, help="begins options of ROS 2; changes nothing")
+    ] = False,
     config: Config = None,
 ) -> None:
     """Vote while driving, from ROS 2 topics. A ballot closes every 2 km, every 10 minutes and after 2 minutes at rest.
