@@ -97,7 +97,7 @@ def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_
     write_map(map_from_points(street(1)), tmp_path / "map")
     for folder in ("live", "offline"):
         (tmp_path / folder).mkdir()
-    play = f"play {tmp_path}/bag --domain {domain} --rate 0.5 --wait 600"
+    play = f"play {tmp_path}/bag --domain {domain} --rate 0.2 --wait 600"
     player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
     drive = f"--map {tmp_path}/map --vehicle car --name day --every-m 12"
     try:

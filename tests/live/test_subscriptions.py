@@ -18,12 +18,13 @@ from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr, matrix_of
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.road_map import OneMap
 from mapvote.live.service import Plan, run
-from mapvote.live.subscriptions import Clocks, Cloud, Subscriptions, Sweeps
+from mapvote.live.subscriptions import Clocks, Subscriptions
+from mapvote.live.sweeps import Cloud, Packets, Sweeps, direction_of
 from streets import drive_along, path, street
 
 pytest.importorskip("cyclonedds")
@@ -44,6 +45,71 @@ def test_clouds_of_one_revolution_are_one_scan_in_the_order_of_lidars_however_th
     assert joined(*left_out) == [[(0, 0), (1, 2)], [(0, 100)], [(0, 200), (1, 202)]], "it holds no other back"
     clouds = [(lidar, ms + 2 * lidar) for lidar in (0, 1) for ms in (0, 100, 200)]
     assert joined(*clouds, together=6) == [[(0, ms), (1, ms + 2)] for ms in (0, 100, 200)], "by a busy process"
+
+
+def sector(start_deg: float, width_deg: float, ns: int, seed: int = 0) -> Cloud:
+    """A cloud of points between two azimuths, counter-clockwise from the first."""
+    azimuth = np.radians(start_deg + width_deg * np.linspace(0.0, 1.0, 400))
+    r = np.random.default_rng(seed).uniform(5.0, 30.0, 400)
+    points = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.ones(400)]).astype(np.float32)
+    return Cloud(0, ns, ns, from_cdr(CLOUD, cloud_message(Scan(ns, points))))
+
+
+@pytest.mark.parametrize(("start_deg", "step_deg"), [(0.0, 36.0), (170.0, -36.0), (-90.0, 72.0), (11.0, 20.0)])
+def test_packets_of_a_part_of_a_revolution_are_joined_to_whole_ones(start_deg: float, step_deg: float) -> None:
+    packets, per_turn = Packets(), round(360.0 / abs(step_deg))
+    out = []
+    for k in range(5 * per_turn):
+        width = abs(step_deg)
+        begin = start_deg + k * step_deg - (width if step_deg < 0 else 0.0)
+        out += packets.add(sector(begin, width, k * 10**7))
+    assert packets.is_packets
+    assert [len(scan.packets) for scan in out] == [per_turn] * 4
+    assert [scan.stamp_ns for scan in out] == [n * per_turn * 10**7 for n in range(4)]
+
+
+def test_clouds_that_wait_for_the_decision_are_released_after_a_pause() -> None:
+    packets = Packets()
+    first = sector(0.0, 90.0, 0)
+    assert packets.add(first, 5.0) == []
+    assert packets.after_pause(5.2) == []
+    assert packets.after_pause(5.4) == [first]
+    assert packets.after_pause(9.0) == []
+
+
+def test_lost_packets_cost_their_points_and_no_revolution() -> None:
+    packets = Packets()
+    out = [s for k in range(60) if k not in (23, 24, 41) for s in packets.add(sector(36.0 * k, 36.0, k * 10**7))]
+    assert [len(scan.packets) for scan in out] == [10, 10, 8, 10, 9]
+
+
+@pytest.mark.parametrize(("start_deg", "width_deg"), [(0.0, 360.0), (-60.0, 120.0), (-35.0, 70.0)])
+def test_whole_revolutions_and_lidars_that_look_ahead_are_no_packets(start_deg: float, width_deg: float) -> None:
+    packets = Packets()
+    clouds = [sector(start_deg, width_deg, k * 10**8, k) for k in range(12)]
+    out = [one for cloud in clouds for one in packets.add(cloud)]
+    assert (packets.is_packets, out) == (False, clouds)
+    middle, coverage = direction_of(clouds[0].message)
+    assert coverage == pytest.approx(width_deg / 360.0, abs=0.06)
+    assert width_deg == 360.0 or abs(middle) < 0.05
+
+
+def test_the_scan_of_packets_has_all_points_at_the_times_at_which_they_were_measured(domain: int) -> None:
+    chosen = Chosen((PublishedTopic(POINTS, CLOUD, 1, True, False),), None)
+    topics = Subscriptions(Network(domain), chosen, SENSORS["hdl32e"])
+    azimuth = np.linspace(0.0, 2 * np.pi, 3600, endpoint=False)
+    points = np.column_stack([9 * np.cos(azimuth), 9 * np.sin(azimuth), np.ones(3600)]).astype(np.float32)
+    time_s = np.linspace(0.0, 0.1, 3600, endpoint=False).astype(np.float32)
+    parts = []
+    for part in np.array_split(np.arange(3600), 10):
+        ns = START + round(1e9 * float(time_s[part[0]]))
+        message = cloud_message(Scan(ns, points[part], time_s[part] - time_s[part[0]]))
+        parts.append(Cloud(0, ns, ns, from_cdr(CLOUD, message)))
+    scan = topics._scan_of(Cloud(0, START, START, parts[0].message, tuple(parts)), SENSORS["hdl32e"])
+    assert np.array_equal(scan.points, points)
+    assert scan.time_s is not None
+    assert np.abs(scan.time_s - time_s).max() < 1e-6
+    assert scan.others == ()
 
 
 @pytest.mark.parametrize("damage", [{"w": 0.0}, {"x": np.nan}, {"w": np.inf}])

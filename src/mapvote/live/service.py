@@ -19,7 +19,8 @@ from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
 from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
-from mapvote.live.subscriptions import Cloud, Subscriptions
+from mapvote.live.subscriptions import Subscriptions
+from mapvote.live.sweeps import Cloud
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")

@@ -6,9 +6,9 @@ import logging
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,9 @@ from mapvote.live.frames import Frames
 from mapvote.live.log_lines import Repeated
 from mapvote.live.messages import BASE_FRAME, CLOCK, CLOUD, TF, from_cdr, matrix_of, stamp_ns, time_ns
 from mapvote.live.names import RosNames
+from mapvote.live.sweeps import Cloud, Packets, Sweeps
 
 log = logging.getLogger("mapvote.live")
-_SWEEP = 0.55
-"""Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
 _DEPTH = 200
 """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
 _POSES = 400
@@ -37,53 +36,6 @@ _OTHER_CLOCK_NS = 10**9
 """Stamps of clouds and poses that come together and differ by more are of two clocks."""
 _TOGETHER_NS = 500_000_000
 """Clouds and poses that are sent, or that arrive, within so long come together."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cloud:
-    """A PointCloud2 that arrived."""
-
-    lidar: int
-    stamp_ns: int
-    sent_ns: int
-    message: Any
-
-
-class Sweeps:
-    """Joins the clouds that several LiDARs measure within half a revolution to one scan."""
-
-    def __init__(self, lidars: int) -> None:
-        self._lidars, self._reach_ns = lidars, 0.55e8
-        self._open: list[Cloud] = []
-        self._firsts: deque[int] = deque(maxlen=20)
-        """Stamps of the first LiDAR, which give its period."""
-
-    @property
-    def step_s(self) -> float | None:
-        """Between two clouds of the first LiDAR (median), seconds; None before the third."""
-        return float(np.median(np.diff(sorted(self._firsts)))) * 1e-9 if len(self._firsts) > 2 else None
-
-    def add(self, clouds: Iterable[Cloud]) -> list[list[Cloud]]:
-        """Clouds that arrived together, in any order. Returns the scans that are whole by now, each in order of
-        LiDARs."""
-        out = []
-        for cloud in sorted(clouds, key=lambda cloud: cloud.stamp_ns):
-            if cloud.lidar == 0:
-                self._firsts.append(cloud.stamp_ns)
-                if len(self._firsts) > 2:
-                    self._reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
-            start_ns = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
-            apart = abs(cloud.stamp_ns - start_ns) > self._reach_ns or cloud.lidar in {c.lidar for c in self._open}
-            if self._open and apart:
-                out.append(self._closed())
-            self._open.append(cloud)
-            if len(self._open) == self._lidars:
-                out.append(self._closed())
-        return out
-
-    def _closed(self) -> list[Cloud]:
-        closed, self._open = sorted(self._open, key=lambda c: c.lidar), []
-        return closed
 
 
 class Clocks:
@@ -159,6 +111,7 @@ class Subscriptions:
         self._repeated = Repeated(log.warning)
         self._readers = [PointReader(one.topic, rules) for one in chosen.points]
         self._sweeps = Sweeps(len(chosen.points))
+        self._packets = [Packets() for _ in chosen.points]
         self._points, self._odometry = (
             [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
             for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
@@ -255,7 +208,14 @@ class Subscriptions:
                     clouds.append(Cloud(lidar, stamp_ns(message.header), sent_ns, message))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
         self.clouds += len(clouds)
-        return self._sweeps.add(clouds)
+        now_s = time.monotonic()
+        whole: list[Cloud] = []
+        for cloud in sorted(clouds, key=lambda cloud: cloud.stamp_ns):
+            with self._some_unusable(CLOUD):
+                whole += self._packets[cloud.lidar].add(cloud, now_s)
+        for packets in self._packets:
+            whole += packets.after_pause(now_s)
+        return self._sweeps.add(whole)
 
     def _add_frames(self, data: memoryview, *, fixed: bool) -> None:
         with self._some_unusable(TF):
@@ -287,7 +247,7 @@ class Subscriptions:
             del firsts[MEASURED_SCANS:]  # how many arrive together does not matter
             rate_hz = rate_of_first(np.array([cloud.stamp_ns for cloud in firsts]))
             model = replace(UNKNOWN, rate_hz=rate_hz)
-            read = [scan_from_point_cloud2(cloud.message, model, self._readers[0]) for cloud in firsts]
+            read = [self._scan_of(cloud, model) for cloud in firsts]
             found = estimate_sensor(read, rate_hz)
             self.sensor, self.sensor_told = found.sensor, found.told
         return self.sensor is not None
@@ -301,12 +261,27 @@ class Subscriptions:
         assert sensor is not None
         scans = []
         for cloud in clouds:
-            reader = self._readers[cloud.lidar]
-            reader.step_s = self._sweeps.step_s
-            scan = scan_from_point_cloud2(cloud.message, sensor, reader)
+            scan = self._scan_of(cloud, sensor)
             if cloud.lidar:
                 if mounts is None:
                     raise MapvoteError(f"no frame says where {self.lidar_frames[cloud.lidar]} sits")
                 scan = scan.seen_from(mounts[cloud.lidar])
             scans.append(scan)
         return scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
+
+    def _scan_of(self, cloud: Cloud, sensor: Sensor) -> Scan:
+        """The scan of one LiDAR, of its packets where it sends packets: one without a usable point is left out."""
+        reader = self._readers[cloud.lidar]
+        if not cloud.packets:
+            reader.step_s = self._sweeps.step_s
+            return scan_from_point_cloud2(cloud.message, sensor, reader)
+        stamps_ns = [packet.stamp_ns for packet in cloud.packets]
+        reader.step_s = float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else None
+        scans: list[Scan] = []
+        for number, packet in enumerate(cloud.packets):
+            try:
+                scans.append(scan_from_point_cloud2(packet.message, sensor, reader))
+            except MapvoteError:
+                if number + 1 == len(cloud.packets) and not scans:
+                    raise
+        return replace(Scan.sweep(cloud.stamp_ns, scans), others=())
