@@ -63,11 +63,18 @@ def _leaping() -> LocalisedDrive:
     return replace(drive, T_map_lidar=drive.T_map_lidar[order], T_prior=None)
 
 
+def _swapped() -> LocalisedDrive:
+    """Two halves of a drive in the wrong order: each is localised by itself."""
+    drive = _drive()
+    return replace(drive, T_map_lidar=np.roll(drive.T_map_lidar, N // 2, axis=0), T_prior=None)
+
+
 @pytest.mark.parametrize(
     ("drive", "named"),
     [
         (replace(_drive(), sure=np.arange(N) % 3 == 0), "have a sure place"),
         (_leaping(), "the localised path leaps"),
+        (_swapped(), "the localised path leaps once before scan 30"),
         (_prior(lambda T: T[np.random.default_rng(1).permutation(N)]), "way by the prior"),
         (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, yaw=np.pi / 2)), "attitude differs by 90 deg"),
         (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, roll=np.pi)), "attitude differs by 180 deg"),

@@ -28,11 +28,9 @@ class LocalisedRules:
     least_share: float = 0.5
     """Of the scans over the map's ground: so many have a sure place."""
     leap_mps: float = 70.0
-    """No vehicle is faster between two scans in turn ..."""
-    leap_m: float = 2.0
-    """... nor is a leap shorter than this, which a track that is corrected may move."""
-    most_leaps: float = 0.05
-    """Share of the steps that may be leaps: a track is moved where another place fits better."""
+    """No vehicle is faster between two sure scans ..."""
+    leap_m: float = 5.0
+    """... and a track that is corrected moves by less than this. One such leap is one too many."""
     way_m: float = 10.0
     """Ways are compared over so many metres, at least."""
     way_share: float = 0.25
@@ -109,14 +107,14 @@ def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRu
 
 
 def _leaps(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
-    """Steps between sure scans in turn that no vehicle drives."""
-    next_to = np.diff(found) == 1
+    """Steps from one sure scan to the next that no vehicle drives."""
     step_m = np.linalg.norm(np.diff(drive.T_map_lidar[found, :3, 3], axis=0), axis=1)
     step_s = np.diff(drive.stamps_ns[found]) * 1e-9
-    leaps = next_to & (step_m > rules.leap_m) & (step_m > rules.leap_mps * step_s)
-    if leaps.sum() >= 2 and leaps.sum() > rules.most_leaps * next_to.sum():
+    leaps = (step_m > rules.leap_m) & (step_m > rules.leap_mps * step_s)
+    if leaps.any():
         worst = int(np.argmax(np.where(leaps, step_m, 0.0)))
-        what = f"the localised path leaps {int(leaps.sum())} times, most before scan {found[worst + 1]} "
+        times = "once" if leaps.sum() == 1 else f"{int(leaps.sum())} times, most"
+        what = f"the localised path leaps {times} before scan {found[worst + 1]} "
         yield Finding("error", f"{what}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _MEND)
 
 
