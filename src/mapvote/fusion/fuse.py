@@ -33,7 +33,7 @@ from mapvote.fusion.distrust import contradictors, deniers
 from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
 from mapvote.fusion.gravity import Fallen, Remains, fall_across, fall_within, remains_of, remains_without_votes
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
-from mapvote.fusion.neighbour_noise import without_spilled
+from mapvote.fusion.neighbour_noise import without_spilled, without_spilled_in
 from mapvote.fusion.tile_vote import TileVote, by_voter, newest_votes, offered, one_each, silenced
 
 History = Callable[[], Sequence[TileVote]]
@@ -217,25 +217,27 @@ def _let_fall(
 ) -> tuple[Decision, Tile, int]:
     """(the decision, the tile ``edited`` by votes, without what falls, how many points that were)."""
     # From cells whose change waits nothing falls.
-    waits = np.zeros(CELLS, dtype=np.bool_)
-    waits[decided.pending.cells] = True
-    for cells in (decided.denied, reviewed):
-        if cells is not None:
-            waits |= cells.reshape(-1)
-    site = remains_of(tile, edited, decided.edits, np.flatnonzero(waits))
-    fell, missing = fall_within(tile.index, site)
+    waiting = [np.flatnonzero(cells) for cells in (decided.denied, reviewed) if cells is not None]
+    waits = np.unique(np.concatenate([decided.pending.cells, *waiting]))
+    decided = replace(decided, waits=waits)
+    if edited.points is tile.points and fallen is None:
+        return decided, edited, 0
+    left = remains_of(tile, edited, decided.edits, waits)
+    fell, missing = fall_within(tile.index, left)
     fell = fell if fallen is None else fell.joined(fallen)
-    decided = replace(decided, fell=fell, waits=np.flatnonzero(waits))
     if not len(fell.cells):
-        return (replace(decided, undecided=site) if missing else decided), edited, 0
+        return (replace(decided, undecided=left) if missing else decided), edited, 0
     plane = fell.plane()
     edited, deleted = delete_points(edited, plane)
-    site = replace(site, rest=site.rest & ~plane)
+    left = replace(left, rest=left.rest & ~plane)
     # A cell that the fall leaves empty is changed-empty; its points may be noise of a cell beside it.
+    emptied = fell.cells[left.rest.reshape(-1)[fell.cells] == 0]
     edits = decided.edits.copy()
-    edits.reshape(-1)[fell.cells[site.rest.reshape(-1)[fell.cells] == 0]] = int(CellState.CHANGED_EMPTY)
-    states = without_spilled(edits, tile, decided.votes) if len(decided.odds.cells) else edits
-    decided = replace(decided, states=states, edits=edits, undecided=site if missing else None)
+    edits.reshape(-1)[emptied] = int(CellState.CHANGED_EMPTY)
+    states = decided.states.copy()
+    told = without_spilled_in(emptied, edits, tile) if len(decided.odds.cells) else edits
+    states.reshape(-1)[emptied] = told.reshape(-1)[emptied]
+    decided = replace(decided, fell=fell, states=states, edits=edits, undecided=left if missing else None)
     return decided, edited, deleted
 
 

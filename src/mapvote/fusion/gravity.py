@@ -180,10 +180,11 @@ def _fall_in(
     # Groups that touch a deletion of this tile.
     corner, reach = (own[0].start, own[1].start), (gravity.touch_voxels, gravity.longest_cells)
     deleted = read_only(np.ascontiguousarray(window.deleted[own]))
-    _drop_touching(*window.shown, deleted, *corner, *window.lattice_corner, *reach, *window.memory, *window.found)
+    places = *corner, *window.lattice_corner, *reach, _ANYWHERE
+    _drop_touching(*window.shown, deleted, *places, *window.memory, *window.found)
     # Groups inside an object of which a part lies in this tile.
     for body in _bodies(window, own, gravity):
-        limits = body.tops, *body.corner, body.key, gravity.longest_cells
+        limits = read_only(body.tops), *body.corner, body.key, gravity.longest_cells
         _drop_inside(*window.shown, *limits, *window.memory, *window.found)
     fallen = {tile: window.fallen_in(tile) for tile in sites if window.words[window.slices_of(tile)].any()}
     # What leaves the tiles around is too long.
@@ -277,6 +278,8 @@ class _Body:
 
 
 _OUTSIDE = -(1 << 30)
+_ANYWHERE = np.empty((0, 0), dtype=np.int32)
+_ANYWHERE.flags.writeable = False
 
 
 def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iterator[_Body]:
@@ -348,18 +351,18 @@ def _seen_from(word: np.uint64, layers: int) -> np.uint64:
 @kernel
 def _drop_touching(
     rest: U64, holds: U64, base: I32, known: Bool, deleted: U64, row0: int, col0: int, lattice_row: int,
-    lattice_col: int, touch: int, longest: int, seen: U64, stays: U64, cells: I64, words: U64, asked: Bool,
-    fallen: U64, beside: I64,
+    lattice_col: int, touch: int, longest: int, nowhere: I32, seen: U64, stays: U64, cells: I64, words: U64,
+    asked: Bool, fallen: U64, beside: I64,
 ) -> None:  # fmt: skip
     """Into ``fallen`` and ``beside`` the groups that touch a voxel of ``deleted`` (256, 256) and that nothing holds.
 
     The other planes are of a window of tiles; ``known`` says which of them are shown. ``row0`` and ``col0`` are the
-    first cell of ``deleted`` in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. ``seen`` and ``stays``
-    mark the voxels of groups that were followed, and of those that are held; ``cells`` and ``words`` are memory for one
-    group. Into ``asked``, which has one tile more on every side, the tiles that would decide a group.
+    first cell of ``deleted`` in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. ``nowhere`` (0, 0):
+    groups need not be inside anything. ``seen`` and ``stays`` mark the voxels of groups that were followed, and of
+    those that are held; ``cells`` and ``words`` are memory for one group. Into ``asked``, which has one tile more on
+    every side, the tiles that would decide a group.
     """
     rows, cols = rest.shape
-    nowhere = base[:0, :0]
     for i in range(TILE_CELLS):
         for j in range(TILE_CELLS):
             if deleted[i, j] == 0:

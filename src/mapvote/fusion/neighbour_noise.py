@@ -16,13 +16,15 @@ from mapvote.core.columns import column_bits, flat_cells
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
+from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote, offered
 
 REACH_M = 0.45
 """How far about a point its plane is fitted, a voxel and a half: some eight points of a wall."""
 NEAR_M = 0.15
 """As far as noise carries, half a cell: what lies deeper in its cell belongs there."""
+_BESIDE = 2
+"""Cells around one whose points its planes are fitted to."""
 _ENOUGH = 6
 _FLAT = 3.0
 """A plane: as many points, whose variance is as many times as large along it as across it."""
@@ -41,6 +43,18 @@ def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
     told = states.copy()
     told.reshape(-1)[cells] = int(CellState.UNCHANGED_EMPTY)
     return told
+
+
+def without_spilled_in(cells: I64, states: U8, tile: Tile) -> U8:
+    """As :func:`without_spilled` of demolished surfaces alone, and of points in the flat ``cells`` (n,) or next to
+    them: states elsewhere are NO_VOTE."""
+    rows, cols = np.divmod(cells, TILE_CELLS)
+    near = np.full(states.shape, NO_VOTE, dtype=np.uint8)
+    for i in range(-_BESIDE, _BESIDE + 1):
+        for j in range(-_BESIDE, _BESIDE + 1):
+            at = (rows + i).clip(0, TILE_CELLS - 1), (cols + j).clip(0, TILE_CELLS - 1)
+            near[at] = states[at]
+    return without_spilled(np.where(near == int(CellState.CHANGED_EMPTY), near, np.uint8(NO_VOTE)), tile, ())
 
 
 def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
