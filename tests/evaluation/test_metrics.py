@@ -23,6 +23,7 @@ from mapvote_lab.evaluation.scores import (
     PAPER_SCORES,
     UNSCORED,
     MapJudge,
+    ObjectRests,
     determined_share,
     map_obstacles,
     reliability,
@@ -96,6 +97,22 @@ def test_map_scores_of_a_perfect_update_of_none_of_damage_and_of_nothing() -> No
     assert (broken.valid_deleted, broken.added_false) == (0.5, 1.0)
     empty = np.zeros((0, 3))
     assert set(asdict(MapJudge(empty, empty, empty, empty).score(empty)).values()) == {0}, "0, not NaN"
+
+
+def test_the_rest_of_each_object_is_measured_and_a_visible_one_counted() -> None:
+    """Two demolished houses of 100 points, and a built one of ten samples."""
+    gone = np.column_stack([np.arange(200) * 1.0, np.zeros(200), np.ones(200)])
+    added = np.column_stack([np.arange(10) * 1.0, np.full(10, 50.0), np.ones(10)])
+    judge = MapJudge(gone, np.zeros((0, 3)), added, gone)
+    objects = [
+        ("demolished", lambda points: points[:, 0] < 100),
+        ("demolished", lambda points: points[:, 0] >= 100),
+        ("built", lambda points: points[:, 1] > 40),
+        ("demolished", lambda points: np.zeros(len(points), dtype=np.bool_)),
+    ]
+    rests = judge.rests(np.concatenate([gone[:21], gone[100:120], added[:7]]), objects)
+    assert rests == ObjectRests(left=(0.21, 0.2), added=(0.7,), visible=1), "20 points are not more than 20"
+    assert judge.rests(gone[:3], objects).visible == 0, "3 % are not more than 5"
 
 
 def test_an_object_is_found_by_half_of_its_cells_and_inventions_are_measured() -> None:

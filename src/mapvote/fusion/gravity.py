@@ -201,8 +201,10 @@ class _Window:
         self.base, self.deleted = base, deleted
         self.shown = read_only(rest), read_only(holds), read_only(base), known
         most = int(np.bitwise_count(rest & ~holds).sum()) + 1
-        self.words, self.asked = np.zeros_like(rest), np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
-        self.memory = np.zeros_like(rest), np.zeros_like(rest), np.empty(most, np.int64), np.empty(most, np.uint64)
+        self.words = np.zeros(rest.shape, np.uint64)
+        self.asked = np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
+        seen, stays = (np.zeros(rest.shape, np.uint64) for _ in range(2))
+        self.memory = seen, stays, np.empty(most, np.int64), np.empty(most, np.uint64)
         self.beside = np.full(rest.shape, _NOWHERE)
         self.found = self.asked, self.words, self.beside
 
@@ -288,30 +290,29 @@ def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iter
     rows, cols = np.nonzero(window.deleted)
     if not len(rows):
         return
-    # Objects among the deleted cells.
-    row0, col0 = int(rows.min()), int(cols.min())
-    emptied = np.zeros((int(rows.max()) - row0 + 1, int(cols.max()) - col0 + 1), dtype=np.bool_)
-    emptied[rows - row0, cols - col0] = True
-    wide = np.ones((2 * gravity.reach_cells + 1,) * 2, dtype=np.bool_)
-    near = scipy.ndimage.binary_dilation(emptied, wide)
-    objects = np.where(emptied, scipy.ndimage.label(near, np.ones((3, 3)))[0], 0)
+    # Objects among the deleted cells, each by row, then column.
+    labels, stack = np.zeros(window.deleted.shape, dtype=np.int32), np.empty(len(rows), dtype=np.int64)
+    _label_near(rows, cols, read_only(window.deleted), 2 * gravity.reach_cells + 1, labels, stack)
+    number = labels[rows, cols]
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order], prepend=0))
+    rows, cols = rows[order], cols[order]
+    low, high = (np.stack([of.reduceat(part, starts) for part in (rows, cols)]) for of in (np.minimum, np.maximum))
     # Those of this tile that are large enough for an inside, and not too long.
-    boxes = scipy.ndimage.find_objects(objects)
-    here = objects[
-        tuple(slice(max(s.start - o, 0), max(s.stop - o, 0)) for s, o in zip(own, (row0, col0), strict=True))
-    ]
-    for number in np.unique(here[here > 0]).tolist():
-        box = boxes[number - 1]
-        height, width = (side.stop - side.start for side in box)
-        if max(height, width) > gravity.longest_object_cells or height * width < gravity.inside_cells:
+    size = high - low + 1
+    first = np.array([[side.start] for side in own])
+    here = ((high >= first) & (low < first + TILE_CELLS)).all(axis=0)
+    fits = here & (size.max(axis=0) <= gravity.longest_object_cells) & (size.prod(axis=0) >= gravity.inside_cells)
+    margin = 2 * gravity.reach_cells + gravity.touch_voxels
+    for k in np.flatnonzero(fits).tolist():
+        mine = slice(starts[k], starts[k + 1] if k + 1 < len(starts) else None)
+        r, c = rows[mine], cols[mine]
+        if not ((r >= first[0]) & (r < first[0] + TILE_CELLS) & (c >= first[1]) & (c < first[1] + TILE_CELLS)).any():
             continue
-        r, c = np.nonzero(objects[box] == number)
-        r, c = r + box[0].start + row0, c + box[1].start + col0
-        margin = 2 * gravity.reach_cells + gravity.touch_voxels
-        if window.shows((int(r.min()) - margin, int(c.min()) - margin), (int(r.max()) + margin, int(c.max()) + margin)):
-            body = _body_of(window, r, c, gravity)
-            if body is not None:
-                yield body
+        (r0, c0), (r1, c1) = (low[:, k] - margin).tolist(), (high[:, k] + margin).tolist()
+        body = _body_of(window, r, c, gravity) if window.shows((r0, c0), (r1, c1)) else None
+        if body is not None:
+            yield body
 
 
 def _body_of(window: _Window, rows: I64, cols: I64, gravity: Gravity) -> _Body | None:
@@ -346,6 +347,29 @@ def _seen_from(word: np.uint64, layers: int) -> np.uint64:
     if layers >= 64 or layers <= -64:
         return np.uint64(0)
     return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
+
+
+@kernel
+def _label_near(rows: I64, cols: I64, deleted: U64, reach: int, labels: I32, stack: I64) -> None:
+    """Into ``labels``, zeros, a number from 1 on for each object of the cells (n,) in which ``deleted`` has a bit: they
+    are of one object if they are at most ``reach`` rows and columns apart. ``stack`` (n,): memory."""
+    height, width = deleted.shape
+    count = 0
+    for k in range(len(rows)):
+        if labels[rows[k], cols[k]]:
+            continue
+        count += 1
+        labels[rows[k], cols[k]] = count
+        stack[0], n = rows[k] * width + cols[k], 1
+        while n > 0:
+            n -= 1
+            r, c = stack[n] // width, stack[n] % width
+            for a in range(max(r - reach, 0), min(r + reach + 1, height)):
+                for b in range(max(c - reach, 0), min(c + reach + 1, width)):
+                    if deleted[a, b] and not labels[a, b]:
+                        labels[a, b] = count
+                        stack[n] = a * width + b
+                        n += 1
 
 
 @kernel

@@ -136,12 +136,21 @@ def report_page(
     facts = [
         (story.found, "changed objects found"),
         (str(len(story.objects.false_m2)), "changes of 1 m² or more where nothing changed"),
+        *_rest_facts(evaluation.result),
         (f"{story.deleted:,}", "points deleted from the map"),
         (f"{story.added:,}", "points added to it"),
         (f"{100 * error:.1f} cm", "median localisation error"),
         (f"{sent / 1000:.0f} kB", "sent by each vehicle"),
     ]
     return page(title, lead, facts, sections)
+
+
+def _rest_facts(result: EvaluationResult) -> list[tuple[str, str]]:
+    """How many demolished objects are still to be seen in the map."""
+    rests = result.cases[CASE].rests
+    if rests is None or not rests.left:
+        return []
+    return [(f"{rests.visible} of {len(rests.left)}", "demolished objects with a visible rest (> 5 %, > 20 points)")]
 
 
 def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSection:

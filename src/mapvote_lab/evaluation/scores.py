@@ -182,6 +182,21 @@ class MapScores(msgspec.Struct, frozen=True, kw_only=True):
     added_points: int
 
 
+VISIBLE_SHARE, VISIBLE_POINTS = 0.05, 20
+"""A demolished object has a visible rest if more than this share of its points, and more points than this, are left."""
+
+
+class ObjectRests(msgspec.Struct, frozen=True):
+    """What the update made of the points of each true object, in the order of the truth."""
+
+    left: tuple[float, ...]
+    """Per demolished object of which the map held a point: share of its points left."""
+    added: tuple[float, ...]
+    """Per built object of which a ray could reach something: share of its reachable surface added."""
+    visible: int
+    """Demolished objects with a visible rest."""
+
+
 class MapJudge:
     """Compares maps with noise-free surface samples of the two worlds; what the old map is worth is asked once.
 
@@ -226,6 +241,23 @@ class MapJudge:
             new_samples=len(self._added),
             added_points=len(fresh),
         )
+
+    def rests(self, new_points: F64, objects: Sequence[tuple[str, Callable[[F64], Bool]]]) -> ObjectRests:
+        """``new_points`` as for :meth:`score`; ``objects``: ("built" or "demolished", which of points (n, 3) lie in
+        it)."""
+        survived, _ = same_rows(self._old, new_points)
+        reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
+        left, added, visible = [], [], 0
+        for kind, inside in objects:
+            if kind == "demolished":
+                own = survived[self.stale & inside(self._old)]
+                share = ratio(np.count_nonzero(own), len(own))
+                left += [share] * bool(len(own))
+                visible += int(share > VISIBLE_SHARE and np.count_nonzero(own) > VISIBLE_POINTS)
+            else:
+                own = reached[inside(self._added)]
+                added += [ratio(np.count_nonzero(own), len(own))] * bool(len(own))
+        return ObjectRests(tuple(left), tuple(added), visible)
 
 
 def _distance(points: F64, surface: cKDTree) -> F64:
@@ -345,6 +377,8 @@ class CaseResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """By the further truths of ``evaluation/truths.py``."""
     map: MapScores | None = None
     """None (not in the JSON) where no map was edited: the yardsticks only decide cells."""
+    rests: ObjectRests | None = None
+    """As ``map``."""
     bytes_per_vehicle: list[int]
     """Of each ballot; empty for a yardstick, which sends none."""
     state_bytes_per_vehicle: list[int] | None = None

@@ -23,6 +23,7 @@ from mapvote_lab.evaluation.scores import (
     ByClass,
     CaseResult,
     EvaluationResult,
+    ObjectRests,
     Scores,
     ratio,
 )
@@ -234,14 +235,23 @@ def _map_table(result: EvaluationResult) -> Iterator[Sheet]:
                     _percent(scores.added_false_scored, 2),
                     f"{sum(objects.found)} of {len(objects.found)}",
                     f"{len(false)}, largest {false[0]:.1f} m²" if false else "none",
+                    *_rests(entry.rests),
                 ]
             )
     headings = [
         "", "stale deleted", "valid deleted", "new surface added", "added on no surface", "in scored cells",
-        "objects found", "false objects",
+        "objects found", "false objects", "visible rests", "most left", "least added",
     ]  # fmt: skip
     if rows:
         yield Sheet("The updated map", headings, rows)
+
+
+def _rests(rests: ObjectRests | None) -> list[str]:
+    """Demolished objects with a visible rest, the largest share left of one, the smallest share added of a new one."""
+    if rests is None:
+        return ["", "", ""]
+    most = _percent(max(rests.left)) if rests.left else ""
+    return [f"{rests.visible} of {len(rests.left)}", most, _percent(min(rests.added)) if rests.added else ""]
 
 
 def _localisation_tables(result: EvaluationResult) -> Iterator[Sheet]:

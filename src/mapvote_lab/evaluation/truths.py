@@ -352,8 +352,10 @@ class Jury:
 
     def of_update(self, outcome: CaseOutcome, sizes: Sequence[int] = (), state_sizes: Sequence[int] = ()) -> CaseResult:
         """The same, what became of the map's points, and the bytes of each ballot and of its votes alone."""
-        points = self.points.score(map_obstacles(outcome.updated))
-        judged = self.of_states(outcome.states, outcome.vehicle_states, points)
+        updated = map_obstacles(outcome.updated)
+        judged = self.of_states(outcome.states, outcome.vehicle_states, self.points.score(updated))
+        insides = [(one["kind"], partial(self.truth.grid.value_at, one["cells"])) for one in self._objects]
+        judged = replace(judged, rests=self.points.rests(updated, insides))
         return replace(judged, bytes_per_vehicle=list(sizes), state_bytes_per_vehicle=list(state_sizes))
 
     def ceilings(self) -> dict[str, Scores]:
