@@ -12,11 +12,10 @@ from mapvote.config import MovingSettings, VotingSettings
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F32, F64, Bool
+from mapvote.core.types import F32, F64, U16, Bool
 from mapvote.perception.moving_objects import (
     MOVERS,
-    NOTHING,
-    U16,
+    NO_RETURN,
     LookCounts,
     Movers,
     MovingFilter,
@@ -240,7 +239,7 @@ def aimed(offsets: F32) -> tuple[F32, np.ndarray, np.ndarray]:
 
 def plain_image(points: F64, origin: F64) -> U16:
     rho, a, b = aimed((points - origin).astype(np.float32))
-    image = np.full((PIXELS.turns, PIXELS.slopes), NOTHING)
+    image = np.full((PIXELS.turns, PIXELS.slopes), NO_RETURN)
     seen = (rho >= 0.5) & (b >= 0) & (b < PIXELS.slopes)
     range_2mm = np.minimum(rho * np.float32(500.0) + np.float32(0.5), 65534).astype(np.uint16)
     for aside in (-1, 0, 1):
@@ -256,10 +255,10 @@ def plain_look(offsets: F32, image: U16, counts: LookCounts) -> list[int]:
         if rho >= 0.5 and b >= around and b + around < PIXELS.slopes:
             below, above = image[a, b - around : b].min(), image[a, b + 1 : b + around + 1].min()
             r, own = int(min(below, above, image[a, b])), round(float(rho) * 500.0)
-            if r != NOTHING and r > own + 250:
+            if r != NO_RETURN and r > own + 250:
                 counts.free[i] += 1
-                counts.sides[i] |= (below < NOTHING) + 2 * (above < NOTHING)
-            elif r != NOTHING and r >= own - 250:
+                counts.sides[i] |= (below < NO_RETURN) + 2 * (above < NO_RETURN)
+            elif r != NO_RETURN and r >= own - 250:
                 counts.hit[i] += 1
         free, hit = counts.free[i], counts.hit[i]
         if not ((free == 0 and hit >= ENOUGH) or (hit == 0 and free >= ENOUGH and counts.sides[i] == 3)):

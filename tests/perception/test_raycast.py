@@ -22,7 +22,7 @@ from mapvote.formats import open_drive
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.matching.prepare import deskew, motion_at
 from mapvote.perception.fans import FANS, Rays, follow_rays
-from mapvote.perception.raycast import CLEARANCE_M, SECTORS, SKY_M, Sight, Sky, cast_rays, find_obstacles
+from mapvote.perception.raycast import CLEARANCE_M, SKY_RULE, SKY_SECTORS, Sight, Sky, cast_rays, find_obstacles
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.scenario import load_scenario
@@ -240,15 +240,15 @@ def test_above_a_wall_all_round_every_beam_but_the_one_next_to_it_went_into_the_
     free = BEAMS[BEAMS > 3.0]
     np.testing.assert_allclose(np.unique(elevations_of(sky).round(3)), np.sort(free)[1:], atol=0.01)
     assert len(sky.reach) == (len(free) - 1) * FANS // 2, "every second fan"
-    assert (sky.reach == SKY_M).all()
-    assert (sky.stop == SKY_M).all()
+    assert (sky.reach == SKY_RULE.follow_m).all()
+    assert (sky.stop == SKY_RULE.follow_m).all()
 
 
 def test_beside_a_house_the_sky_begins_a_sector_later() -> None:
     _, azimuth, elevation = directions()
     house = (azimuth > 90.0) & (azimuth < 180.0)
     sky = azimuths_of(sky_of((elevation < 0.0) | house))
-    wide = 360.0 / SECTORS
+    wide = 360.0 / SKY_SECTORS
     assert not ((sky > 90.0 - wide) & (sky < 180.0 + wide)).any()
     assert (sky < 90.0 - 2.0 * wide).any()
     assert (sky > 180.0 + 2.0 * wide).any()

@@ -3,7 +3,7 @@
 A fan is walked once over the cells, from where it marks; each of its rays that comes so far then marks the voxels
 between its height on entering and on leaving each of them. One walk thus serves all beams of a firing, and the loop
 along a ray runs over vectors of cells, in halves of a column's word: numbers of 32 bits make vectors twice as long.
-What is done for each ray is inlined: as a call it would be handed five arrays, member by member, 20,000 times a scan.
+The work for each ray is inlined: a call would pass five arrays, member by member, 20,000 times a scan.
 """
 
 from __future__ import annotations
@@ -11,21 +11,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F32, F64, I32, U64
+from mapvote.core.types import F32, F64, I32, U32, U64
 
-U32 = NDArray[np.uint32]
 FANS = 2048
 """Fans in a turn (0.18 deg, a firing or two): two cross every cell at 40 m. A fan's direction is its rays' mean."""
 FULL_RANGE_M = 25.0
 """Nearer than this every second fan suffices for two to a cell, nearer than half of it every fourth, and so on."""
 _LANES = 16
-"""Cells that a ray is entered into at once: where it ends within them, the rest is masked."""
-_HALF = 32
+"""Cells that a ray is entered into at once. If the ray ends within them, the rest is masked."""
+_HALF_COLUMN = 32
 """Voxels of half a column."""
 
 
@@ -94,7 +92,7 @@ _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 
 
 def gather_rays(rays: Rays) -> Fans:
-    """Sort rays into fans. What lies in the sensor's own cell proves nothing."""
+    """Sort rays into fans. A ray that ends in the sensor's own cell proves nothing."""
     room = len(rays.reach) + FANS
     first, last = np.zeros(FANS, np.int32), np.empty(FANS, np.int32)
     slope, stop, end = np.empty(room, np.float32), np.empty(room, np.float32), np.zeros(FANS, np.float32)
@@ -120,7 +118,7 @@ def _gather(rays: Rays, fans: Fans) -> None:
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    for i in range(n):  # what is not kept is written over, so that nothing hangs on a guess
+    for i in range(n):  # rays that are not kept are overwritten: no branch to predict
         fan, e = np.uint64(rays.fan[i]), rays.stop[i]
         keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
         k = np.uint64(last[fan])
@@ -148,7 +146,7 @@ class Way(NamedTuple):
 @inlined
 def set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     """The way from (x, y), in cells, in direction (dx, dy), where it has come ``at`` metres."""
-    far, along = 1e18, 1e-9  # what runs along an axis never comes to the next row or column
+    far, along = 1e18, 1e-9  # a fan along an axis never comes to the next row or column
     c, r = int(np.floor(x + dx * at / CELL_SIZE)), int(np.floor(y + dy * at / CELL_SIZE))
     next_c = far if abs(dx) < along else ((c + (dx > 0)) - x) / dx * CELL_SIZE
     next_r = far if abs(dy) < along else ((r + (dy > 0)) - y) / dy * CELL_SIZE
@@ -167,7 +165,7 @@ class Crossed(NamedTuple):
     bottom: I32
     """Bit 0 of each column, as a layer counted from the sensor's."""
     low: U32
-    """What the fan's rays pass of the lower half of each column ..."""
+    """Voxels of the lower half of each column that the fan's rays pass ..."""
     high: U32
     """... and of the upper."""
 
@@ -204,10 +202,10 @@ def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer:
 def _pass(
     slope: np.float32, stop: np.float32, height: np.float32, up: int, n: int, crossed: Crossed, words: U32
 ) -> None:
-    """Enter what one ray passes of the first ``n`` cells: in each, the voxels between its heights on entering and on
-    leaving. ``height`` of the sensor over its layer, in voxels; ``words`` begin ``up`` voxels above the columns."""
+    """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
+    and on leaving. ``height`` of the sensor over its layer, in voxels; ``words`` begin ``up`` voxels above the columns."""
     t, bottom = crossed.entered, crossed.bottom
-    none, most = np.int32(0), np.int32(_HALF - 1)
+    none, most = np.int32(0), np.int32(_HALF_COLUMN - 1)
     b = np.uint64(0)
     while b < np.uint64(n) and t[b] < stop:
         for i in range(np.uint64(_LANES)):  # unsigned: an index that cannot be negative vectorises
@@ -225,10 +223,11 @@ def _pass(
 
 @inlined
 def _enter(crossed: Crossed, n: int, passed: U64) -> None:
-    """What a fan passed into the plane (flat), and the words empty again. Bit 63, all above, is never passed."""
+    """Enter the voxels that a fan passed into the plane (flat), and clear the words. Bit 63, all above, is never
+    passed."""
     for j in range(n):
         low, high = np.uint64(crossed.low[j]), np.uint64(crossed.high[j] & np.uint32(0x7FFFFFFF))
-        passed[np.uint64(crossed.cell[j])] |= low | high << np.uint64(_HALF)
+        passed[np.uint64(crossed.cell[j])] |= low | high << np.uint64(_HALF_COLUMN)
     for j in range(n + _LANES):
         crossed.low[j] = crossed.high[j] = 0
 
@@ -256,8 +255,8 @@ def _mark_passed(
             lowest = min(lowest, crossed.bottom[j])
         for k in range(fans.first[f], fans.last[f]):
             slope, stop = fans.slope[k], fans.stop[k]
-            halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF else 1
+            halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF_COLUMN else 1
             for half in range(halves):
                 words = crossed.low if half == 0 else crossed.high
-                _pass(slope, stop, height, half * _HALF, n, crossed, words)
+                _pass(slope, stop, height, half * _HALF_COLUMN, n, crossed, words)
         _enter(crossed, n, passed)

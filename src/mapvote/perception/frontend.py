@@ -41,20 +41,19 @@ class DriveReport:
     """Statistics of a drive."""
 
     stamps_ns: list[int] = field(default_factory=list)
-    """Of every scan."""
+    """Each scan's stamp."""
     lost: list[int] = field(default_factory=list)
     """Indices of scans that abstained because the vehicle was not sure where it was."""
     sigmas_m: list[float] = field(default_factory=list)
     """Position sigma of each scan that was observed: one that still waits for the filter is not in it yet."""
     T_map_lidar: list[F64] = field(default_factory=list)
-    """Pose of every scan that is decided; of a lost one the best guess."""
+    """Pose of every scan that is decided; the best guess for a lost one."""
     covariances: list[F32] = field(default_factory=list)
     """(6, 6) of each of these poses, as :class:`mapvote.core.types.Registration` has it."""
     priors: list[PosePrior | None] = field(default_factory=list)
-    """Of every scan."""
+    """Each scan's prior."""
     stage_s: dict[str, list[float]] = field(default_factory=dict)
-    """CPU seconds of every scan by stage: localise, ground, moving, see, and what is made of it (vote). All of it runs
-    on one thread."""
+    """CPU seconds of every scan by stage: localise, ground, moving, see, vote. All stages run on one thread."""
 
     @property
     def scans(self) -> int:
@@ -64,9 +63,9 @@ class DriveReport:
     def length_m(self) -> float:
         """Road driven between scans in turn that were both localised."""
         steps = np.linalg.norm(np.diff([T[:3, 3] for T in self.T_map_lidar], axis=0), axis=1)
-        found = np.ones(len(self.T_map_lidar), dtype=np.bool_)
-        found[self.lost] = False
-        return float(steps[found[1:] & found[:-1]].sum())
+        localised = np.ones(len(self.T_map_lidar), dtype=np.bool_)
+        localised[self.lost] = False
+        return float(steps[localised[1:] & localised[:-1]].sum())
 
     def driven(self) -> list[F64]:
         """(3,) each: where the sensor was, map metres, of the scans that were localised."""
@@ -85,8 +84,8 @@ class DriveReport:
 
     def prior_sigma_m(self) -> float | None:
         """The standard deviation that the priors state; None without priors."""
-        said = [prior.sigma_m for prior in self.priors if prior is not None]
-        return float(np.median(said)) if said else None
+        sigmas_m = [prior.sigma_m for prior in self.priors if prior is not None]
+        return float(np.median(sigmas_m)) if sigmas_m else None
 
     def split(self, n: int) -> DriveReport:
         """Keep the first ``n`` scans, all of which have voted or are lost; returns the report of those after them."""
@@ -139,13 +138,13 @@ class PlacedScan:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one localised scan saw."""
+    """The observation of one localised scan."""
 
     scan: PlacedScan
     moving: Bool
     """(n,) points of moving objects."""
     view: ScanView
-    """What was struck and what was seen through, over ``reference.grid``."""
+    """Hits and voxels that rays passed, over ``reference.grid``."""
     reference: Reference
     """The partial reference map R_i (paper III-A) that the scan is compared with."""
 

@@ -11,14 +11,15 @@ close to it, to all sides, ended behind it, so thin things, edges and foliage st
 rays passed both just below and just above the place, because a ray over a roof does not observe the roof.
 It needs no map, only poses, so it serves SLAM and voting alike.
 
-Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
-us hides is seen through only once it has driven on. Nothing older than ``Movers.past_s`` (2 s) before it is used.
+Online: a scan is decided after at most ``lookahead_s`` (1 s), because the space behind a vehicle ahead is observed
+only once that vehicle has driven on. Nothing older than ``Movers.past_s`` (2 s) before it is used.
 
-Limits: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
-moving, and what only the sky lies behind is judged by the cells it is connected to (rays without return are unknown).
+Limits: a car that waits through the whole window is static. A car farther away than ``reach_m`` is never called
+moving. An object with only the sky behind it is judged by the cells it is connected to: rays without return are
+unknown.
 
-Of range images: where something lies from a sensor is worked out for all points first, in float32 from the sensor, in
-loops without a branch that vectorise; then each point is entered, or looked up.
+Range images are made and read in two loops. The first computes the direction and range of all points, in float32 from
+the sensor, without a branch, so that it vectorises. The second enters each point, or looks it up.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapvote.config import MovingSettings
 from mapvote.core.geometry import rows_from, turn
@@ -37,15 +37,14 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, I64, U8, Bool
+from mapvote.core.types import F32, F64, I32, I64, U8, U16, Bool
 from mapvote.core.voxels import grouped, voxel_key
 
-U16 = NDArray[np.uint16]
 PER_M = np.float32(500.0)
 """Ranges are held in steps of 2 mm, up to 131 m."""
-NOTHING = np.uint16(65535)
-"""Of a range image: no return in that direction."""
-NEAR_M = np.float32(0.5)
+NO_RETURN = np.uint16(65535)
+"""Value of a range image in directions without a return."""
+LEAST_RANGE_M = np.float32(0.5)
 """Points nearer than this to the sensor in the plane have no usable direction."""
 
 
@@ -87,7 +86,7 @@ class LookCounts(NamedTuple):
 def _aim(x: np.float32, y: np.float32, z: np.float32, pixels: Pixels) -> tuple[np.float32, np.int32, np.int32]:
     """(horizontal range, azimuth pixel, slope pixel: -1 or ``slopes`` outside) of a place from the sensor."""
     rho = np.sqrt(x * x + y * y)
-    row = np.floor((z / max(rho, NEAR_M) - pixels.slope_min) * pixels.per_slope)
+    row = np.floor((z / max(rho, LEAST_RANGE_M) - pixels.slope_min) * pixels.per_slope)
     b = np.int32(min(max(row, np.float32(-1.0)), np.float32(pixels.slopes)))
     return rho, min(np.int32(turn(x, y) * np.float32(pixels.turns)), np.int32(pixels.turns - 1)), b
 
@@ -101,10 +100,10 @@ def _enter_image(rows: F32, pixels: Pixels, pixel: I32, steps: I32, flat: U16, o
     slopes, nowhere = np.int32(pixels.slopes), np.int32(pixels.turns * pixels.slopes)
     for i in range(np.uint64(0), n):  # unsigned: an index that cannot be negative vectorises
         rho, a, b = _aim(x[i], y[i], z[i], pixels)
-        pixel[i] = np.int32(a * slopes + b) if (rho >= NEAR_M) & (b >= 0) & (b < slopes) else nowhere
-        steps[i] = np.int32(min(rho * PER_M + np.float32(0.5), np.float32(NOTHING - 1)))
+        pixel[i] = np.int32(a * slopes + b) if (rho >= LEAST_RANGE_M) & (b >= 0) & (b < slopes) else nowhere
+        steps[i] = np.int32(min(rho * PER_M + np.float32(0.5), np.float32(NO_RETURN - 1)))
     for i in range(np.uint64(0), np.uint64(len(flat))):
-        flat[i] = NOTHING
+        flat[i] = NO_RETURN
     for i in range(np.uint64(0), n):
         here = np.uint64(pixel[i])
         flat[here] = min(flat[here], np.uint16(steps[i]))
@@ -125,7 +124,8 @@ def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
 
 
 class Sought(NamedTuple):
-    """Where samples lie as one scan saw them, and what it saw there, (n,) each: scratch of :func:`look`."""
+    """Direction and range of samples from one scan's sensor, and the ranges it measured, (n,) each: scratch of
+    :func:`look`."""
 
     steps: I32
     """Horizontal range."""
@@ -147,20 +147,20 @@ def room_to_look(n: int) -> Sought:
 
 BOTH_SIDES = np.uint8(3)
 """Rays passed below and above."""
-_LEAST, _MOST = 2, 8
+_LEAST_PIXELS, _MOST_PIXELS = 2, 8
 """Pixels above and below that are read: at 8 m and beyond the fewest."""
 
 
 @inlined
 def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.float32, sought: Sought) -> None:
-    """Where the first ``n`` samples lie from the sensor: fills ``steps``, ``pixel`` and ``around``."""
+    """Compute range and direction of the first ``n`` samples: fills ``steps``, ``pixel`` and ``around``."""
     x, y, z, _ = samples
     steps, pixel, around = sought.steps, sought.pixel, sought.around
-    near, slopes, reach = np.int32(NEAR_M * PER_M), np.int32(pixels.slopes), height_m * pixels.per_slope
+    near, slopes, reach = np.int32(LEAST_RANGE_M * PER_M), np.int32(pixels.slopes), height_m * pixels.per_slope
     for i in range(np.uint64(0), np.uint64(n)):
         rho, a, b = _aim(x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2], pixels)
         steps[i] = np.int32(rho * PER_M + np.float32(0.5))
-        k = np.int32(min(max(reach / max(rho, NEAR_M), np.float32(_LEAST)), np.float32(_MOST)))
+        k = np.int32(min(max(reach / max(rho, LEAST_RANGE_M), np.float32(_LEAST_PIXELS)), np.float32(_MOST_PIXELS)))
         inside = (steps[i] >= near) & (b >= k) & (b + k < slopes)
         pixel[i] = np.int32(a * slopes + b) if inside else np.int32(0)
         around[i] = k
@@ -168,18 +168,18 @@ def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.fl
 
 @inlined
 def _read(n: int, image: U16, sought: Sought) -> None:
-    """The ranges at, below and above each sample's pixel. Most look no farther than _LEAST, so that the first loop is
-    short: the more pixels it is after at once, the less it waits for memory."""
+    """Read the ranges at, below and above each sample's pixel. Most samples read only _LEAST_PIXELS to each side: the
+    first loop is short, so that it requests many pixels at once and waits less for memory."""
     here, below, above = sought.here, sought.below, sought.above
     for w in range(np.uint64(0), np.uint64(n)):
-        p = np.uint64(max(sought.pixel[w], np.int32(_LEAST)))
+        p = np.uint64(max(sought.pixel[w], np.int32(_LEAST_PIXELS)))
         here[w] = image[p]
         below[w] = min(image[p - np.uint64(1)], image[p - np.uint64(2)])
         above[w] = min(image[p + np.uint64(1)], image[p + np.uint64(2)])
     for w in range(np.uint64(0), np.uint64(n)):
         p = np.uint64(sought.pixel[w])
-        if (sought.around[w] > _LEAST) & (p > 0):
-            for s in range(np.uint64(_LEAST + 1), np.uint64(sought.around[w] + 1)):
+        if (sought.around[w] > _LEAST_PIXELS) & (p > 0):
+            for s in range(np.uint64(_LEAST_PIXELS + 1), np.uint64(sought.around[w] + 1)):
                 below[w], above[w] = min(below[w], image[p - s]), min(above[w], image[p + s])
 
 
@@ -206,10 +206,10 @@ def look(
     for w in range(np.uint64(0), np.uint64(n)):
         below, above, steps = sought.below[w], sought.above[w], sought.steps[w]
         r = np.int32(min(sought.here[w], min(below, above)))
-        known = (sought.pixel[w] > 0) & (r != np.int32(NOTHING)) & (r >= steps - margin)
+        known = (sought.pixel[w] > 0) & (r != np.int32(NO_RETURN)) & (r >= steps - margin)
         through = known & (r > steps + margin)
-        low = np.uint8(1) if below < NOTHING else np.uint8(0)
-        high = np.uint8(2) if above < NOTHING else np.uint8(0)
+        low = np.uint8(1) if below < NO_RETURN else np.uint8(0)
+        high = np.uint8(2) if above < NO_RETURN else np.uint8(0)
         i = np.uint64(of[w])
         x[left], y[left], z[left], of[left] = x[w], y[w], z[w], of[w]
         free[i] += 1 if through else 0
@@ -261,7 +261,7 @@ MOVERS = Movers()
 
 @dataclass(frozen=True, slots=True)
 class _Scan:
-    """What the window keeps of one scan."""
+    """One scan in the window."""
 
     stamp_ns: int
     origin_map: F64
@@ -336,16 +336,20 @@ class MovingFilter:
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
         waiting, sought = Samples(x, y, z, np.arange(m, dtype=np.int32)), room_to_look(m)
+        # Each of the other scans counts what it saw at the samples.
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = movers.margin_m, movers.height_m, movers.enough
             left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
+        # A voxel is brief if rays passed it on both sides and most scans that could see it saw through it.
         free, total = counts.free, counts.free + counts.hit
         brief = (counts.sides == BOTH_SIDES) & (free >= movers.min_free) & (free >= movers.free_share * total)
+        # The samples' cells in a square around the sensor.
         half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
         lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
         cols, rows = np.floor(scan.samples[:, :2].T / CELL_SIZE).astype(np.int64) - lowest[:, None]
         side = 2 * half + 1
+        # Connected cells move together.
         shares = movers.share_whole, movers.share_part
         seen_often = total >= movers.min_free
         moves = moving_components(rows * side + cols, side, seen_often, brief, movers.min_voxels, *shares)

@@ -1,11 +1,11 @@
-"""What one scan saw, passed through and could not see, as planes over the local grid (paper III-A), and into the sky.
+"""Planes of one scan over the local grid: hits, voxels that rays passed, visibility (paper III-A), rays into the sky.
 
-The walk over the cells is in mapvote.perception.fans: the 3D question becomes a 2D one.
+mapvote.perception.fans walks over the cells: the 3D question becomes a 2D one.
 
-A sensor reports returns only. Yet in a direction in which the road and the walls answer, and above the highest of them
-nothing does, no surface up there was within range. The test uses whole sectors, because single beams are lost on
+A sensor reports returns only. If the road and the walls answer in a direction, and nothing answers above the highest
+of them, then no surface up there was within range. The test uses whole sectors, because single beams are lost on
 glass, on dark paint and by chance. For the same reason a ray lost between returns proves nothing.
-Above a house that was pulled down, and where one was built, hardly any other ray goes by.
+Hardly any other ray passes above a house that was pulled down, or where one was built.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 from mapvote.perception.fans import FANS, Fans, Rays, follow_rays, gather_rays, mark_passed, set_out
@@ -33,7 +34,7 @@ class Sight(IntEnum):
     """How far a cell could be seen, the best of all fans that cross it."""
 
     NEVER = 0
-    """No ray was fired in this direction: no observation."""
+    """No ray was fired in this direction: the cell has no observation."""
     BEYOND = 1
     """Behind the farthest return of every fan."""
     BEHIND = 2
@@ -175,69 +176,80 @@ def cast_rays(
     return ScanView(grid, counts, hit, passed, sight)
 
 
-SECTORS = 256
-"""In a turn: of 1.4 deg, 8 firings or so of each beam; the ones beside a sector must be as empty."""
-ANSWERED = 0.25
-"""Share of a sector's rays that must have a return: where fewer have, lost packets or the vehicle may be the cause."""
-LEAST_UPRIGHT = 0.866
-"""Cosine of the lean, at most 30 deg, up to which a beam has one slope in every direction of the map."""
-SKY_M = 60.0
-"""Horizontal metres for which a ray into the sky is followed: to the corners of any window, and well within range."""
-_EVERY = 2
-"""Of the fans every second one: at 40 m they are .25 m apart."""
+SKY_SECTORS = 256
+"""Sectors in a turn, 1.4 deg each: about 8 firings of each beam. Both neighbours of a sector must be as empty."""
+
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class SkyRule:
+    """Numbers of the test for rays into the sky."""
+
+    answered: float = 0.25
+    """Share of a sector's rays that must have a return: fewer may be due to lost packets or the vehicle's roof."""
+    min_upright: float = 0.866
+    """Cosine of the largest lean, 30 deg, at which a beam has one slope in every direction of the map."""
+    follow_m: float = 60.0
+    """Horizontal distance for which a ray into the sky is followed: the corners of any window lie within it."""
+    every_fan: int = 2
+    """One fan of so many casts rays into the sky: at 40 m they are 0.25 m apart."""
+
+
+SKY_RULE = SkyRule()
 
 
 @kernel
 def _highest(rays: Rays, lean: F64, least: float, top: F32, count: I32) -> None:
-    """Into ``top`` (SECTORS,), from -inf, the steepest slope of a return in each, from the sensor's own plane; infinite
-    where too few came. ``count`` (SECTORS,): scratch of zeros."""
-    wide = FANS // SECTORS
+    """Enter into ``top`` (SKY_SECTORS,), which holds -inf, the steepest slope of a return in each sector, from the
+    sensor's own plane; infinite where fewer than ``least`` came. ``count`` (SKY_SECTORS,): scratch of zeros."""
+    wide = FANS // SKY_SECTORS
     for i in range(np.uint64(0), np.uint64(len(rays.reach))):
         sector = np.uint64(rays.fan[i] // wide)
         slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
         top[sector] = max(top[sector], slope)
         count[sector] += 1
-    for s in range(SECTORS):
+    for s in range(SKY_SECTORS):
         if count[s] < least:
             top[s] = np.inf
-
-
-_FAN = np.arange(0, FANS, _EVERY, dtype=np.int32)
-_AZIMUTH = (_FAN + 0.5) * 2.0 * np.pi / FANS
-_X, _Y = np.cos(_AZIMUTH).astype(np.float32), np.sin(_AZIMUTH).astype(np.float32)
-
-
-def _into_sky(rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
-    """Rays of the beams, of ascending ``slopes`` (beams,), that lie above all returns of their sector and its
-    neighbours."""
-    top = np.full(SECTORS, -np.inf, np.float32)
-    _highest(rays, lean, least, top, np.zeros(SECTORS, np.int32))
-    most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
-    above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))  # the next one may have grazed it
-    above = above[_FAN // (FANS // SECTORS)]
-    some = len(slopes) - above
-    of, room = np.repeat(np.arange(len(_FAN)), some), int(some.sum())
-    beam = np.arange(room) - np.repeat(np.cumsum(some) - some - above, some)
-    x, y = _X[of], _Y[of]
-    slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
-    far = np.full(room, np.float32(SKY_M))
-    return Rays(far, x, y, slope, far, _FAN[of])
 
 
 class Sky:
     """The elevations above which a sensor's rays passed into the sky."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: Sensor, rule: SkyRule = SKY_RULE) -> None:
+        self._rule = rule
         beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere the end of a ray is unknown
         upright = np.tan(np.radians(beams)).astype(np.float32)
         self._slopes = {True: upright, False: np.ascontiguousarray(-upright[::-1])}
         """By whether the sensor's z axis points up: upside down, the lowest beam is the highest."""
-        self._least = ANSWERED * len(beams) * sensor.azimuths / SECTORS
+        self._least = rule.answered * len(beams) * sensor.azimuths / SKY_SECTORS
+        self._fan = np.arange(0, FANS, rule.every_fan, dtype=np.int32)
+        azimuth = (self._fan + 0.5) * 2.0 * np.pi / FANS
+        self._x = np.cos(azimuth).astype(np.float32)
+        self._y = np.sin(azimuth).astype(np.float32)
 
     def rays(self, up_map: F64, rays: Rays) -> Rays:
         """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the axis that the
-        sensor turns about, in their frame. It may lean some degrees, and point down. Of a sensor that leans by more
-        no ray is known to have passed into the sky: its beams are no cones about the vertical."""
-        if abs(up_map[2]) < LEAST_UPRIGHT * np.linalg.norm(up_map):
-            return _into_sky(rays, np.zeros(0, np.float32), np.zeros(2), np.inf)
-        return _into_sky(rays, self._slopes[bool(up_map[2] > 0.0)], up_map[:2] / up_map[2], self._least)
+        sensor turns about, in their frame; it may point down, and lean by up to 30 deg. A sensor that leans by more
+        gets no ray into the sky: its beams are no cones about the vertical."""
+        if abs(up_map[2]) < self._rule.min_upright * np.linalg.norm(up_map):
+            return self._above_returns(rays, np.zeros(0, np.float32), np.zeros(2), np.inf)
+        return self._above_returns(rays, self._slopes[bool(up_map[2] > 0.0)], up_map[:2] / up_map[2], self._least)
+
+    def _above_returns(self, rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
+        """Rays of the beams, of ascending ``slopes`` (beams,), that lie above all returns of their sector and its
+        neighbours."""
+        top = np.full(SKY_SECTORS, -np.inf, np.float32)
+        _highest(rays, lean, least, top, np.zeros(SKY_SECTORS, np.int32))
+        most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
+        # The beam next to the highest return may have grazed the same surface: it is left out.
+        above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))
+        above = above[self._fan // (FANS // SKY_SECTORS)]
+        beams_above = len(slopes) - above
+        fan_of = np.repeat(np.arange(len(self._fan)), beams_above)
+        n_rays = int(beams_above.sum())
+        beam = np.arange(n_rays) - np.repeat(np.cumsum(beams_above) - beams_above - above, beams_above)
+        x, y = self._x[fan_of], self._y[fan_of]
+        slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
+        far = np.full(n_rays, np.float32(self._rule.follow_m))
+        return Rays(far, x, y, slope, far, self._fan[fan_of])
