@@ -203,7 +203,8 @@ def _pass(
     slope: np.float32, stop: np.float32, height: np.float32, up: int, n: int, crossed: Crossed, words: U32
 ) -> None:
     """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
-    and on leaving. ``height`` of the sensor over its layer, in voxels; ``words`` begin ``up`` voxels above the columns."""
+    and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above the
+    columns."""
     t, bottom = crossed.entered, crossed.bottom
     none, most = np.int32(0), np.int32(_HALF_COLUMN - 1)
     b = np.uint64(0)
