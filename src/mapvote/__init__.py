@@ -59,8 +59,8 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(f"mapvote.{_HOME[name]}"), name)
     except ModuleNotFoundError as error:
+        from mapvote.core.extras import missing_extra
         from mapvote.core.types import MapvoteError
-        from mapvote.formats.extras import missing_extra
 
         mend = missing_extra(error)
         if mend is None:

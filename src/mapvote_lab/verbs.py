@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 
 def _need_lab(verb: str) -> None:
     """MapvoteError naming the extra if a package of the laboratory is missing."""
-    from mapvote.formats.extras import require
+    from mapvote.core.extras import require
 
     for package in ("embreex", "matplotlib"):
         require(package, "lab", f"mapvote {verb}")

@@ -6,7 +6,7 @@ from importlib import metadata
 
 import pytest
 
-from mapvote.formats.extras import missing_extra
+from mapvote.core.extras import missing_extra
 
 WRITTEN = [
     "numpy>=2",

@@ -73,7 +73,7 @@ def run() -> None:
     except MapvoteError as error:
         complain(str(error))
     except ModuleNotFoundError as error:
-        from mapvote.formats.extras import missing_extra
+        from mapvote.core.extras import missing_extra
 
         mend = missing_extra(error)
         if mend is None:

@@ -165,9 +165,15 @@ def numbers_in(text: str, option: str, wanted: str, count: int) -> tuple[float, 
 
 
 def check_ending(file: Path | None, option: str, *endings: str) -> None:
-    """MapvoteError if a file to write has none of the ``endings``, which say the format."""
-    if file is not None and file.suffix.lower() not in endings:
+    """MapvoteError if a file to write has none of the ``endings``, which say the format, or if its format needs a
+    package that is not installed."""
+    from mapvote.core.extras import require_for
+
+    if file is None:
+        return
+    if file.suffix.lower() not in endings:
         raise MapvoteError(f"{option} {file}: is written as {' or '.join(endings)}; give the file such an ending")
+    require_for(file, f"{option} {file}")
 
 
 def named_after(folder: Path, point_map: PointMap) -> PointMap:

@@ -262,11 +262,14 @@ def export(
 
         mapvote export https://maps.example.org map --follow --key-file key
     """
+    from mapvote.core.extras import require_for
+
     if follow:
         if not is_url(source) or out.suffix:
             raise MapvoteError("export: --follow takes the URL of a server and a folder")
         _follow(source, out, projector, key_file, keep=keep, every=None if once else every)
         return
+    require_for(out, str(out))
     x, y, z = numbers_in(offset, "--offset", "three numbers, for example 367000,3951000,0", 3)
     live = not out.suffix and (is_url(source) or is_store(source))
     if since is not None and not live:

@@ -139,6 +139,7 @@ def drive(
     import time
 
     from mapvote.config import load_settings
+    from mapvote.core.extras import require
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
     from mapvote.formats.drives.point_times import TimeRules
@@ -154,6 +155,11 @@ def drive(
 
     if out is None and send is None:
         raise MapvoteError("drive: give --send URL, --out FOLDER, or both")
+    # Packages that are missing are named before kernels are compiled and topics are waited for.
+    require("cyclonedds.domain", "ros2", "mapvote drive")
+    require("rosbags.typesys", "ros2", "mapvote drive")
+    if metrics is not None:
+        require("prometheus_client", "server", "--metrics")
     logging.getLogger("mapvote.live").setLevel(logging.INFO)
     plan = Plan(
         vehicle,

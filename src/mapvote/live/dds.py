@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import first_line, require
+from mapvote.formats.reading import first_line
 from mapvote.live.messages import READ, from_cdr, typestore
 from mapvote.live.ros_environment import ros_environment
 

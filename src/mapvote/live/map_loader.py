@@ -29,10 +29,10 @@ import numpy as np
 import yaml
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import first_line
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
 from mapvote.formats.maps.cloud import joined
 from mapvote.formats.maps.pcd import stream_pcd
+from mapvote.formats.reading import first_line
 from mapvote.live.dds import Network, Publication, Subscription
 from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
 

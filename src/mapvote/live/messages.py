@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.rosbag import pose_of_message
-from mapvote.formats.extras import first_line, require
+from mapvote.formats.reading import first_line
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.extras import require
 from mapvote.core.geometry import inverse
 from mapvote.core.kernel import call_while_compiling
 from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import require
 from mapvote.live.dds import Network, Publication
 from mapvote.live.drive import Counts, LiveDrive
 from mapvote.live.messages import POSE_TOPIC, POSE_WITH_COVARIANCE, blank_message, header_of, pose_of, to_cdr

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import small_gicp
 
+from mapvote.core.extras import require
 from mapvote.core.geometry import exp, log
 from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap
@@ -58,10 +59,11 @@ VGICP = Vgicp()
 class _Voxels:
     """small_gicp's voxels of one side, and their distributions where they can be looked up."""
 
-    def __init__(self, cloud: small_gicp.PointCloud, side_m: float, numbers: Vgicp) -> None:
+    def __init__(self, cloud: Any, side_m: float, numbers: Vgicp) -> None:
+        """``cloud``: small_gicp's, with covariances."""
         self.side_m = side_m
         self.reach_m = numbers.reach_voxels * side_m
-        self.voxels = small_gicp.GaussianVoxelMap(side_m)
+        self.voxels = _library().GaussianVoxelMap(side_m)
         self.voxels.insert(cloud)
         means = np.asarray(self.voxels.voxel_points())[:, :3]
         covariances = np.asarray(self.voxels.voxel_covs()).reshape(-1, 4, 4)[:, :3, :3]
@@ -100,7 +102,7 @@ class VgicpMap:
         self.numbers = numbers
         self.centre = centre
         local = np.ascontiguousarray(points_map - centre)
-        cloud, _ = small_gicp.preprocess_points(local, numbers.map_spacing_m, numbers.neighbours, 1)
+        cloud, _ = _library().preprocess_points(local, numbers.map_spacing_m, numbers.neighbours, 1)
         self._coarse = _Voxels(cloud, numbers.coarse_m, numbers)
         self._fine = _Voxels(cloud, numbers.fine_m, numbers)
 
@@ -120,6 +122,7 @@ class VgicpMap:
             return Registration(T, np.eye(6), 0.0, 0.0, 0, False)
         T[:3, 3] -= self.centre
         # A point's covariance is of its neighbours in the scan: once for both sides.
+        small_gicp = _library()
         source = small_gicp.PointCloud(points)
         small_gicp.estimate_covariances(source, small_gicp.KdTree(source), self.numbers.neighbours, 1)
         for level in [self._coarse, self._fine] if first_level == 0 else [self._fine]:
@@ -182,10 +185,16 @@ def _weighed(T: F64, covariance: F64, prior: PosePrior) -> tuple[F64, F64]:
     return moved, joined
 
 
+def _library() -> Any:
+    """small_gicp; MapvoteError naming the extra if it is missing. The record above is read without it."""
+    return require("small_gicp", "vgicp", "ndt.matcher = vgicp")
+
+
 class VgicpWindow:
     """See :class:`mapvote.matching.matcher.MapAround`: laid out anew when the vehicle leaves its middle."""
 
     def __init__(self, point_map: PointMap, numbers: Vgicp = VGICP) -> None:
+        _library()
         self.point_map = point_map
         self.numbers = numbers
         self._laid_out: VgicpMap | None = None

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, cast
 import yaml
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.extras import first_line
+from mapvote.formats.reading import first_line
 
 STORAGES = (".mcap", ".db3", ".bag")
 UNFINISHED = ".active"

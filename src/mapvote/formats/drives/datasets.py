@@ -48,10 +48,10 @@ from mapvote.formats.drives.trajectory import (
     rigid_motions,
     sorted_trajectory,
 )
-from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, utm_of
 from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.pcd import read_pcd_table
+from mapvote.formats.reading import read_text
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
 _NUSCENES_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

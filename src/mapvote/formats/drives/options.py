@@ -26,9 +26,9 @@ from mapvote.formats.drives.sensor_estimate import (
     rate_of_first,
     turning_about,
 )
-from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 from mapvote.formats.listing import entry
+from mapvote.formats.reading import read_text
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 

@@ -18,6 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
+from mapvote.core.extras import require
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
@@ -25,8 +26,8 @@ from mapvote.formats.drives.options import DriveOptions, beside, make_drive, map
 from mapvote.formats.drives.point_fields import PointReader, livox_table, log, point_cloud_table, stamp_of
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Trajectory, prior_of
-from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
+from mapvote.formats.reading import first_line
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 _SWEEP = 0.55

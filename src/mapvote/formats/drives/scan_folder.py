@@ -30,7 +30,6 @@ from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
 from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans, prior_of
-from mapvote.formats.extras import read_text
 from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import table_of, xyz
@@ -39,6 +38,7 @@ from mapvote.formats.maps.las import stream_las
 from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
 from mapvote.formats.maps.ply import stream_ply_tables
+from mapvote.formats.reading import read_text
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 

@@ -21,9 +21,9 @@ from mapvote.formats.drives.options import DriveOptions, beside, map_frame, moun
 from mapvote.formats.drives.point_fields import log
 from mapvote.formats.drives.pose_header import Column, find_header, split_row
 from mapvote.formats.drives.scan_names import numbers_of
-from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 from mapvote.formats.listing import entry
+from mapvote.formats.reading import read_text
 
 _FACES_Z = 0.9
 """Cosine between the way a camera looks and the z axis of its own world, somewhere on a drive."""

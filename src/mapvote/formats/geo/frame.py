@@ -21,9 +21,10 @@ import scipy
 import yaml
 from numpy.typing import NDArray
 
+from mapvote.core.extras import require
 from mapvote.core.geometry import poses_at
 from mapvote.core.types import F64, Bool, MapvoteError
-from mapvote.formats.extras import read_text, require
+from mapvote.formats.reading import read_text
 
 LOCAL = "local"
 """Metres from an unknown place on Earth."""

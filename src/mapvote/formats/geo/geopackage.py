@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import require
 from mapvote.formats.geo.frame import ENU, MapFrame
 
 LAYER = "changes"

@@ -23,12 +23,12 @@ import yaml
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import folder_beside, whole_file, whole_folder, write_whole
-from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
 from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
 from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
+from mapvote.formats.reading import first_line, read_text
 
 log = logging.getLogger("mapvote.formats")
 

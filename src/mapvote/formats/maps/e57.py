@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.reading import reading
 
 _BLOCK = 500_000
 """Points read at a time."""

@@ -21,16 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import Brightness, shares
+from mapvote.core.extras import require
 from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import reading, require
 from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, FLAGS, Head, Piece, read_head, read_pieces
+from mapvote.formats.reading import reading
 
 log = logging.getLogger("mapvote.formats")
 

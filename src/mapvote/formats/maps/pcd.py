@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import reading
 from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, log, table_of, warn_of_float32
 from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
+from mapvote.formats.reading import reading
 
 _BLOCK = 500_000
 """Points read at a time."""

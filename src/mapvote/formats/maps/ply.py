@@ -10,10 +10,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.extras import reading, require
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of
+from mapvote.formats.reading import reading
 
 _BLOCK = 500_000
 """Vertices handed on at a time."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +21,25 @@ def require(module: str, extra: str, where: str) -> ModuleType:
         ) from error
 
 
+ENDINGS = {
+    ".las": ("laspy", "las"),
+    ".laz": ("laspy", "las"),
+    ".ply": ("plyfile", "ply"),
+    ".e57": ("pye57", "e57"),
+    ".gpkg": ("pyogrio", "geo"),
+    ".png": ("matplotlib", "plots"),
+    ".svg": ("matplotlib", "plots"),
+    ".pdf": ("matplotlib", "plots"),
+}
+"""The package and the extra that a file of this ending needs."""
+
+
+def require_for(file: Path, where: str) -> None:
+    """MapvoteError naming the extra if a file of this ending needs a package that is missing: before the work."""
+    if file.suffix.lower() in ENDINGS:
+        require(*ENDINGS[file.suffix.lower()], where)
+
+
 def missing_extra(error: ModuleNotFoundError) -> str | None:
     """What to install for a module that was not found, by mapvote's own metadata; None if no extra has it."""
     module = (error.name or "").partition(".")[0]
@@ -37,32 +54,3 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
         if re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():
             return f"this needs the package {module}; install it with: pip install 'mapvote[{extra[1]}]'"
     return None
-
-
-def read_text(file: Path) -> str:
-    """The whole text of a file; MapvoteError if it cannot be read or is not text."""
-    try:
-        return file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise MapvoteError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except UnicodeDecodeError as error:
-        raise MapvoteError(f"{file}: not a text file ({error.reason} at byte {error.start}); copy it again") from error
-
-
-@contextmanager
-def reading(path: Path, kind: str) -> Iterator[None]:
-    """Whatever goes wrong within is one MapvoteError that names the file: libraries let through what numpy, struct and
-    their own parsers raise. ``kind``: what the file is not a whole one of."""
-    try:
-        yield
-    except MapvoteError:
-        raise
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:
-        raise MapvoteError(f"{path}: not a whole {kind} ({first_line(error)}); copy or export it again") from error
-
-
-def first_line(error: BaseException) -> str:
-    """The message of another library's error, in one line."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
