@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import ipaddress
 import os
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -225,7 +226,7 @@ class GateSettings(Section):
 
 
 class ServerSettings(Section):
-    """server/http/app.py: what the server lets in."""
+    """mapvote_server/api: what the server lets in."""
 
     max_body_bytes: int = Field(
         default=16_000_000, description="largest request body; up to eight of this size are in memory"
@@ -246,10 +247,21 @@ class ServerSettings(Section):
     stored_bytes: int = Field(
         default=2_000_000_000, ge=1, description="bytes that the ballots of one vehicle may take in the store"
     )
+    question_s: float = Field(default=30.0, gt=0, description="time limit for the answer to one question")
+    work_s_per_minute: float = Field(
+        default=30.0, gt=0, description="CPU seconds that the requests of one key may use per minute on average"
+    )
+    rows_per_minute: float = Field(
+        default=1_000_000.0, gt=0, description="rows that one key may read per minute on average"
+    )
+    streams_per_key: int = Field(default=4, ge=1, description="streams of events that one key may listen to at once")
     hosts: tuple[str, ...] = Field(
         default=(), description="host names of this server, besides localhost and numeric addresses"
     )
-
+    proxies: tuple[str, ...] = Field(
+        default=("127.0.0.1", "::1"),
+        description="addresses or networks of reverse proxies. Forwarded and X-Forwarded-For count from these alone",
+    )
     webhook_url: str = Field(
         default="", pattern="^(https?://.*)?$", description="URL that events are posted to. Empty disables this"
     )
@@ -265,7 +277,14 @@ class ServerSettings(Section):
             raise ValueError("webhook_url needs a webhook_secret: whsec_ and the output of `openssl rand -base64 32`")
         return self
 
-    @field_validator("hosts", mode="before")
+    @field_validator("proxies", mode="after")
+    @classmethod
+    def _networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
+            ipaddress.ip_network(name, strict=False)
+        return value
+
+    @field_validator("hosts", "proxies", mode="before")
     @classmethod
     def _from_one_line(cls, value: object) -> object:
         """An environment variable names them with commas."""

@@ -41,5 +41,9 @@ class TooMany(MapvoteError):
         self.after_s = after_s
 
 
+class TooSlow(MapvoteError):
+    """A question that takes longer than one may; the same question again would too."""
+
+
 class Unavailable(MapvoteError):
     """The database cannot be written or reached now; nothing was changed, try again."""

@@ -9,7 +9,6 @@ from contextlib import asynccontextmanager, contextmanager
 
 import httpx2
 import structlog
-from anyio import to_thread
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
@@ -18,9 +17,10 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import desk_routes, event_routes, operator_routes, page_routes, vehicle_routes
 from mapvote_server.api.event_routes import deliver
+from mapvote_server.api.proxies import Proxies
 from mapvote_server.api.schemas import unreadable, unusable
 from mapvote_server.api.security import Guard, Hosts, Watch
-from mapvote_server.api.services import READING, Services
+from mapvote_server.api.services import Services
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.publish import Gate
 from mapvote_server.store.store import Store
@@ -50,7 +50,6 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        to_thread.current_default_thread_limiter().total_tokens = READING
         beside = [keep_overview(parts), *([deliver(parts)] if parts.settings.server.webhook_url else [])]
         tasks = [asyncio.create_task(work) for work in beside]
         yield
@@ -75,8 +74,8 @@ def create_app(
         app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
     app.add_exception_handler(RequestValidationError, unusable)
-    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.lookups, opened=opened, owner=owner)
-    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, ready=parts.check_ready)
+    hosts, guard = Hosts(parts.settings.server.hosts), Guard(parts, opened=opened, owner=owner)
+    app.add_middleware(Watch, hosts=hosts, guard=guard, proxies=Proxies(parts.settings.server.proxies), parts=parts)
     return app
 
 
@@ -88,7 +87,7 @@ async def keep_overview(parts: Services) -> None:
             newest = await parts.newest.put(None)
             if newest != known:
                 known = newest
-                await to_thread.run_sync(parts.clouds.overview, newest, stop, limiter=parts.fetching)
+                await parts.rounds.run(parts.clouds.overview, newest, stop)
         except Unavailable:
             pass
         except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error

@@ -1,27 +1,57 @@
-"""Time limits and a head limit for each connection, and a limit on their number.
+"""What each connection may do: time limits, a strict head, one request at a time; and a limit on their number.
 
 uvicorn limits only the pause between two requests. :class:`Connection` stands between the socket and uvicorn's
-protocol. It uses only the interface of :class:`asyncio.Protocol`. :func:`tracked` calls it when a request begins and
-ends. h11 limits what uvicorn keeps of an unfinished event (heads, chunk lines, trailers) to :data:`HEAD_BYTES`, too.
+protocol. It uses the interface of :class:`asyncio.Protocol`, and asks h11 what came after a request. :func:`tracked`
+calls it when a request begins and ends. h11 limits what uvicorn keeps of an unfinished event (heads, chunk lines,
+trailers) to :data:`HEAD_BYTES`, too.
+
+Requests are parsed in one thread, so their order decides who waits. A request that came before the answer to the one
+before it (pipelining) is not read: its connection is closed after that answer, as RFC 9112, 9.3.2 lets a server do. Of
+one address only a few requests are under way at a time until their key is known (:class:`Line`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import re
+from collections import Counter, OrderedDict, deque
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
+import h11
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mapvote.core.record import record
+from mapvote_server.errors import Unavailable
 
 HEAD_BYTES = 32_000
 """A request's line and headers."""
 _LINGER_S = 1.0
 _END_OF_HEAD = re.compile(rb"\n\r?\n")
+_BARE_LINE_END = re.compile(rb"(?<!\r)\n")
+_LENGTHS = b"\r\ncontent-length:", b"\r\ntransfer-encoding:"
 _REFUSAL = "HTTP/1.1 {}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+_MALFORMED = _REFUSAL.format("400 Bad Request").encode()
 _TOO_SLOW = _REFUSAL.format("408 Request Timeout").encode()
 _TOO_LARGE = _REFUSAL.format("431 Request Header Fields Too Large").encode()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Crowding:
+    """How connections share one server."""
+
+    headers: int = 100
+    """Headers of one request, at most."""
+    strangers: int = 8
+    """Requests of one address under way at a time whose key is not known yet."""
+    kept: int = 8
+    """Connections beyond the limit for probes and for keys of reviewers and operators."""
+
+
+CROWDING = Crowding()
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,42 +68,107 @@ class Patience:
 
 
 class Crowd:
-    """All connections of a server, and those without a request under way, oldest first."""
+    """All connections of a server: those without a request under way, oldest first, and the others."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, numbers: Crowding = CROWDING) -> None:
         self._most = most
+        self._kept = numbers.kept
         self._all: set[Connection] = set()
         self._silent: dict[Connection, None] = {}
+        self._busy: dict[Connection, None] = {}
 
     def add(self, connection: Connection) -> None:
-        """A new one. Beyond the limit the connection that has been idle longest is closed, which may be this one."""
+        """A new one. Beyond the limit the connection that has been idle longest is closed; if all are busy, the newest
+        of the key (or address) that holds most; if none holds two, the new one takes a place that is kept."""
         self._all.add(connection)
         self._silent[connection] = None
-        if len(self._all) > self._most:
-            oldest = next(iter(self._silent))
-            self.remove(oldest)
-            oldest.transport.abort()
+        if len(self._all) <= self._most:
+            return
+        leaves: Connection | None = next(iter(self._silent))
+        if leaves is connection:
+            leaves = self._newest_of_the_greediest()
+        if leaves is None:
+            leaves = connection if len(self._all) > self._most + self._kept else None
+        if leaves is not None:
+            self.remove(leaves)
+            leaves.transport.abort()
 
     def silent(self, connection: Connection) -> None:
         """Its request is answered."""
+        self._busy.pop(connection, None)
         if connection in self._all:
             self._silent[connection] = None
 
     def busy(self, connection: Connection) -> None:
         """A request of its own is under way: it stays."""
-        self._silent.pop(connection, None)
+        if connection in self._all:
+            self._silent.pop(connection, None)
+            self._busy[connection] = None
 
     def remove(self, connection: Connection) -> None:
         """It is gone."""
         self._all.discard(connection)
         self._silent.pop(connection, None)
+        self._busy.pop(connection, None)
+
+    def check_place(self, *, privileged: bool) -> None:
+        """Unavailable for a request in a place that is kept for others."""
+        if len(self._all) > self._most and not privileged:
+            raise Unavailable("all connections of this server are busy ([server] connections); try again")
+
+    def _newest_of_the_greediest(self) -> Connection | None:
+        held = Counter(connection.holder for connection in self._busy if not connection.privileged)
+        if not held:
+            return None
+        holder, count = held.most_common(1)[0]
+        if count < 2:
+            return None
+        return next(one for one in reversed(self._busy) if one.holder == holder and not one.privileged)
+
+
+class Line:
+    """Requests whose key is not known yet: so many of one address at a time, the others wait in order."""
+
+    def __init__(self, numbers: Crowding = CROWDING) -> None:
+        self._at_once = numbers.strangers
+        self._under_way: Counter[str] = Counter()
+        self._waiting: OrderedDict[str, deque[Connection]] = OrderedDict()
+
+    def enter(self, connection: Connection) -> bool:
+        """Whether its request may begin; else :meth:`Connection.go_on` is called once it may."""
+        if self._under_way[connection.address] < self._at_once:
+            self._under_way[connection.address] += 1
+            return True
+        self._waiting.setdefault(connection.address, deque()).append(connection)
+        return False
+
+    def leave(self, address: str) -> None:
+        """One of this address is done, or its key is known: the next one may begin."""
+        queue = self._waiting.get(address)
+        if queue:
+            queue.popleft().go_on()
+        else:
+            self._under_way[address] -= 1
+            if not self._under_way[address]:
+                del self._under_way[address]
+        if not queue:
+            self._waiting.pop(address, None)
+
+    def give_up(self, connection: Connection) -> None:
+        """It waits no longer."""
+        queue = self._waiting.get(connection.address)
+        if queue and connection in queue:
+            queue.remove(connection)
 
 
 class Connection(asyncio.Protocol):
     """One connection: passes everything on to ``inner``, and closes if the client exceeds a time limit."""
 
-    def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd) -> None:
-        self._inner, self._patience, self._crowd = inner, patience, crowd
+    def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd, line: Line) -> None:
+        self._inner = inner
+        self._patience = patience
+        self._crowd = crowd
+        self._line = line
         self._loop = asyncio.get_running_loop()
         self._clock: asyncio.TimerHandle | None = None
         """Runs while a head or a body is awaited."""
@@ -81,12 +176,19 @@ class Connection(asyncio.Protocol):
         """Runs while the client takes nothing of an answer."""
         self._head: bytearray | None = bytearray()
         """Bytes of the head so far; None from its end to the end of its request's body."""
+        self._held = b""
+        """The end of a head that waits in line."""
         self._asked = self._answering = False
-        self._body_left = self._refused = False
+        self._body_left = self._refused = self._pipelined = False
+        self._in_line = self._waits = False
+        self._key_known = self._key_known_before = False
+        self.address = self.holder = ""
+        self.privileged = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Wait for a head."""
         self.transport = cast("asyncio.Transport", transport)  # uvloop's is none by its class
+        self.address = self.holder = str((transport.get_extra_info("peername") or ("",))[0])
         self._inner.connection_made(transport)
         self._start(self._patience.header_s)
         self._crowd.add(self)
@@ -95,13 +197,75 @@ class Connection(asyncio.Protocol):
         """Whatever comes between two requests, even a single byte, starts the clock of the next one's head."""
         if self._refused:
             return
+        if self._waits:
+            self._held += data
+            return
+        if self._answering and not self._body_left:
+            self._pipelined = True  # thrown away: the connection ends after this answer
+            return
         if self._head is not None:
             self._head += data
-            if _END_OF_HEAD.search(self._head, 0, HEAD_BYTES):
-                self._head = None
-            elif len(self._head) > HEAD_BYTES:
-                self._refuse(_TOO_LARGE)
+            end = _END_OF_HEAD.search(self._head, 0, HEAD_BYTES)
+            fault = _fault_of(bytes(self._head[: end.end()] if end else self._head))
+            if fault is None and end is None and len(self._head) > HEAD_BYTES:
+                fault = _TOO_LARGE
+            if fault is not None:
+                self._refuse(fault)
                 return
+            if end:
+                data = self._end_head(data, len(self._head) - end.end())
+                if not self._may_begin(data):
+                    return
+        self._pass_on(data)
+
+    def go_on(self) -> None:
+        """Its turn in line has come."""
+        self._waits, self._in_line = False, True
+        self._loop.call_soon(self._begin_held)
+
+    def identify(self, name: str, *, privileged: bool) -> None:
+        """The key of the request under way is known: its name, and whether it is a reviewer's or an operator's.
+        Unavailable if the connection has a place that is kept for those."""
+        self._key_known, self.privileged = True, privileged
+        self.holder = name or self.address
+        self.step_aside()
+        self._crowd.check_place(privileged=privileged)
+
+    def step_aside(self) -> None:
+        """Let the next one in line begin."""
+        if self._in_line:
+            self._in_line = False
+            self._line.leave(self.address)
+
+    def _end_head(self, data: bytes, after: int) -> bytes:
+        """The head is complete, with so many bytes after it: the part of ``data`` that belongs to its request."""
+        assert self._head is not None
+        begun = bytes(self._head[: len(self._head) - after]).lower()
+        self._head = None
+        self._crowd.busy(self)
+        if after and not any(length in begun for length in _LENGTHS):
+            self._pipelined = True
+            return data[:-after]
+        return data
+
+    def _may_begin(self, data: bytes) -> bool:
+        """Whether the request of a complete head begins now; else it is held until its turn."""
+        if self._key_known_before:
+            return True
+        self._in_line = self._line.enter(self)
+        if not self._in_line:
+            self._waits, self._held = True, data
+            self._stop()
+            self.transport.pause_reading()
+        return self._in_line
+
+    def _begin_held(self) -> None:
+        data, self._held = self._held, b""
+        if not self.transport.is_closing():
+            self.transport.resume_reading()
+            self._pass_on(data)
+
+    def _pass_on(self, data: bytes) -> None:
         _CONNECTION.set(self)
         self._inner.data_received(data)
         if self._clock is None and not self._answering:
@@ -114,6 +278,8 @@ class Connection(asyncio.Protocol):
     def connection_lost(self, error: Exception | None) -> None:
         """Stop both clocks."""
         self._crowd.remove(self)
+        self._line.give_up(self)
+        self.step_aside()
         self._stop()
         self._read_again()
         self._inner.connection_lost(error)
@@ -141,11 +307,23 @@ class Connection(asyncio.Protocol):
         self._body_left = False
         self._stop()
 
+    def is_last(self) -> bool:
+        """Whether the client has sent more before it was answered: the connection ends after this answer."""
+        conn = cast("Any", self._inner).conn
+        return self._pipelined or (conn.their_state is h11.DONE and bool(conn.trailing_data[0]))
+
     def end_request(self) -> None:
         """Its answer is sent. What is left of an unread body stays under its clock; h11 throws it away."""
+        if not self._answering:
+            return
         self._answering = False
+        self._key_known_before, self._key_known = self._key_known, False
         self._head = None if self._body_left else bytearray()
+        self.step_aside()
         self._crowd.silent(self)
+        if self._pipelined:
+            self._refused = True
+            self.transport.close()
 
     def _start(self, seconds: float) -> None:
         self._clock = self._loop.call_later(seconds, self._too_slow)
@@ -182,10 +360,37 @@ _CONNECTION: ContextVar[Connection | None] = ContextVar("mapvote_connection", de
 """The connection of the current request: uvicorn starts a request's task while it receives the request's bytes."""
 
 
+def identify(name: str, *, privileged: bool) -> None:
+    """:meth:`Connection.identify` of the current request; nothing within a process."""
+    connection = _CONNECTION.get()
+    if connection is not None:
+        connection.identify(name, privileged=privileged)
+
+
+def step_aside() -> None:
+    """:meth:`Connection.step_aside` of the current request."""
+    connection = _CONNECTION.get()
+    if connection is not None:
+        connection.step_aside()
+
+
+def _fault_of(head: bytes) -> bytes | None:
+    """The refusal of a head, or of its beginning, that an HTTP client does not send: too many headers; a line that ends
+    without CR, or goes on in the next one; a length beside a transfer encoding. Two programs would read it as different
+    requests (RFC 9112, 11.2)."""
+    head = head.lstrip(b"\r\n")
+    if head.count(b"\n") > CROWDING.headers + 2:
+        return _TOO_LARGE
+    lines = head.lower()
+    if _BARE_LINE_END.search(head) or b"\r\n " in head or b"\r\n\t" in head:
+        return _MALFORMED
+    return _MALFORMED if all(length in lines for length in _LENGTHS) else None
+
+
 def watched(inner: type[asyncio.Protocol], patience: Patience) -> type[asyncio.Protocol]:
     """A factory of protocols, each behind a :class:`Connection`; uvicorn calls it as the class ``inner``."""
-    crowd = Crowd(patience.connections)
-    return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd))
+    crowd, line = Crowd(patience.connections), Line()
+    return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd, line))
 
 
 def tracked(app: ASGIApp) -> ASGIApp:
@@ -203,10 +408,18 @@ def tracked(app: ASGIApp) -> ASGIApp:
                 connection.end_body()
             return message
 
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start" and connection.is_last():
+                message = {**message, "headers": [*message.get("headers", ()), (b"connection", b"close")]}
+            await send(message)
+            if message["type"] == "http.response.body" and not message.get("more_body", False):
+                connection.end_request()
+
         sized = {name: value for name, value in scope["headers"] if name in (b"content-length", b"transfer-encoding")}
         connection.begin_request(has_body=bool(sized) and sized.get(b"content-length") != b"0")
         try:
-            await app(scope, received, send)
+            crowded = len(scope["headers"]) > CROWDING.headers
+            await (Response(status_code=431) if crowded else app)(scope, received, sent)
         finally:
             connection.end_request()
 

@@ -12,6 +12,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
 from mapvote.shapes.geojson import feature_rows
+from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -83,7 +84,7 @@ def _hashes(hashes: TileHashes, tile: Tile) -> dict[str, str] | None:
 
 async def _look(parts: Services) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
-    found = await parts.decide(desk, parts.store, parts.fusing, parts.gate)
+    found = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
     parts.clouds.propose(found.edited.values())
     return found
 
@@ -102,11 +103,12 @@ async def decide(by: Reviewer, parts: Parts, ask: ReviewAsk) -> VerdictGiven:
     """
     given = parts.store, ask.change, ask.verdict
     return VerdictGiven(
-        seq=await parts.decide(review, *given, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
+        seq=await parts.rounds.run(review, *given, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
     )
 
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
+@on("commands")
 def take_back(by: Reviewer, parts: Parts, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> VerdictGiven:
     """The change is pending again."""
     undo(parts.store, seq, by=by)

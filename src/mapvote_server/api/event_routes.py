@@ -7,21 +7,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from typing import Annotated
 
 import httpx2
 import msgspec
 import structlog
-from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 from standardwebhooks import Webhook
 
 from mapvote_server.api.schemas import problems
 from mapvote_server.api.services import Known, Parts, Services
-from mapvote_server.errors import Unavailable
+from mapvote_server.errors import TooMany, Unauthorised, Unavailable
 from mapvote_server.questions.history import Event, newest_event, take, taken_up_to, without_names
+from mapvote_server.store.keys import Key, any_issued
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0
@@ -49,16 +48,43 @@ async def listen(
     """
     start = last_event_id if last_event_id is not None else after
     if start is None:
-        start = await to_thread.run_sync(newest_event, parts.store, limiter=parts.fetching)
+        start = await parts.look_up(newest_event, parts.store)
+    key: Key | None = request.state.key
+    if key is not None and parts.streams[key.name] >= parts.settings.server.streams_per_key:
+        most = f"{key.name!r} listens to {parts.streams[key.name]} streams already"
+        raise TooMany(f"{most} ([server] streams_per_key): end one of these first")
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(_stream(request, parts, start, named), media_type="text/event-stream", headers=headers)
+    stream = _counted(parts, key, _stream(request, parts, start, key, named))
+    return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-async def _stream(request: Request, parts: Services, seq: int, named: bool) -> AsyncIterator[bytes]:
+async def _counted(parts: Services, key: Key | None, stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """The stream, counted for its key as long as it lasts."""
+    if key is None:
+        async for sent in stream:
+            yield sent
+        return
+    if parts.streams[key.name] >= parts.settings.server.streams_per_key:  # others began since it was counted
+        return
+    parts.streams[key.name] += 1
+    try:
+        async for sent in stream:
+            yield sent
+    finally:
+        parts.streams[key.name] -= 1
+        if not parts.streams[key.name]:
+            del parts.streams[key.name]
+
+
+async def _stream(request: Request, parts: Services, seq: int, key: Key | None, named: bool) -> AsyncIterator[bytes]:
+    """Events after ``seq``, until the key is revoked or expires: it is looked up after each batch was read, before the
+    batch is sent."""
     yield b": listening\n\n"
     silent = 0.0
     while not parts.stopping.is_set() and not await request.is_disconnected():
-        found = await to_thread.run_sync(parts.feed.after, seq, limiter=parts.fetching)
+        found = await parts.look_up(parts.feed.after, seq)
+        if not await _still_open(parts, key, request.state.key_hash):
+            return
         for event in found if named else without_names(found):
             yield as_sse(event)
         if found:
@@ -69,6 +95,19 @@ async def _stream(request: Request, parts: Services, seq: int, named: bool) -> A
         if silent >= _STILL_THERE_S:
             silent = 0.0
             yield b": still here\n\n"
+
+
+async def _still_open(parts: Services, key: Key | None, key_hash: str | None) -> bool:
+    """Whether the key of a stream is still good; without a key, whether the server still needs none."""
+    if key is None:
+        return not await parts.look_up(any_issued, parts.store)
+    if key_hash is None:  # the owner of the store, in this process
+        return True
+    try:
+        await parts.known_keys.put(key_hash)
+    except Unauthorised:
+        return False
+    return True
 
 
 def as_sse(event: Event) -> bytes:
@@ -99,13 +138,12 @@ async def deliver(parts: Services) -> None:
     A post that is not answered by 2xx is repeated, after one second, then two, four, at most sixty; none overtakes it.
     """
     asked = parts.settings.server
-    ask = partial(to_thread.run_sync, limiter=parts.fetching)
-    seq = noted = await ask(taken_up_to, parts.store, asked.webhook_url)
+    seq = noted = await parts.look_up(taken_up_to, parts.store, asked.webhook_url)
     wait = _EVERY_S
     async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
         while True:
             try:
-                events = await ask(parts.feed.after, seq)
+                events = await parts.look_up(parts.feed.after, seq)
                 if events:
                     body = msgspec.json.encode({"map_id": parts.store.map_id, "events": events})
                     at = datetime.fromtimestamp(parts.store.clock() // 10**9, UTC)
@@ -113,7 +151,7 @@ async def deliver(parts: Services) -> None:
                     (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
                     seq = events[-1].seq
                 if seq != noted:
-                    await ask(take, parts.store, asked.webhook_url, seq)
+                    await parts.look_up(take, parts.store, asked.webhook_url, seq)
                     noted = seq
                 wait = _EVERY_S
             except (httpx2.HTTPError, Unavailable) as error:

@@ -42,6 +42,12 @@ def asks_for_page(scope: Scope) -> bool:
     return scope["method"] == "GET" and scope["path"] in _PAGES and b"text/html" in accepted
 
 
+def is_page(scope: Scope) -> bool:
+    """Whether a link of another server may lead here: a page that a browser opens as a whole."""
+    mode = next((value for name, value in scope["headers"] if name == b"sec-fetch-mode"), b"")
+    return scope["method"] == "GET" and scope["path"] in _PAGES and mode == b"navigate"
+
+
 def form(why: str = "") -> Response:
     """401 with the form; ``why`` the last key was not taken."""
     body = _file("key.html").replace("WHY", html.escape(why))

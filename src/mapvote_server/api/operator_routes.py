@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import structlog
 from fastapi import APIRouter, Query, Request, Response
@@ -15,6 +15,7 @@ from prometheus_client import generate_latest
 from mapvote.codec.ballot import tile_key
 from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import feature_rows, tile_squares
+from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
     Cancelled,
@@ -80,7 +81,7 @@ router = APIRouter()
 @router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
 async def publish_now(by: Operator, parts: Parts, ask: PublishAsk) -> Published:
     """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
-    return await parts.decide(_publish, parts, ask, by)
+    return await parts.rounds.run(_publish, parts, ask, by)
 
 
 @router.get("/v1/publish", response_model=Publishes, responses=problems(403), summary="How far a publish is")
@@ -145,7 +146,7 @@ def _as_answer(done: Outcome, waits: str = "") -> Published:
 )
 async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
-    version = await parts.decide(rollback, parts.store, ask.to, by=by, reason=ask.reason)
+    version = await parts.commands.run(rollback, parts.store, ask.to, by=by, reason=ask.reason)
     return as_json({"version": version.number})
 
 
@@ -155,6 +156,7 @@ async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     responses=problems(404) | AS_CSV,
     summary="What changed, as GeoJSON in map metres or as CSV",
 )
+@on("questions")
 def changes(
     parts: Parts,
     known: Known,
@@ -176,6 +178,7 @@ def changes(
     responses=problems(404) | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
     summary="What changed, as a page that needs no server",
 )
+@on("questions")
 def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_cells: MinCells = 1) -> Response:
     """A file to keep or to mail: the clouds of the largest changes, before and after."""
     store = parts.store
@@ -186,6 +189,7 @@ def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_
 
 
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
+@on("questions")
 def cell(parts: Parts, known: Known, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     return as_json(explain_cell(parts.store, x, y, known=known))
@@ -197,6 +201,7 @@ def cell(parts: Parts, known: Known, x: float, y: float) -> Response:
     responses=problems() | AS_CSV,
     summary="Freshness of every tile",
 )
+@on("questions")
 def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
     answer = tiles_seen(parts.store, known)
@@ -206,6 +211,7 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
 
 
 @router.get("/v1/coverage/passes", response_model=Passes, responses=problems(403), summary="Where to drive next")
+@on("questions")
 def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
     return as_json(wanted_passes(parts.store))
@@ -217,6 +223,7 @@ def passes(by: Reviewer, parts: Parts) -> Response:
     responses=problems(403) | AS_CSV,
     summary="Vehicles that contradict the others",
 )
+@on("questions")
 def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
     """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
     found = vehicle_standings(parts.store)
@@ -228,25 +235,33 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
 
 
 @router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
+@on("questions")
 def policy(parts: Parts) -> Response:
     """The policy in force, who set it and why."""
+    return _policy_of(parts)
+
+
+def _policy_of(parts: Services) -> Response:
     return as_json(parts.store.policy_changes()[-1])
 
 
 @router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
+@on("commands")
 def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
     parts.store.change_policy(ask.values, by=by, reason=ask.reason)
-    return policy(parts)
+    return _policy_of(parts)
 
 
 @router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
+@on("questions")
 def info(parts: Parts) -> Response:
     """The map, its newest version, and how much there is of everything."""
     return as_json(overview(parts.store))
 
 
 @router.get("/v1/log", response_model=Log, responses=problems(403), summary="What happened")
+@on("questions")
 def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
     """Every version, and the last so many events."""
     return as_json(log_of(parts.store, events))
@@ -255,20 +270,20 @@ def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000
 @router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
 async def whole(by: Operator, parts: Parts) -> Response:
     """Reads the whole store and names what is damaged. Nothing is changed."""
-    return as_json({"damage": await parts.decide(check, parts.store)})
+    return as_json({"damage": await parts.rounds.run(check, parts.store)})
 
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(by: Operator, parts: Parts) -> Response:
     """As GET; damaged items are also quarantined."""
-    return as_json({"damage": await parts.decide(check, parts.store, mend=True, by=by)})
+    return as_json({"damage": await parts.rounds.run(check, parts.store, mend=True, by=by)})
 
 
 @router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
 async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
     raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
-    return Restored(restored=await parts.decide(restore_plane, parts.store, digest, raw, by=by))
+    return Restored(restored=await parts.commands.run(restore_plane, parts.store, digest, raw, by=by))
 
 
 @router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
@@ -276,13 +291,13 @@ async def begin_anew(by: Operator, parts: Parts, everybody: bool) -> Withdrawn:
     """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
     if not everybody:
         raise MapvoteError("name a vehicle in the path, or say everybody=true")
-    return Withdrawn(withdrawn=await parts.decide(withdraw, parts.store, None, by=by))
+    return Withdrawn(withdrawn=await parts.commands.run(withdraw, parts.store, None, by=by))
 
 
 @router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
 async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Published:
     """Every version again without its votes; the difference to the newest is one new version."""
-    return await parts.decide(_replay, parts, ask, by)
+    return await parts.rounds.run(_replay, parts, ask, by)
 
 
 def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
@@ -293,16 +308,17 @@ def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
 @router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
 async def clearable(by: Operator, parts: Parts) -> Response:
     """Old versions and ballots that POST would delete."""
-    return as_json(await parts.decide(clear, parts.store, dry_run=True))
+    return as_json(await parts.rounds.run(clear, parts.store, dry_run=True))
 
 
 @router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
 async def clear_now(by: Operator, parts: Parts) -> Response:
     """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
-    return as_json(await parts.decide(clear, parts.store, dry_run=False, by=by))
+    return as_json(await parts.rounds.run(clear, parts.store, dry_run=False, by=by))
 
 
 @router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
+@on("questions")
 def listed_keys(by: Operator, parts: Parts) -> Response:
     """All keys ever issued, revoked and expired ones too."""
     standing, now = keys.ballots_standing(parts.store), parts.store.clock()
@@ -312,19 +328,21 @@ def listed_keys(by: Operator, parts: Parts) -> Response:
 
 
 @router.post("/v1/keys", response_model=KeyIssued, responses=problems(403), summary="Issue a key")
+@on("commands")
 def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
     """The answer is the only place where the key is ever seen: the store keeps its hash."""
-    role = cast("keys.Role", ask.role)
-    return as_json({"key": keys.issue(parts.store, ask.name, role, by=by, days=ask.days)})
+    return as_json({"key": keys.issue(parts.store, ask.name, ask.role, by=by, days=ask.days)})
 
 
 @router.post("/v1/keys/rotate", response_model=KeyIssued, responses=problems(403, 404), summary="Replace a key")
+@on("commands")
 def rotate_key(by: Operator, parts: Parts, ask: RotateAsk) -> Response:
     """A new key of the same role and length for who has a valid one."""
     return as_json({"key": keys.rotate(parts.store, ask.name, by=by, overlap_days=ask.overlap_days)})
 
 
 @router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
+@on("commands")
 def revoke_keys(by: Operator, parts: Parts, ask: RevokeAsk) -> KeysRevoked:
     """Its standing ballots count no more, unless ``keep_votes``."""
     revoked, ballots = keys.revoke(parts.store, ask.name, by=by, keep_votes=ask.keep_votes)
@@ -359,7 +377,7 @@ async def ready(parts: Parts) -> Ready:
 
     ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
     """
-    version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
+    version, damaged = await parts.check_ready(), await parts.look_up(_damaged, parts.store)
     return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
 
 
@@ -367,5 +385,5 @@ async def ready(parts: Parts) -> Ready:
 async def metrics(parts: Parts) -> Response:
     """Counters, latencies, the newest version."""
     parts.metrics.version.set(await parts.newest.put(None))
-    parts.metrics.tell_damaged(await parts.look_up(_damaged))
+    parts.metrics.tell_damaged(await parts.look_up(_damaged, parts.store))
     return Response(generate_latest(parts.metrics.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

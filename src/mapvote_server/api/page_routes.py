@@ -17,6 +17,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
 from mapvote.shapes.packed_cloud import N_LEVELS
+from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
     Digest,
@@ -52,6 +53,7 @@ router = APIRouter()
 
 
 @router.get("/v1/clouds/overview", summary="A whole version, coarse", **sends_bytes(404))
+@on("questions")
 def overview(request: Request, parts: Parts, version: VersionQuery | None = None) -> Response:
     """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
     number = parts.store.current() if version is None else version
@@ -59,12 +61,14 @@ def overview(request: Request, parts: Parts, version: VersionQuery | None = None
 
 
 @router.get("/v1/clouds/changed", summary="Points added and deleted between two versions", **sends_bytes(404))
+@on("questions")
 def changed(request: Request, parts: Parts, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
     return packed(request, parts.clouds.changed(old, new), _FOR_EVER)
 
 
 @router.get("/v1/clouds/{points}/{ground}/{level}", summary="One level of detail of a tile", **sends_bytes(404))
+@on("questions")
 def level_of(
     request: Request,
     parts: Parts,
@@ -80,6 +84,7 @@ def level_of(
 
 
 @router.get("/v1/evidence/{row}/{col}", summary="Votes cell by cell", **sends_bytes(403))
+@on("questions")
 def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
     """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
 
@@ -92,6 +97,7 @@ def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicl
 
 
 @router.get("/v1/paths", response_model=Places, responses=problems(403) | AS_CSV, summary="Paths of the drives")
+@on("questions")
 def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
     """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
     ``csv`` without the lines."""
@@ -108,7 +114,7 @@ def packed(request: Request, data: bytes, cache: str) -> Response:
 
 
 @router.get("/docs", include_in_schema=False)
-def docs(request: Request) -> Response:
+async def docs(request: Request) -> Response:
     """The API on one page, from its OpenAPI document, without any script or request to elsewhere."""
     rows = []
     for path, methods in request.app.openapi()["paths"].items():

@@ -22,9 +22,21 @@ from mapvote.core.types import MapvoteError
 from mapvote.shapes.change_objects import Kind, Size
 from mapvote.shapes.geojson import as_csv
 from mapvote_server.api.services import Progress
-from mapvote_server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
+from mapvote_server.errors import (
+    Conflict,
+    Forbidden,
+    Held,
+    NotFound,
+    TooLarge,
+    TooMany,
+    TooSlow,
+    Unauthorised,
+    Unavailable,
+)
 from mapvote_server.questions.vehicles import VehicleStanding
+from mapvote_server.store import keys
 from mapvote_server.store.integrity import Damage
+from mapvote_server.work import count_rows
 
 STATUS: Mapping[type[MapvoteError], int] = {
     Unauthorised: 401,
@@ -33,16 +45,19 @@ STATUS: Mapping[type[MapvoteError], int] = {
     Conflict: 409,
     TooLarge: 413,
     MapvoteError: 422,
+    TooSlow: 422,
     TooMany: 429,
     Unavailable: 503,
 }
 """An entry also holds for the subclasses of its class."""
-LEAST, MOST = -(1 << 31), (1 << 31) - 1
-"""Range of a version's number in a database."""
+LEAST, MOST = 1, (1 << 31) - 1
+"""Range of a version's number."""
 PLAIN = r"^[^\x00-\x1f]*$"
 """No control characters: PostgreSQL stores no NUL."""
 
-Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+Name = Annotated[str, Path(pattern=_NAME)]
+NameOf = Annotated[str, Field(pattern=_NAME, description="1-64 of letters, digits, dot, underscore, dash")]
 Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 Number = Annotated[int, Path(ge=LEAST, le=MOST)]
 Table = Literal["json", "csv"]
@@ -77,7 +92,7 @@ class PublishAsk(Ask):
 class ReplayAsk(Ask):
     """Whose votes to take out of every version."""
 
-    vehicle: str = Field(max_length=64, pattern=PLAIN)
+    vehicle: NameOf
     dry_run: bool = Field(default=True, description="only say what would change; false publishes it")
 
 
@@ -91,22 +106,22 @@ class PolicyAsk(Ask):
 class IssueAsk(Ask):
     """Whose key, and what it opens."""
 
-    name: str = Field(max_length=200, pattern=PLAIN, description="1-64 of letters, digits, dot, underscore, dash")
-    role: str = Field(default="vehicle", max_length=20, description="vehicle, reader, reviewer or operator")
+    name: NameOf
+    role: keys.Role = "vehicle"
     days: float | None = Field(default=None, description="the key expires after so many days; null: never")
 
 
 class RotateAsk(Ask):
     """Whose key is replaced."""
 
-    name: str = Field(max_length=200, pattern=PLAIN)
+    name: NameOf
     overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
 
 
 class RevokeAsk(Ask):
     """Whose keys are revoked."""
 
-    name: str = Field(max_length=200, pattern=PLAIN)
+    name: NameOf
     keep_votes: bool = Field(default=False, description="whether its standing ballots still count")
 
 
@@ -433,7 +448,7 @@ AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octe
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     """For the OpenAPI document: the refusals that every route knows, and these."""
-    return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
+    return {code: {"model": Problem} for code in (401, 422, 429, 503, *codes)}
 
 
 def sends_bytes(*codes: int) -> dict[str, Any]:
@@ -443,7 +458,9 @@ def sends_bytes(*codes: int) -> dict[str, Any]:
 
 def as_json(content: object) -> Response:
     """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
-    all others."""
+    all others. The members of its lists are counted as rows."""
+    members = content.values() if isinstance(content, Mapping) else ()
+    count_rows(1 + sum(len(member) for member in members if isinstance(member, list)))
     return Response(msgspec.json.encode(content, enc_hook=_plain), media_type="application/json")
 
 
@@ -452,7 +469,8 @@ def _plain(model: Any) -> Any:
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> Response:
-    """Rows as CSV."""
+    """Rows as CSV, counted."""
+    count_rows(1 + len(rows))
     return Response(as_csv(rows), media_type="text/csv")
 
 
@@ -475,7 +493,7 @@ def refuse(error: Exception) -> Response:
 async def unreadable(request: Request, error: Exception) -> Response:
     """A body that is not even UTF-8: FastAPI answers 400, but every unusable body is 422 here.
 
-    Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
+    Asynchronous, as FastAPI would run a plain function in a thread of its own pool.
     """
     return refuse(MapvoteError("the body is no JSON in UTF-8"))
 

@@ -12,9 +12,8 @@ import binascii
 import ipaddress
 import re
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
-from concurrent.futures import Executor
-from functools import lru_cache, partial
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import structlog
 from starlette.responses import Response
@@ -22,18 +21,18 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import key_form
+from mapvote_server.api.connections import identify, step_aside
+from mapvote_server.api.lanes import asker
+from mapvote_server.api.proxies import Proxies
 from mapvote_server.api.schemas import refuse
-from mapvote_server.api.services import Batcher, Metrics, RateLimit
+from mapvote_server.api.services import RateLimit, Services
 from mapvote_server.errors import Forbidden, TooMany, Unauthorised, Unavailable
 from mapvote_server.store import keys
-from mapvote_server.store.store import Store
 
-_AT_ONCE = 256
-"""Keys looked up in one query at most."""
 _REMEMBERED = 10_000
 _PAUSE_S = 1.0
 _WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
-"""Wrong keys from one address that are looked up."""
+"""Wrong keys from one address that are answered at once; further ones wait :data:`_PAUSE_S` for their answer."""
 
 
 class Guard:
@@ -48,12 +47,10 @@ class Guard:
     ``owner``: every request is that of an operator of this name.
     """
 
-    def __init__(self, store: Store, threads: Executor, *, opened: bool, owner: str | None = None) -> None:
+    def __init__(self, parts: Services, *, opened: bool, owner: str | None = None) -> None:
+        self._parts = parts
         self._opened = opened
         self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
-        self._any_issued = partial(keys.any_issued, store)
-        self._threads = threads
-        self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE, threads)
         self._known: dict[str, keys.Key] = {}
         self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
 
@@ -63,12 +60,13 @@ class Guard:
         """The key of a request and its hash (None of the owner); None if the server is open.
 
         Unauthorised if the key is missing, unknown or revoked; of a ``ballot`` a known key passes, and the store
-        decides. TooMany if ``peer`` has sent too many wrong keys: no new key from there is looked up for a while.
+        decides. TooMany in its place if ``peer`` has sent many wrong keys. A right key never waits for wrong ones:
+        every key is looked up, and only the answer to a wrong one is delayed.
         """
         if self._owner is not None:
             return self._owner, None
         if self._opened:
-            self._opened = not await asyncio.get_running_loop().run_in_executor(self._threads, self._any_issued)
+            self._opened = not await self._parts.look_up(keys.any_issued, self._parts.store)
         if self._opened:
             return None
         secret = _secret_of(authorization)
@@ -84,16 +82,16 @@ class Guard:
         return key, digest
 
     async def _look_up(self, digest: str, peer: str) -> keys.Key:
-        if digest not in self._known:
+        try:
+            return await self._parts.known_keys.put(digest)
+        except Unauthorised:
+            self._known.pop(digest, None)
             try:
-                self._wrong.check(peer)
+                self._wrong.take(peer)
             except TooMany:
+                step_aside()
                 await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of sending more
                 raise
-        try:
-            return await self._looked_up.put(digest)
-        except Unauthorised:
-            self._wrong.take(peer)
             raise
 
 
@@ -129,8 +127,16 @@ class Hosts:
         self._allowed = frozenset(name.lower() for name in allowed) | {"localhost"}
         self._ours = lru_cache(maxsize=256)(self._is_ours)
 
-    def check(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
+    def check(self, scope: Scope) -> None:
         """Forbidden for a request to another name, or by a page of another server."""
+        headers = scope["headers"]
+        self._check_names(headers)
+        # An <img> or a link sends no Origin, but the browser's Basic credentials. Links may lead to the pages alone.
+        site = next((value for name, value in headers if name == b"sec-fetch-site"), b"")
+        if site in (b"cross-site", b"same-site") and not key_form.is_page(scope):
+            raise Forbidden("pages of other servers may not use this server: open it in a window of its own")
+
+    def _check_names(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
         host = origin = None
         for name, value in headers:
             if name == b"host":
@@ -177,21 +183,19 @@ def _authorization(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
 
 PROBES = ("/livez", "/readyz")
 """Who asks without a key, by any name of the server, gets a status without content."""
-_PROBE_S = 1.0
 log = structlog.get_logger("mapvote")
 
 
 class Watch:
-    """The outermost layer. No key, header or query is ever logged.
+    """The outermost layer. No key, header or query is ever logged."""
 
-    ``ready`` raises Unavailable if no ballot can be taken now. Probes call it once a second at most.
-    """
-
-    def __init__(
-        self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, ready: Callable[[], Awaitable[object]]
-    ) -> None:
-        self._app, self._hosts, self._guard, self._metrics, self._ready = app, hosts, guard, metrics, ready
-        self._probed, self._until = 503, 0.0
+    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, proxies: Proxies, parts: Services) -> None:
+        self._app = app
+        self._hosts = hosts
+        self._guard = guard
+        self._proxies = proxies
+        self._metrics = parts.metrics
+        self._ready = parts.check_ready
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -206,7 +210,8 @@ class Watch:
             await send(message)
 
         try:
-            self._hosts.check(scope["headers"])
+            self._proxies.apply(scope)
+            self._hosts.check(scope)
             peer = (scope["client"] or ("",))[0]
             if scope["method"] == "POST" and scope["path"] == key_form.PATH:
                 answer = await self._let_in(scope, receive, peer)
@@ -217,6 +222,9 @@ class Watch:
             whose = await self._guard.who(authorization, peer, ballot=ballot)
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
+            if key_hash is not None and key is not None:
+                asker.set(key.name)
+            identify(key.name if key else "", privileged=key is None or key.role in ("reviewer", "operator"))
             await self._app(scope, receive, watched)
         except MapvoteError as error:
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
@@ -252,11 +260,8 @@ class Watch:
         """The answer to a probe."""
         if path == "/livez":
             return 200
-        if time.monotonic() >= self._until:
-            self._until = time.monotonic() + _PROBE_S
-            try:
-                await self._ready()
-                self._probed = 200
-            except Unavailable:
-                self._probed = 503
-        return self._probed
+        try:
+            await self._ready()
+        except Unavailable:
+            return 503
+        return 200

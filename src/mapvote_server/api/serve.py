@@ -110,7 +110,7 @@ def serve(
         h11_max_incomplete_event_size=HEAD_BYTES,
         ws="none",
         access_log=False,
-        forwarded_allow_ips=["127.0.0.1", "::1"],  # a proxy on this machine names its clients
+        proxy_headers=False,  # mapvote_server.api.proxies reads them
         log_level="warning",
         timeout_graceful_shutdown=_PATIENCE_S,
         server_header=False,

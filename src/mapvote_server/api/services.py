@@ -16,13 +16,14 @@ from threading import Event, Lock
 from typing import Annotated, Generic, NamedTuple, ParamSpec, TypeVar
 
 import msgspec
-from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.requests import ClientDisconnect
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
+from mapvote_server.api.lanes import Budget, Lane
+from mapvote_server.api.probe import Probe
 from mapvote_server.errors import Conflict, Forbidden, NotFound, TooLarge, TooMany, Unavailable
 from mapvote_server.questions.clouds import Clouds
 from mapvote_server.questions.history import Feed
@@ -31,15 +32,11 @@ from mapvote_server.store.admission import Incoming, Intake, Quota, Receipt
 from mapvote_server.store.fusion_jobs import Watched
 from mapvote_server.store.integrity import KINDS
 from mapvote_server.store.publish import Gate
-from mapvote_server.store.queries import current_number
 from mapvote_server.store.store import Store
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
 Given = ParamSpec("Given")
-READING = 1
-"""Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
-that answer vehicles."""
 
 
 class RateLimit:
@@ -307,6 +304,8 @@ _BURST = 0.1
 """Share of a minute's ballots that a vehicle may send at once."""
 _UPLOADS = 8
 """Largest bodies that fit into the memory for all ballots on their way."""
+_KEYS = 256
+"""Keys looked up in one query at most."""
 _READERS = 1024
 """Requests answered by one query of the newest version."""
 
@@ -314,9 +313,8 @@ _READERS = 1024
 class Services:
     """The parts that live as long as the app, on an open store; :func:`services` gives them to a route.
 
-    Each kind of work has its own threads, so that none blocks another. All other work runs in FastAPI's own pool of
-    :data:`READING` threads: what operators read. ``executor`` as in :func:`mapvote_server.api.app.create_app`.
-    ``limited``: whether the quotas of vehicles hold.
+    Each kind of work has its own threads (:mod:`mapvote_server.api.lanes`), so that none blocks another. ``executor``
+    as in :func:`mapvote_server.api.app.create_app`. ``limited``: whether quotas and time limits hold.
     """
 
     def __init__(
@@ -326,25 +324,38 @@ class Services:
         self.store, self.settings = store, settings
         self.gate = gate
         """Compares a version with the one before, before it is published."""
-        self.receiving = ThreadPoolExecutor(3, "ballots")
         self.lookups = ThreadPoolExecutor(2, "lookups")
-        """Keys, the newest version, health: short questions before every answer."""
+        """Keys, the newest version, events: short reads before and between answers."""
+        self._writing = ThreadPoolExecutor(1, "writer")
+        self.budget = Budget(most.work_s_per_minute, most.rows_per_minute)
+        self.vehicle = Lane("vehicle", 3, each=1, budget=self.budget)
+        """Manifests, tiles and ballots."""
+        question_s = most.question_s if limited else None
+        self.questions = Lane("questions", 2, each=1, budget=self.budget, limit_s=question_s)
+        """Answers that people read."""
+        self.commands = Lane("commands", 2, each=1)
+        """Short changes: keys, policy, votes taken back."""
+        self.rounds = Lane("rounds", 4, each=2)
+        """Work that fuses tiles, or reads the whole store."""
         self._fuse = ThreadPoolExecutor(2, "fuse")
         self.fusing = executor or self._fuse
         """The executor that fuses tiles."""
-        self.fetching = CapacityLimiter(4)
-        """Threads for manifests and tiles."""
-        self._deciding = CapacityLimiter(4)
         quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
-        self.writer: Batcher[Incoming, Receipt] = Batcher(Intake(store, quota).write, _BATCH, self.receiving)
+        self.intake = Intake(store, quota)
+        self.writer: Batcher[Incoming, Receipt] = Batcher(self.intake.write, _BATCH, self._writing)
         """Writes ballots, many in one transaction."""
         self.newest: Batcher[None, int] = Batcher(lambda asked: [store.current()] * len(asked), _READERS, self.lookups)
         """The number of the newest version, read once for all requests that wait for it."""
+        self.known_keys: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _KEYS, self.lookups)
+        """Whose keys these are, by their hashes; Unauthorised for those that open nothing."""
         self.manifests = Manifests(store)
         self.publishing = Publishing()
         self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()
         self.limit = RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute))
         self.uploads = Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes)
+        self._probe = Probe(store.database)
+        self.streams: TallyOf[str] = TallyOf()
+        """Streams of events under way, by the name on their key."""
         self.stopping = Event()
         """Set once the server stops."""
 
@@ -353,15 +364,11 @@ class Services:
         stopping."""
         if self.stopping.is_set():
             raise Unavailable("the server is stopping")
-        return await self.look_up(_newest_if_writable)
+        return await self._probe.newest()
 
-    async def look_up(self, ask: Callable[[Store], Answer]) -> Answer:
-        """The result of a short question to the store, in the threads for lookups."""
-        return await asyncio.get_running_loop().run_in_executor(self.lookups, ask, self.store)
-
-    async def decide(self, work: Callable[Given, Answer], *given: Given.args, **more: Given.kwargs) -> Answer:
-        """The result of slow work, which fuses tiles or reads the whole store, in the threads for it."""
-        return await to_thread.run_sync(partial(work, *given, **more), limiter=self._deciding)
+    async def look_up(self, work: Callable[Given, Answer], *given: Given.args, **more: Given.kwargs) -> Answer:
+        """The result of a short read of the store, in the threads for lookups."""
+        return await asyncio.get_running_loop().run_in_executor(self.lookups, partial(work, *given, **more))
 
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
@@ -371,13 +378,10 @@ class Services:
     async def close(self) -> None:
         """Wait until every accepted ballot is written."""
         await self.writer.close()
-        for pool in (self._fuse, self.receiving, self.lookups):
+        for part in (self.vehicle, self.questions, self.commands, self.rounds, self._probe):
+            part.close()
+        for pool in (self._fuse, self._writing, self.lookups):
             pool.shutdown(cancel_futures=True)
-
-
-def _newest_if_writable(store: Store) -> int:
-    with store.database.writing() as connection:
-        return current_number(connection)
 
 
 def services(request: Request) -> Services:
@@ -430,7 +434,7 @@ def name_of(request: Request, *roles: keys.Role) -> str:
 
 
 Parts = Annotated[Services, Depends(_parts)]
-"""Parameters of routes. Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
+"""Parameters of routes. Asynchronous, as FastAPI would run a plain function in a thread of its own pool.
 Routes that hundreds of vehicles ask at once look for themselves, which takes 50 us less."""
 Operator = Annotated[str, Depends(operator)]
 Reviewer = Annotated[str, Depends(reviewer)]

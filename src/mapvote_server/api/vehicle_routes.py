@@ -4,20 +4,18 @@ OpenAPI is the contract for vehicles in other languages: every answer is declare
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import Any
 
 import msgspec
-from anyio import to_thread
 from fastapi import APIRouter, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
 from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.shapes.geojson import utc
+from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
     Digest,
@@ -53,6 +51,7 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
 
 
 @router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
+@on("questions")
 def versions(parts: Parts, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by."""
     found = parts.store.versions()
@@ -88,7 +87,7 @@ async def plane(request: Request, digest: Digest) -> Response:
         "Vary": "Accept-Encoding",
     }
     parts = services(request)
-    data = await to_thread.run_sync(parts.store.blob, digest, limiter=parts.fetching)
+    data = await parts.vehicle.run(parts.store.blob, digest)
     if request.headers.get("if-none-match") == f'"{digest}"':
         return Response(status_code=304, headers=headers)
     if "zstd" in request.headers.get("accept-encoding", ""):
@@ -102,14 +101,16 @@ async def plane(request: Request, digest: Digest) -> Response:
 async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
     """Withdraw a ballot: later versions are as if it had never been cast."""
     by = own(request, vehicle)
-    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by))
+    parts = services(request)
+    return Withdrawn(withdrawn=await parts.commands.run(withdraw, parts.store, vehicle, drive, by=by))
 
 
 @router.delete("/v1/ballots/{vehicle}", responses=problems(403, 404, 429), summary="Withdraw a vehicle's ballots")
 async def unvote_all_drives(request: Request, vehicle: Name) -> Withdrawn:
     """Withdraw the ballots of all its drives."""
     by = own(request, vehicle)
-    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, by=by))
+    parts = services(request)
+    return Withdrawn(withdrawn=await parts.commands.run(withdraw, parts.store, vehicle, by=by))
 
 
 async def _manifest(request: Request, number: int | None, since: int | None) -> Response:
@@ -117,7 +118,7 @@ async def _manifest(request: Request, number: int | None, since: int | None) -> 
     number = await parts.newest.put(None) if number is None else number
     made = parts.manifests.ready(number, since)
     if made is None:
-        made = await to_thread.run_sync(parts.manifests.make, number, since, limiter=parts.fetching)
+        made = await parts.vehicle.run(parts.manifests.make, number, since)
     headers = {"ETag": made.tag, "Cache-Control": "private, no-cache"}
     if request.headers.get("if-none-match") == made.tag:
         return Response(status_code=304, headers=headers)
@@ -152,7 +153,7 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
     work = partial(examine, body, (vehicle, drive), request.state.key_hash)
-    incoming = await asyncio.get_running_loop().run_in_executor(parts.receiving, work)
+    incoming = await parts.vehicle.run(work)
     receipt = await parts.writer.put(incoming)
     parts.metrics.ballots.labels(receipt.result).inc()
     created = receipt.result == "created"

@@ -22,6 +22,7 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from mapvote.codec.ballot import Planes
 from mapvote.core.types import MapvoteError
 from mapvote_server.errors import Unavailable
+from mapvote_server.work import check_time, is_late, remaining_s
 
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
 _PAGE_BYTES = 16384
@@ -34,10 +35,17 @@ COPIED = (
 )
 
 
-class Database:
-    """One database. A transaction is committed when its block ends without an error, else nothing has happened."""
+_LOOKS_EVERY = 20_000
+"""Steps of SQLite's machine between two looks at the time limit; about a millisecond."""
 
-    def __init__(self, url: str, *, timeout_s: float = 30.0) -> None:
+
+class Database:
+    """One database. A transaction is committed when its block ends without an error, else nothing has happened.
+
+    ``timeout_s``: how long a writer waits for its turn.
+    """
+
+    def __init__(self, url: str | sa.URL, *, timeout_s: float = 30.0) -> None:
         self.url = sa.make_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
@@ -48,8 +56,13 @@ class Database:
             sa.event.listen(self.engine, "begin", _begin_sqlite)
         else:
             self.engine = sa.create_engine(
-                self.url, pool_size=16, max_overflow=64, pool_pre_ping=True, connect_args={"connect_timeout": 5}
+                self.url,
+                pool_size=16,
+                max_overflow=64,
+                pool_pre_ping=True,
+                connect_args={"connect_timeout": 5, "options": f"-c lock_timeout={round(timeout_s * 1e3)}"},
             )
+        sa.event.listen(self.engine, "before_cursor_execute", _in_time)
 
     @contextmanager
     def reading(self) -> Iterator[sa.Connection]:
@@ -58,6 +71,9 @@ class Database:
             if not self.is_sqlite:
                 connection = connection.execution_options(isolation_level="REPEATABLE READ")
             with connection.begin():
+                limit_s = remaining_s()
+                if not self.is_sqlite and limit_s is not None:
+                    connection.exec_driver_sql(f"SET LOCAL statement_timeout = {max(1, round(limit_s * 1e3))}")
                 yield connection
 
     @contextmanager
@@ -142,11 +158,26 @@ def _clear_errors() -> Iterator[None]:
     except exc.DBAPIError as error:
         if error.statement is None and not isinstance(error.orig, sqlite3.Error):  # its text holds the address
             raise Unavailable("the database cannot be reached; try again") from error
+        check_time()
         reason = (str(error.orig).strip().splitlines() or ["no reason given"])[0]
         copied = f": {COPIED}" if "malformed" in reason or "not a database" in reason else ""
-        raise Unavailable(f"the database refuses ({reason}){copied}; try again") from error
+        raise Unavailable(f"the database refuses ({reason}){copied}{_mend(reason)}") from error
     except exc.TimeoutError as error:
         raise Unavailable("all connections to the database are busy; try again") from error
+
+
+def _mend(reason: str) -> str:
+    """The end of an error's sentence: what helps."""
+    if "readonly" in reason or "read-only" in reason:
+        return "; give the user of the server the right to write its file and folder, or mount the disk writable"
+    if "is full" in reason or "No space" in reason:
+        return "; free space on its disk, then try again"
+    return "; try again"
+
+
+def _in_time(*_: Any) -> None:
+    """Before each statement."""
+    check_time()
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
@@ -157,6 +188,7 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.close()
+    connection.set_progress_handler(is_late, _LOOKS_EVERY)
 
 
 def _begin_sqlite(connection: sa.Connection) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from hand_made import make_map, make_tile
 from live_server import serving_here
+from mapvote_server.store import keys
 from mapvote_server.store.store import Store
 
 CONFIG = """
@@ -111,10 +112,58 @@ def test_a_client_that_never_reads_is_cut(url: str, line: socket.socket) -> None
     assert received < 2 * 12 * POINTS
 
 
-def test_requests_in_one_go_are_answered_one_after_another(line: socket.socket) -> None:
-    one = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"
-    line.sendall((one + b"\r\n") * 199 + one + b"Connection: close\r\n\r\n")
-    assert until_cut(line).count(b"HTTP/1.1 200 ") == 200
+ONE = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+def with_body(*more: bytes) -> bytes:
+    return b"PUT /v1/ballots/a/d1 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n\r\njunk" + b"".join(more)
+
+
+@pytest.mark.parametrize("sent", [[ONE * 200], [ONE, ONE * 3], [with_body(ONE)], [with_body(with_body(ONE))]])
+def test_requests_before_the_answer_to_the_first_end_the_connection(line: socket.socket, sent: list[bytes]) -> None:
+    """The first one is answered, and nothing of the others is done."""
+    for piece in sent:
+        line.sendall(piece)
+    said = until_cut(line)
+    assert said.count(b"HTTP/1.1 ") == 1
+    assert said.startswith((b"HTTP/1.1 200 ", b"HTTP/1.1 422 "))
+
+
+def test_one_after_another_on_one_connection_all_are_answered(line: socket.socket) -> None:
+    for _ in range(50):
+        line.sendall(ONE)
+        said = line.recv(1 << 16)
+        while not said.endswith(b"}"):
+            said += line.recv(1 << 16)
+        assert said.startswith(b"HTTP/1.1 200 ")
+
+
+@pytest.mark.parametrize(
+    ("head", "status"),
+    [
+        (b"GET /healthz HTTP/1.1\nHost: localhost\n\n", 400),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\nX: y\r\n\r\n", 400),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: y\r\n folded\r\n\r\n", 400),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: y\r\n\tfolded\r\n\r\n", 400),
+        (b"POST /v1/publish HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n"
+         b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n", 400),
+        (b"POST /v1/publish HTTP/1.1\r\nHost: localhost\r\nTRANSFER-ENCODING: chunked\r\n"
+         b"content-length: 4\r\n\r\n0\r\n\r\n", 400),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n" + b"a:1\r\n" * 99 + b"\r\n", 200),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n" + b"a:1\r\n" * 100 + b"\r\n", 431),
+        (b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n" + b"a:1\r\n" * 5000, 431),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("pieces", [1, 7])
+def test_a_head_that_programs_read_differently_or_of_many_headers_is_refused(
+    line: socket.socket, head: bytes, status: int, pieces: int
+) -> None:
+    size = len(head) // pieces + 1
+    with suppress(ConnectionError):
+        for i in range(pieces):
+            line.sendall(head[i * size : (i + 1) * size])
+            time.sleep(0.02)
+    assert line.recv(1 << 16).startswith(f"HTTP/1.1 {status} ".encode())
 
 
 @pytest.mark.parametrize("before", [b"", b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"])
@@ -161,6 +210,28 @@ def test_a_request_under_way_is_never_what_makes_room(url: str, line: socket.soc
         assert httpx2.get(f"{url}/healthz", timeout=PATIENT_S).status_code == 200
         line.sendall(b"nk")
         assert line.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
+
+
+def test_who_holds_all_connections_gives_one_up_for_everybody_else(tmp_path: Path) -> None:
+    """Eight bodies that never end, of one vehicle and of eight: an operator and a probe are answered beside both."""
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", make_map({}))
+    vehicles = [keys.issue(store, f"v{i}", "vehicle") for i in range(8)]
+    operator = keys.issue(store, "boss", "operator")
+    settings = CONFIG.replace("connections = 12", "connections = 8")
+    with serving_here(tmp_path / "s.db", settings=settings, log=tmp_path / "log") as url:
+        for names in (["v0"] * 8, [f"v{i}" for i in range(8)]):
+            with ExitStack() as stack:
+                for i, name in enumerate(names):
+                    upload = stack.enter_context(connected(url))
+                    head = f"PUT /v1/ballots/{name}/d{i} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n"
+                    key = vehicles[int(name[1:])]
+                    upload.sendall(f"{head}Authorization: Bearer {key}\r\n\r\nju".encode())
+                time.sleep(0.3)
+                assert httpx2.get(f"{url}/livez", timeout=PATIENT_S).status_code == 200
+                headers = {"Authorization": f"Bearer {operator}"}
+                for path in ("/v1/map", "/v1/keys", "/healthz"):
+                    assert httpx2.get(url + path, headers=headers, timeout=PATIENT_S).status_code == 200
+    store.close()
 
 
 def test_the_server_is_well_again_afterwards(url: str, tmp_path: Path) -> None:

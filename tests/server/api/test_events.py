@@ -8,6 +8,7 @@ import base64
 import json
 import queue
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -26,7 +27,7 @@ from mapvote.config import ServerSettings
 from mapvote.core.types import CellState
 from mapvote_server.api.event_routes import as_sse, deliver
 from mapvote_server.questions.history import Event, Feed, newest_event, without_names
-from mapvote_server.store import schema
+from mapvote_server.store import keys, schema
 from mapvote_server.store.queries import log_event
 from mapvote_server.store.store import Store
 from stores import NewStore
@@ -67,6 +68,42 @@ def test_a_ballot_is_told_to_who_listens_and_again_to_who_comes_back(store: Stor
         with http.stream("GET", f"{url}/v1/events", headers={"Last-Event-ID": str(told["seq"] - 1)}) as answer:
             again = next(json.loads(line[5:]) for line in answer.iter_lines() if line.startswith("data:"))
         assert again == told
+
+
+def begun(http: httpx2.Client, url: str, key: str) -> tuple[int, Iterator[str]]:
+    """Status and lines of a stream, which stays open until the client is closed."""
+    request = http.build_request("GET", f"{url}/v1/events", headers={"Authorization": f"Bearer {key}"})
+    answer = http.send(request, stream=True)
+    return answer.status_code, answer.iter_lines()
+
+
+@pytest.mark.parametrize("end", ["revoked", "expired"])
+def test_a_stream_ends_with_its_key_and_hears_nothing_afterwards(store: Store, tmp_path: Path, end: str) -> None:
+    key = keys.issue(store, "eve", "operator", days=None if end == "revoked" else 2.0 / 86_400)
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url, httpx2.Client(timeout=20.0) as http:
+        status, lines = begun(http, url, key)
+        assert (status, next(lines)) == (200, ": listening")
+        if end == "revoked":
+            keys.revoke(store, "eve")
+        else:
+            time.sleep(2.1)
+        keys.issue(store, "secret-car-7", "vehicle")
+        heard = "".join(lines)
+    assert "secret-car-7" not in heard
+    assert "key revoked" not in heard
+
+
+def test_one_key_listens_to_four_streams_and_shuts_nobody_out(store: Store, tmp_path: Path) -> None:
+    greedy, operator = keys.issue(store, "greedy", "vehicle"), keys.issue(store, "boss", "operator")
+    settings = "[server]\nconnections = 8\n"
+    with (
+        serving_here(tmp_path / "s.db", settings=settings, log=tmp_path / "log") as url,
+        httpx2.Client(timeout=20.0, limits=httpx2.Limits(max_connections=None)) as http,
+    ):
+        streams = [begun(http, url, greedy) for _ in range(12)]
+        assert [status for status, _ in streams] == [200] * 4 + [429] * 8
+        assert httpx2.get(f"{url}/livez", timeout=20.0).status_code == 200
+        assert begun(http, url, operator)[0] == 200
 
 
 @pytest.fixture
@@ -120,7 +157,8 @@ def test_an_address_without_a_secret_and_a_secret_of_another_form_are_refused() 
 
 def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(store: Store, receiver: tuple[str, Posts]) -> None:
     settings = SimpleNamespace(server=ServerSettings(webhook_url=receiver[0], webhook_secret=SECRET))
-    parts = cast("Services", SimpleNamespace(store=store, settings=settings, fetching=None, feed=Feed(store, 0.0)))
+    feed = Feed(store, 0.0)
+    parts = cast("Services", SimpleNamespace(store=store, settings=settings, look_up=asyncio.to_thread, feed=feed))
 
     async def listen(posts: int) -> list[str]:
         task = asyncio.create_task(deliver(parts))

@@ -51,6 +51,20 @@ def test_a_rebound_name_or_a_foreign_page_publishes_nothing(url: str, headers: d
         assert "[server] hosts" in answer.json()["detail"]
 
 
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_an_image_or_a_link_of_a_foreign_page_sets_nothing_off(url: str, site: str) -> None:
+    """Browsers send no Origin with those, but the credentials that they keep."""
+    for path in ("/v1/check", "/v1/desk", "/v1/map", "/nothing"):
+        for mode in ("no-cors", "navigate"):
+            headers = {"Sec-Fetch-Site": site, "Sec-Fetch-Mode": mode}
+            assert httpx2.get(url + path, headers=headers, timeout=60.0).status_code == 403, path
+    link = {"Sec-Fetch-Site": site, "Sec-Fetch-Mode": "navigate"}
+    assert httpx2.get(url, headers=link, timeout=60.0).status_code == 200
+    assert httpx2.get(url, headers=link | {"Sec-Fetch-Mode": "no-cors"}, timeout=60.0).status_code == 403
+    for ours in ("same-origin", "none"):
+        assert httpx2.get(f"{url}/v1/check", headers={"Sec-Fetch-Site": ours}, timeout=60.0).status_code == 200
+
+
 def test_a_request_without_a_host_is_refused(url: str) -> None:
     host, _, port = url.removeprefix("http://").partition(":")
     with socket.create_connection((host, int(port))) as connection:
