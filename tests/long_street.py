@@ -1,14 +1,15 @@
-"""A street of four tiles, and whether a voter says the same of it block by block."""
+"""A street of four tiles, and a comparison of its votes tile by tile with its votes in blocks."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-import pytest
 
 from hand_made import make_map, make_tile, wall
 from mapvote.core.point_map import PointMap
-from mapvote.rules import surfaces
-from mapvote.rules.voter import TileVotes, Voter
+from mapvote.rules.surfaces import SurfaceVoter
+from mapvote.rules.voter import TileVotes
 
 
 def long_street() -> PointMap:
@@ -20,10 +21,10 @@ def long_street() -> PointMap:
     return make_map({(0, c): make_tile(points, index=(0, c)) for c in range(4)})
 
 
-def blocks_say_the_same(voter: Voter, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Judged tile by tile, what a drive says is what all tiles say at once."""
+def blocks_say_the_same(voter: SurfaceVoter) -> None:
+    """Votes of tiles judged one by one equal those of tiles judged in blocks."""
     whole = dict(voter.each())
-    monkeypatch.setattr(surfaces, "_BLOCK", 1)
+    voter.judged = replace(voter.judged, side_tiles=1)
     by_blocks = dict(voter.each())
     assert list(by_blocks) == list(whole)
     changed = []

@@ -21,17 +21,10 @@ from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 from mapvote.rules.evidence import (
     CROSSED,
-    GONE_RAYS,
     HIT,
-    HIT_RAYS,
-    HIT_REACH_M,
-    NEW_A_CELL,
-    NEW_ENOUGH,
-    NEW_RAYS,
     PASSED,
     PASSES,
-    SUPPORT,
-    TOGETHER,
+    SURFACE_RULE,
     WORDS,
     Facts,
     count_scan,
@@ -42,10 +35,10 @@ from mapvote.rules.evidence import (
     mark_near,
     weigh_voxels,
 )
-from mapvote.rules.packed_tiles import PLANES, Overlap, PackedTiles, count_of
+from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, count_of
 
 ROWS, COLS = range(100, 104), range(100, 105)
-FULL = 2**PLANES - 1
+FULL = 2**COUNT_PLANES - 1
 
 
 def street() -> PointMap:
@@ -69,7 +62,7 @@ def near_hits(seen: Observation) -> tuple[np.ndarray, np.ndarray]:
     here, scan, grid = seen.reference, seen.scan, seen.view.grid
     near, apart = np.zeros((2, *grid.shape), np.uint64)
     still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
-    reach = HIT_REACH_M / CELL_SIZE
+    reach = SURFACE_RULE.hit_reach_m / CELL_SIZE
     mark_near(scan.points_map, scan.cell, still, here.base, here.occupied, corner, reach, near, apart)
     return near, apart
 
@@ -93,7 +86,7 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
     st.integers(0, 1000),
 )
 @settings(max_examples=20, deadline=None)
-def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, float, float]], seed: int) -> None:
+def test_the_counts_of_a_voxel_follow_from_each_scan(offsets: list[tuple[float, float, float]], seed: int) -> None:
     point_map = street()
     seen = seen_from(point_map, np.array(offsets), seed)
     evidence = PackedTiles(point_map.lattice, WORDS)
@@ -140,7 +133,7 @@ def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_sta
 def cell_with(bit: int, passes: tuple[int, int, int]) -> np.ndarray:
     """(WORDS,) of a cell: ``passes`` of the voxel below ``bit``, of it, of the one above."""
     cell = np.zeros(WORDS, np.uint64)
-    for k in range(PLANES):
+    for k in range(COUNT_PLANES):
         for beside, often in zip((-1, 0, 1), passes, strict=True):
             if 0 <= bit + beside < TOP_BIT:
                 cell[PASSES + k] |= np.uint64((often >> k & 1) << bit + beside)
@@ -152,7 +145,7 @@ def cell_with(bit: int, passes: tuple[int, int, int]) -> np.ndarray:
 @example(2, (1, 2, 2))
 @example(TOP_BIT - 2, (2, 2, 1))
 @example(TOP_BIT - 1, (2, 2, 0))
-def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_three(
+def test_the_joint_crossings_of_a_voxel_are_the_least_passes_of_three_voxels(
     bit: int, passes: tuple[int, int, int]
 ) -> None:
     below, own, above = passes
@@ -160,7 +153,7 @@ def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_t
     assert least_passed(cell_with(bit, passes), bit) == min(asked)
 
 
-def test_free_is_what_two_scans_passed_and_none_hit() -> None:
+def test_a_voxel_is_free_if_two_scans_passed_it_and_none_hit_it() -> None:
     planes = np.zeros((3, 1, WORDS), np.uint64)
     planes[2, 0, PASSES + 1] = 0b1110  # passed by two scans
     planes[2, 0, PASSES] = 0b10000  # by one
@@ -168,7 +161,7 @@ def test_free_is_what_two_scans_passed_and_none_hit() -> None:
     assert free_words(planes).tolist() == [[0], [0], [0b1010]]
 
 
-def test_cells_of_unknown_ground_gather_nothing() -> None:
+def test_cells_with_unknown_ground_count_nothing() -> None:
     point_map = street()
     seen = one_scan(point_map, np.array([[30.7, 30.7, 1.05]]))
     unknown = replace(seen.reference, ground_z=np.full_like(seen.reference.ground_z, np.nan))
@@ -201,17 +194,19 @@ def by_boxes(here: Observation) -> np.ndarray:
     stands = here.scan.points_map[here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)]
     for r, c in np.ndindex(*grid.shape):
         off_x, off_y = stands[:, 0] - x[c], stands[:, 1] - y[r]
-        for z in stands[np.maximum(np.abs(off_x), np.abs(off_y)) <= CELL_SIZE / 2 + HIT_REACH_M, 2]:
-            for layer in range(int(np.floor((z - HIT_REACH_M) / CELL_SIZE)), int((z + HIT_REACH_M) // CELL_SIZE) + 1):
+        reach = SURFACE_RULE.hit_reach_m
+        for z in stands[np.maximum(np.abs(off_x), np.abs(off_y)) <= CELL_SIZE / 2 + reach, 2]:
+            for layer in range(
+                int(np.floor((z - SURFACE_RULE.hit_reach_m) / CELL_SIZE)),
+                int((z + SURFACE_RULE.hit_reach_m) // CELL_SIZE) + 1,
+            ):
                 near[r, c] |= np.uint64(1) << np.uint64(np.clip(layer - base[r, c], 0, TOP_BIT))
     return near
 
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(0, 40))
-def test_a_hit_speaks_for_every_voxel_that_it_comes_near_and_strikes_another_only_if_none_of_these_is_mapped(
-    seed: int, n: int
-) -> None:
+def test_a_return_hits_every_mapped_voxel_near_it_else_the_voxel_it_lies_in(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
     mapped = rng.integers(0, 2**63, (SIDE, SIDE), np.uint64) & rng.integers(0, 2**63, (SIDE, SIDE), np.uint64)
@@ -242,7 +237,7 @@ def words(*marks: tuple[int, int, int]) -> U64:
 
 
 def alone(voxels: U64, others: Bool | None = None) -> bool:
-    """Whether all cells with ``voxels``, fewer than SUPPORT, are a thing of its own."""
+    """Whether all cells with ``voxels``, fewer than SURFACE_RULE.support, are a thing of its own."""
     cells = voxels != 0
     found = enough(voxels, 0, np.zeros((WIDE, WIDE), np.bool_) if others is None else others, EVEN)
     assert not found[~cells].any()
@@ -261,13 +256,13 @@ def alone(voxels: U64, others: Bool | None = None) -> bool:
         (words((5, 5, 0b10), (5, 6, 0b10)), False, "no taller than a kerb"),
     ],
 )
-def test_two_voxels_on_the_ground_on_top_of_each_other_are_a_thing_and_specks_are_none(
+def test_two_voxels_on_top_of_each_other_on_the_ground_are_an_object_and_specks_are_none(
     voxels: U64, thing: bool, why: str
 ) -> None:
     assert alone(voxels) == thing, why
 
 
-def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
+def test_voxels_that_touch_another_object_are_no_object_by_themselves() -> None:
     others = np.zeros((WIDE, WIDE), np.bool_)
     others[7, 7] = True
     assert alone(words((5, 5, 0b110)), others=others)
@@ -276,21 +271,21 @@ def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
 
 @given(
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 2**59)), max_size=12),
-    st.sampled_from([0, NEW_A_CELL]),
+    st.sampled_from([0, SURFACE_RULE.new_a_cell]),
 )
-def test_what_is_enough_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]], a_cell: int) -> None:
+def test_enough_counts_the_voxels_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]], a_cell: int) -> None:
     voxels = words(*((2 * row, 2 * col, word << 4) for row, col, word in marks))  # no two cells touch, none the ground
-    assert np.array_equal(enough(voxels, a_cell, voxels != 0, EVEN), np.bitwise_count(voxels) >= SUPPORT)
+    assert np.array_equal(enough(voxels, a_cell, voxels != 0, EVEN), np.bitwise_count(voxels) >= SURFACE_RULE.support)
 
 
 @given(st.integers(1, WIDE), st.integers(1, 8))
-def test_what_is_new_needs_more_the_more_cells_it_has_and_at_most_so_much(cells: int, voxels_a_cell: int) -> None:
+def test_a_new_object_needs_more_voxels_the_more_cells_it_has_up_to_a_bound(cells: int, voxels_a_cell: int) -> None:
     voxels = words(*((5, col, (1 << voxels_a_cell) - 1 << 4) for col in range(cells)))
-    needed = min(SUPPORT + NEW_A_CELL * (cells - 1), NEW_ENOUGH)
-    assert enough(voxels, NEW_A_CELL, voxels != 0, EVEN)[5, 0] == (cells * voxels_a_cell >= needed)
+    needed = min(SURFACE_RULE.support + SURFACE_RULE.new_a_cell * (cells - 1), SURFACE_RULE.new_enough)
+    assert enough(voxels, SURFACE_RULE.new_a_cell, voxels != 0, EVEN)[5, 0] == (cells * voxels_a_cell >= needed)
 
 
-def test_a_cell_goes_along_that_touches_what_went_if_rays_passed_half_of_it_and_nothing_stands() -> None:
+def test_a_cell_beside_a_deleted_one_is_deleted_if_rays_passed_half_of_it_and_nothing_stands() -> None:
     """A row of cells from a pole that went. Of the others rays passed half of what is mapped (P) or less (N); in S
     something stands."""
     row = "PPPPPNPP", "NPP", "PSPP"
@@ -308,35 +303,35 @@ def test_a_cell_goes_along_that_touches_what_went_if_rays_passed_half_of_it_and_
 
 
 def weighed(mapped: int, free: int, **counts: int) -> Facts:
-    """Of one cell whose voxel 5 has these counts; ``passes`` of the voxels above and below it too."""
+    """Facts of one cell whose voxel 5 has these counts; the voxels above and below it have the same ``passes``."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
     for first, name, word in ((CROSSED, "crossed", 0b010), (HIT, "met", 0b010), (PASSES, "passes", 0b111)):
-        for k in range(PLANES):
+        for k in range(COUNT_PLANES):
             planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) * word << bit - 1)
-    words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
+    occupied, known_free = (np.full((1, 1), word << bit, np.uint64) for word in (mapped, free))
     out = Facts.none((1, 1))
-    weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
+    weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), occupied, known_free, out)
     return out
 
 
 @given(crossed=st.integers(0, 120), passes=st.integers(0, 120), met=st.integers(0, 20))
-def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, passes: int, met: int) -> None:
-    said = weighed(1, 0, crossed=crossed, passes=passes, met=met)
-    assert (said.gone[0, 0] != 0) == (max(crossed, passes // TOGETHER) >= GONE_RAYS + HIT_RAYS * met)
-    assert (said.stands[0, 0] != 0) == (met > 0 and said.gone[0, 0] == 0)
-    assert not (said.new | said.beyond).any()
+def test_a_voxel_is_gone_if_its_crossings_outweigh_its_hits(crossed: int, passes: int, met: int) -> None:
+    facts = weighed(1, 0, crossed=crossed, passes=passes, met=met)
+    assert (facts.gone[0, 0] != 0) == (
+        max(crossed, passes // SURFACE_RULE.together) >= SURFACE_RULE.gone_rays + SURFACE_RULE.hit_rays * met
+    )
+    assert (facts.stands[0, 0] != 0) == (met > 0 and facts.gone[0, 0] == 0)
+    assert not (facts.new | facts.beyond).any()
 
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
 @example(crossed=0, met=1, passes=0)
-def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
-    crossed: int, met: int, passes: int
-) -> None:
-    said = weighed(0, 1, crossed=crossed, met=met, passes=passes)
-    new = said.new[0, 0] != 0
-    assert new == (met >= 1 + NEW_RAYS * crossed)
-    assert [said.hits[0, 0], said.balance[0, 0]] == ([met, met - passes] if new else [0, 0])
-    assert not (said.gone | said.stands | said.beyond).any()
+def test_a_free_voxel_is_new_if_its_hits_outweigh_its_crossings(crossed: int, met: int, passes: int) -> None:
+    facts = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    new = facts.new[0, 0] != 0
+    assert new == (met >= 1 + SURFACE_RULE.new_rays * crossed)
+    assert [facts.hits[0, 0], facts.balance[0, 0]] == ([met, met - passes] if new else [0, 0])
+    assert not (facts.gone | facts.stands | facts.beyond).any()
 
 
 @given(
@@ -344,9 +339,9 @@ def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_
     met=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
     passes=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
 )
-def test_what_was_passed_more_often_than_hit_is_nothing_new(cells: Bool, met: I32, passes: I32) -> None:
+def test_a_group_passed_more_often_than_hit_is_not_new(cells: Bool, met: I32, passes: I32) -> None:
     ground = np.zeros(cells.shape, np.uint64)
-    pole = np.where(cells, np.uint64(2 * (1 << NEW_ENOUGH) - 2), np.uint64(0))
+    pole = np.where(cells, np.uint64(2 * (1 << SURFACE_RULE.new_enough) - 2), np.uint64(0))
     facts = Facts.none(cells.shape)._replace(new=pole, balance=np.where(cells, met - passes, 0))
     came = judge_window(facts, ground, np.full(cells.shape, np.nan, np.float32), 0.5)[0] == CellState.CHANGED_OCCUPIED
     groups, count = ndimage.label(cells, np.ones((3, 3)))

@@ -1,4 +1,4 @@
-"""A long drive says the same, however its tiles were kept and judged."""
+"""The votes of a long drive do not depend on how its tiles were packed and judged."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, MapvoteError
-from mapvote.rules import packed_tiles
 from mapvote.rules.evidence import CROSSED, HIT, PASSED, PASSES
-from mapvote.rules.packed_tiles import PackedTiles, Shelf
+from mapvote.rules.packed_tiles import PackedTiles, Shelf, TilePacking
 from mapvote.rules.surfaces import SurfaceVoter
 
 LATTICE = Lattice()
@@ -74,29 +73,26 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
 
 
 @pytest.mark.slow
-def test_blocks_of_tiles_say_what_all_of_them_say_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks_say_the_same(surfaces_after_a_drive(long_street()), monkeypatch)
+def test_votes_of_single_tiles_equal_those_of_blocks_of_tiles() -> None:
+    blocks_say_the_same(surfaces_after_a_drive(long_street()))
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20))
-def test_everything_is_found_where_it_was_put(things: list[bytes]) -> None:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(packed_tiles, "IN_MEMORY", 64)
-        full = Shelf()
-        places = [full.put(thing) for thing in things]
-        assert [full.read(place) for place in places] == things
+def test_a_shelf_returns_all_that_was_put_on_it(things: list[bytes]) -> None:
+    shelf = Shelf(TilePacking(memory_bytes=64))
+    places = [shelf.put(thing) for thing in things]
+    assert [shelf.read(place) for place in places] == things
 
 
-def test_a_short_drive_asks_the_disk_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_drive_opens_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "TemporaryFile", None)
     full = Shelf()
     assert full.read(full.put(bytes(1 << 20))) == bytes(1 << 20)
 
 
-def test_where_a_long_drive_cannot_be_kept_it_is_said_how_to_mend_it(
+def test_the_error_of_a_full_disk_names_the_folder_and_the_mend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(packed_tiles, "IN_MEMORY", 4)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     with pytest.raises(MapvoteError, match=r"nowhere: .*make room, or name another folder in TMPDIR"):
-        Shelf().put(b"longer than four")
+        Shelf(TilePacking(memory_bytes=4)).put(b"longer than four")

@@ -23,8 +23,8 @@ from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
 from mapvote.rules.paper import (
     BEGINS_ABOVE,
+    N_WORDS,
     WITHOUT_MOVERS,
-    WORDS,
     PaperVoter,
     cell_words,
     classify_paper,
@@ -185,7 +185,7 @@ def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_cha
         occluded=occluded, few_points=few_points, movers=movers, line_of_sight=sight, tall_rule=tall_rule, n_min=n_min
     )
     states, weights = reading_table(VotingSettings(skip_tall_cells=tall), paper)
-    n = np.arange(WORDS) & 15
+    n = np.arange(N_WORDS) & 15
     spoken = states != NO_VOTE
     assert np.array_equal(spoken[0], spoken[1]), "a scan speaks or does not, whatever the map holds"
     occupied = (states == CellState.UNCHANGED_OCCUPIED) | (states == CellState.CHANGED_OCCUPIED)
@@ -200,7 +200,7 @@ def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_cha
 def test_with_movers_removed_what_the_scan_without_them_saw_decides_as_the_scan_else_does(sight: Any) -> None:
     removed, _ = reading_table(VotingSettings(), PaperSettings(movers="removed", line_of_sight=sight))
     occlude, _ = reading_table(VotingSettings(), PaperSettings(movers="occlude", line_of_sight=sight))
-    words, seen = np.arange(WORDS), sum(1 << k for k in range(4, 9))
+    words, seen = np.arange(N_WORDS), sum(1 << k for k in range(4, 9))
     assert np.array_equal(removed, occlude[:, words & ~seen | (words >> WITHOUT_MOVERS & seen)])
 
 

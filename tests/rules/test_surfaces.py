@@ -16,8 +16,8 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState
-from mapvote.rules.evidence import GONE_RAYS, HIT_REACH_M, SUPPORT
-from mapvote.rules.surfaces import LOOKS, MOST_CELLS, MOST_HEIGHT_M, SurfaceVoter, blocks, depths_m, log_odds, looks
+from mapvote.rules.evidence import SURFACE_RULE
+from mapvote.rules.surfaces import CHANGE_ODDS, N_FEATURES, SurfaceVoter, blocks, depths_m, log_odds, looks
 from mapvote.rules.voter import TileVotes
 
 ROW, COLUMNS = 100, range(100, 112)
@@ -29,7 +29,7 @@ WALL = [(ROW, c) for c in COLUMNS]
 POLE = (ROW, 105)
 OLD_Y = (ROW + 0.5) * CELL_SIZE
 BOLLARD = [0.45, 0.75]
-TWIG = [1.65 + 0.3 * k for k in range(SUPPORT - 1)]
+TWIG = [1.65 + 0.3 * k for k in range(SURFACE_RULE.support - 1)]
 """Heights of something that does not stand on the ground."""
 
 
@@ -72,7 +72,7 @@ def test_a_wall_set_back_by_half_a_metre_is_an_old_wall_gone_and_a_new_one_come(
 
 
 def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
-    votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y + 0.5 * CELL_SIZE + 0.5 * HIT_REACH_M))
+    votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y + 0.5 * CELL_SIZE + 0.5 * SURFACE_RULE.hit_reach_m))
     assert all(votes.states[cell] == UO for cell in WALL)
     assert not (votes.states == CO).any()
 
@@ -80,7 +80,7 @@ def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
 @pytest.mark.parametrize(
     ("heights", "row", "state"),
     [
-        pytest.param([0.45 + 0.3 * k for k in range(SUPPORT)], ROW, CE, id="a pole"),
+        pytest.param([0.45 + 0.3 * k for k in range(SURFACE_RULE.support)], ROW, CE, id="a pole"),
         pytest.param(TWIG, ROW, UN, id="a twig"),
         pytest.param(BOLLARD, ROW, CE, id="a bollard, which stands on the ground and on its own"),
         pytest.param(BOLLARD, 0, CE, id="a bollard at the end of the map"),
@@ -106,7 +106,7 @@ def test_twigs_fall_neither_with_a_wall_near_by_nor_together_at_the_edge_of_all_
 
 def test_what_a_hit_of_a_wall_explains_is_nothing_new_in_the_cell_beside_it() -> None:
     """Range noise puts every second hit behind the wall's face, into voxels that the map knows to be free."""
-    beside = OLD_Y + 0.5 * CELL_SIZE + 0.8 * HIT_REACH_M
+    beside = OLD_Y + 0.5 * CELL_SIZE + 0.8 * SURFACE_RULE.hit_reach_m
     voter = SurfaceVoter(VotingSettings(), town((WALL, HEIGHTS)))
     struck = [voter.observe(one_scan(voter.point_map, standing_at(y)))[ROW + 1].any() for y in (beside, beside + 0.1)]
     assert struck == [False, True]
@@ -138,8 +138,11 @@ def test_what_some_rays_crossed_goes_with_its_wall_and_what_few_scans_or_no_ray_
         return lambda scan, words: words[:, 106:].fill(0) if scan >= but else None
 
     point_map = town((WALL, HEIGHTS))
-    assert [after(point_map, scans=n).states[POLE] for n in (GONE_RAYS - 1, GONE_RAYS)] == [UN, CE]
-    once, never = (after(point_map, scans=GONE_RAYS, passed=half_unseen(but)).states for but in (1, 0))
+    assert [after(point_map, scans=n).states[POLE] for n in (SURFACE_RULE.gone_rays - 1, SURFACE_RULE.gone_rays)] == [
+        UN,
+        CE,
+    ]
+    once, never = (after(point_map, scans=SURFACE_RULE.gone_rays, passed=half_unseen(but)).states for but in (1, 0))
     assert all(once[cell] == CE for cell in WALL)
     assert [int(never[cell]) for cell in WALL] == [CE] * 6 + [NO_VOTE] * 6
 
@@ -198,7 +201,7 @@ def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> 
 
 
 TILE = slice(1, TILE_CELLS + 1), slice(1, TILE_CELLS + 1)
-"""Of a window that reaches one cell beyond it, and a tile to the right."""
+"""A tile in a window that reaches one cell beyond it, and a tile to the right."""
 LOW = np.full((TILE_CELLS + 2, 2 * TILE_CELLS + 1), 1.0, dtype=np.float32)
 
 
@@ -220,7 +223,7 @@ def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None
     amount = np.ones((256, 256), dtype=np.int32)
     amount[5, 6] = 9
     found = looked_at(states, amount)
-    assert found.shape == (5, LOOKS)
+    assert found.shape == (5, N_FEATURES)
     assert np.exp(found[:, 0]) - 1 == pytest.approx([3, 3, 1, 3, 1]), "cells of the thing"
     assert found[:, 1] * 8 == pytest.approx([1, 2, 0, 1, 0]), "alike around"
     assert found[:, 2] == pytest.approx([np.log(2 / 10), np.log(10 / 2), np.log(2), np.log(2 / 10), np.log(2)])
@@ -234,8 +237,8 @@ def test_a_thing_goes_on_where_tiles_meet_and_is_as_large_as_any_at_last() -> No
     assert np.exp(found[:, 0]) - 1 == pytest.approx(40)
     assert found[10, 1] * 8 == pytest.approx(5)
     whole = looked_at(np.full((256, 256), CE, dtype=np.uint8))
-    assert np.exp(whole[:, 0]) - 1 == pytest.approx(np.full(65536, MOST_CELLS))
-    assert looks(windowed(left), full, 99 * LOW, TILE)[:, 3].max() == MOST_HEIGHT_M
+    assert np.exp(whole[:, 0]) - 1 == pytest.approx(np.full(65536, CHANGE_ODDS.most_cells))
+    assert looks(windowed(left), full, 99 * LOW, TILE)[:, 3].max() == CHANGE_ODDS.most_height_m
 
 
 def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides() -> None:
@@ -253,7 +256,7 @@ def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides
 
 
 @settings(max_examples=30, deadline=None)
-@given(arrays(np.float64, (2, LOOKS), elements=st.floats(0, 5)), st.floats(0, 0.15), st.sampled_from([CO, CE]))
+@given(arrays(np.float64, (2, N_FEATURES), elements=st.floats(0, 5)), st.floats(0, 0.15), st.sampled_from([CO, CE]))
 def test_a_deeper_surface_and_a_larger_thing_make_it_surer(looked: np.ndarray, deep: float, state: CellState) -> None:
     states = np.array([state], dtype=np.uint8)
     low, high = looked.min(axis=0)[None], looked.max(axis=0)[None]

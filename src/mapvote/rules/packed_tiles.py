@@ -1,9 +1,9 @@
 """Counters of voxels by tile: open around the vehicle, packed where it has left. A long road needs little memory.
 
-A counter is PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64 voxels, so
-that one scan is added to a whole column with a few word operations.
+A counter has COUNT_PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64
+voxels, so that one scan is added to a whole column with a few word operations.
 
-What is packed lies on a shelf to the end of the drive, and is read once or twice: up to IN_MEMORY bytes in memory, more
+Packed tiles lie on a shelf to the end of the drive, and are read once or twice: up to ``memory_bytes`` in memory, more
 in an unnamed file.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +21,27 @@ from mapvote.codec.planes import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.process_memory import give_back_free_pages
+from mapvote.core.record import record
 from mapvote.core.types import U64, MapvoteError
 
-IN_MEMORY = 16 << 20
-"""Bytes held before a file is opened: a drive of one or two kilometres writes nothing to disk."""
+COUNT_PLANES = 7
+"""Bit planes of a counter: counts up to 127 scans."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class TilePacking:
+    """Numbers of the packing of tiles that the vehicle has left."""
+
+    memory_bytes: int = 16 << 20
+    """Bytes held before a file is opened: a drive of one or two kilometres writes nothing to disk."""
+    zstd_level: int = 1
+    """Level of compression: tiles are packed while driving, and read once or twice."""
+    far_cells: int = 64
+    """Cells between a tile and the view at which the tile is packed: a vehicle that turns round comes back to it."""
+
+
+TILE_PACKING = TilePacking()
 
 
 class Slot(NamedTuple):
@@ -36,8 +54,8 @@ class Slot(NamedTuple):
 class Shelf:
     """Bytes are appended, never moved and never removed."""
 
-    def __init__(self) -> None:
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY, prefix="mapvote_drive_")  # noqa: SIM115
+    def __init__(self, packing: TilePacking = TILE_PACKING) -> None:
+        self._file = tempfile.SpooledTemporaryFile(packing.memory_bytes, prefix="mapvote_drive_")  # noqa: SIM115
         weakref.finalize(self, self._file.close)
 
     def put(self, data: bytes) -> Slot:
@@ -48,7 +66,7 @@ class Shelf:
             self._file.flush()
         except OSError as error:
             raise MapvoteError(
-                f"{tempfile.gettempdir()}: what a long drive keeps, 20 MB a kilometre, could not be written there "
+                f"{tempfile.gettempdir()}: the evidence of a long drive, 20 MB a kilometre, could not be written there "
                 f"({error.strerror}): make room, or name another folder in TMPDIR"
             ) from error
         return Slot(start, len(data))
@@ -59,18 +77,10 @@ class Shelf:
         return self._file.read(place.length)
 
 
-PLANES = 7
-"""Counts up to 127 scans."""
-_FAST = 1
-"""zstd level: packed while driving, and read once or twice."""
-_FAR_CELLS = 64
-"""A tile this far from the view has been left: a vehicle that turns round comes back to it, and it is unpacked."""
-
-
 class Overlap(NamedTuple):
-    """What a window has in common with a tile: rows and columns of the window, from and to, and how much further down
-    and to the right they lie in the tile. A kernel is given this and the whole tile: a part of its planes would be
-    another kind of array, to be compiled for."""
+    """The common part of a window and a tile: rows and columns of the window, from and to, and their offset down and to
+    the right in the tile. A kernel takes this and the whole tile: a part of its planes would be another type of array,
+    to be compiled for."""
 
     row: int
     end_row: int
@@ -83,10 +93,10 @@ class Overlap(NamedTuple):
 class PackedTiles(Mapping[TileIndex, U64]):
     """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it."""
 
-    def __init__(self, lattice: Lattice, words: int) -> None:
-        self.lattice, self.words = lattice, words
+    def __init__(self, lattice: Lattice, words: int, packing: TilePacking = TILE_PACKING) -> None:
+        self.lattice, self.words, self.packing = lattice, words, packing
         self._open: dict[TileIndex, U64] = {}
-        self._shelf, self._packed = Shelf(), dict[TileIndex, Slot]()
+        self._shelf, self._packed = Shelf(packing), dict[TileIndex, Slot]()
         self._spare: list[U64] = []
         """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
@@ -123,11 +133,11 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
     def leave(self, view: Grid) -> None:
         """Pack one tile that lies far from ``view``, if there is any: for every scan, so that none has it all."""
-        around = view.padded(_FAR_CELLS)
+        around = view.padded(self.packing.far_cells)
         for tile, planes in self._open.items():
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
-                self._packed[tile] = self._shelf.put(_packed(planes))
+                self._packed[tile] = self._shelf.put(_packed(planes, self.packing.zstd_level))
                 self._spare.append(self._open.pop(tile))
                 give_back_free_pages()
                 return
@@ -143,7 +153,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
         return planes
 
     def _unpacked(self, place: Slot, planes: U64) -> U64:
-        """``planes``, which come empty, with what was packed."""
+        """``planes``, which come empty, with the packed words."""
         data = self._shelf.read(place)
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
         _lay(raw.reshape(self.words + 1, -1), planes.reshape(CELLS, self.words))
@@ -159,31 +169,31 @@ def _lay(packed: U64, flat: U64) -> None:
             flat[cell, k] = packed[k + 1, i]
 
 
-def _packed(planes: U64) -> bytes:
+def _packed(planes: U64, zstd_level: int) -> bytes:
     """The cells in which anything was counted, and their words plane by plane: most of the higher ones are empty."""
     flat = planes.reshape(CELLS, -1)
     cells = np.flatnonzero(flat.any(axis=1))
-    return compress(np.concatenate([cells.astype(np.uint64)[None], flat[cells].T]).tobytes(), _FAST)
+    return compress(np.concatenate([cells.astype(np.uint64)[None], flat[cells].T]).tobytes(), zstd_level)
 
 
 @kernel
 def add_one(cell: U64, words: tuple[np.uint64, np.uint64, np.uint64]) -> None:
     """Add 1 to the counts that the first, second and third counter of a cell (words,) keep of the voxels of ``words``.
-    If one would exceed its planes, all counts of the cell are halved: what is weighed keeps its ratios."""
-    full = _carry(cell, 0, words[0]), _carry(cell, PLANES, words[1]), _carry(cell, 2 * PLANES, words[2])
+    If one would exceed its planes, all counts of the cell are halved: their ratios stay."""
+    full = _carry(cell, 0, words[0]), _carry(cell, COUNT_PLANES, words[1]), _carry(cell, 2 * COUNT_PLANES, words[2])
     if full[0] | full[1] | full[2]:
         for counter in range(3):
-            first = counter * PLANES
-            for k in range(first, first + PLANES - 1):
+            first = counter * COUNT_PLANES
+            for k in range(first, first + COUNT_PLANES - 1):
                 cell[k] = cell[k + 1]
-            cell[first + PLANES - 1] = full[counter]
+            cell[first + COUNT_PLANES - 1] = full[counter]
 
 
 @kernel
 def _carry(cell: U64, first: int, word: np.uint64) -> np.uint64:
     """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once. Returns the carry: the
-    voxels whose count would exceed PLANES bits."""
-    for k in range(first, first + PLANES):
+    voxels whose count would exceed COUNT_PLANES bits."""
+    for k in range(first, first + COUNT_PLANES):
         carry = cell[k] & word
         cell[k] ^= word
         word = carry
@@ -196,6 +206,6 @@ def _carry(cell: U64, first: int, word: np.uint64) -> np.uint64:
 def count_of(cell: U64, first: int, bit: int) -> int:
     """The count of one voxel of a cell (words,); ``first`` is the counter's first plane."""
     value = 0
-    for k in range(PLANES):
+    for k in range(COUNT_PLANES):
         value |= int((cell[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
     return value

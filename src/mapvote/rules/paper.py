@@ -29,17 +29,17 @@ from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
 from mapvote.rules.voter import Tally, TileVotes
 
-MOST_POINTS = 15
+COUNTED_POINTS = 15
 """Points are counted up to this number, where Eq. (1) has reached its bound."""
 CLEAR, CLEAR_OF_CELLS, BEFORE_FARTHEST, THROUGH_COLUMN, FIRED = (1 << k for k in range(4, 9))
-"""Nothing above the ground before the cell; nothing in an occupied cell; not behind the farthest return; a ray through
-the heights in which the map has points; any ray that way at all. Movers hide what is behind them."""
+"""Bits of a word: no return above the ground before the cell; no return in an occupied cell before it; not behind the
+farthest return; a ray through the heights in which the map has points; any ray in this direction. Movers occlude."""
 WITHOUT_MOVERS = 5
-"""The same five, this many bits higher, of the scan without the points of moving objects."""
+"""Bits by which the same five bits are shifted for the scan without the points of moving objects."""
 BEGINS_ABOVE, REACHES_HIGHER = 1 << 14, 1 << 15
 """The map begins above the sensor's view at that range; it reaches higher than the scan's points."""
-WORDS = 1 << 16
-_BEHIND, _CLEAR, _NEVER = np.uint8(Sight.BEHIND), np.uint8(Sight.CLEAR), np.uint8(Sight.NEVER)
+N_WORDS = 1 << 16
+_BEHIND, _CLEAR, _UNSEEN = np.uint8(Sight.BEHIND), np.uint8(Sight.CLEAR), np.uint8(Sight.NEVER)
 LEVEL = np.array([0.0, 0.0, 1.0])
 _SIGHT = {
     "points": CLEAR,
@@ -55,7 +55,7 @@ def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: 
     """The five bits of one view into ``words``, in place; all planes (rows, cols)."""
     for r in range(sight.shape[0]):
         for c in range(sight.shape[1]):
-            if sight[r, c] == _NEVER:
+            if sight[r, c] == _UNSEEN:
                 continue
             word = FIRED
             if sight[r, c] >= _BEHIND:
@@ -78,7 +78,7 @@ def _of_points(
     origin, up = eye
     for r in range(counts.shape[0]):
         for c in range(counts.shape[1]):
-            word = min(counts[r, c], MOST_POINTS)
+            word = min(counts[r, c], COUNTED_POINTS)
             if occupied[r, c]:
                 dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
                 dz = bottom_z[r, c] - origin[2]
@@ -102,8 +102,8 @@ def cell_words(
     """(rows, cols) words of one scan seen from ``origin_map`` (3,), map metres, by a sensor with the upward axis
     ``up_map`` (3,).
 
-    ``clear_of_cells``: the :class:`Sight` of each cell where only occupied cells hide; ``without_movers``: view and
-    that sight of the scan without its movers. What is not given is taken to be like the rest.
+    ``clear_of_cells``: the :class:`Sight` of each cell where only occupied cells occlude; default: the view's.
+    ``without_movers``: view and that sight of the scan without its movers; default: those of the whole scan.
     """
     words = np.zeros(view.counts.shape, dtype=np.uint16)
     tan_top, grid = float(np.tan(np.radians(sensor.fov_top_deg))), view.grid
@@ -125,11 +125,11 @@ def cell_words(
     return words
 
 
-def sightings(seen: Observation, sensor: Sensor, n_min: int, asked: PaperSettings | None = None) -> U16:
-    """(rows, cols) words over the view's grid; only those bits are worked out that the reading ``asked`` looks at, or
-    all of them. ``n_min``: points that make a cell occupied, for what hides where only occupied cells do."""
-    by_cells = asked is None or asked.line_of_sight == "cells"
-    removed = asked is None or asked.movers == "removed"
+def sightings(seen: Observation, sensor: Sensor, n_min: int, reading: PaperSettings | None = None) -> U16:
+    """(rows, cols) words over the view's grid. Only the bits that the setting ``reading`` uses are computed; None: all.
+    ``n_min``: points that make a cell occupied, where only occupied cells occlude."""
+    by_cells = reading is None or reading.line_of_sight == "cells"
+    removed = reading is None or reading.movers == "removed"
     everything = np.ones(len(seen.moving), dtype=np.bool_)
     cells = _clear_of_cells(seen, everything, n_min) if by_cells else None
     without = None
@@ -138,8 +138,8 @@ def sightings(seen: Observation, sensor: Sensor, n_min: int, asked: PaperSetting
         view = _cast(seen, still, seen.scan.obstacle)
         without = view, _clear_of_cells(seen, still, n_min) if by_cells else view.sight
     words = cell_words(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without, seen.scan.up_map)
-    if asked is not None:
-        words[~votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)] = 0
+    if reading is not None:
+        words[~votes_in(seen.view.grid, seen.scan.origin_map, reading.window_m)] = 0
     return words
 
 
@@ -152,7 +152,7 @@ def votes_in(grid: Grid, origin_map: F64, window_m: float) -> Bool:
 
 
 def _clear_of_cells(seen: Observation, chosen: Bool, n_min: int) -> U8:
-    """Sight where only those returns hide what is behind them that lie in cells with n_min obstacle points or more."""
+    """Sight where only returns in cells with n_min obstacle points or more occlude the cells behind them."""
     scan = seen.scan
     counted = chosen & scan.obstacle & (scan.cell >= 0)
     counts = np.bincount(scan.cell[counted], minlength=seen.reference.counts.size)
@@ -160,7 +160,7 @@ def _clear_of_cells(seen: Observation, chosen: Bool, n_min: int) -> U8:
 
 
 def _cast(seen: Observation, chosen: Bool, obstacle: Bool) -> ScanView:
-    """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that hide what is behind them."""
+    """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that occlude the cells behind them."""
     scan, still = seen.scan, np.zeros(int(chosen.sum()), dtype=np.bool_)
     points, cell = scan.points_map[chosen], scan.cell[chosen]
     return cast_rays(points, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
@@ -174,8 +174,9 @@ def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32
     empty; with none empty if it was visible, else undetermined or without a vote. NO_VOTE where no ray was fired, and,
     in case 5 (``skip_tall_cells``), where the map is too tall.
     """
-    words = np.arange(WORDS)
-    n = words & MOST_POINTS
+    # The five states by the number of points and by sight.
+    words = np.arange(N_WORDS)
+    n = words & COUNTED_POINTS
     shift = WITHOUT_MOVERS if paper.movers == "removed" else 0
     visible = words & (_SIGHT[paper.line_of_sight] << shift) != 0
     fired = words & (FIRED << shift) != 0
@@ -184,7 +185,8 @@ def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32
     if paper.few_points == "empty":
         empty |= (n > 0) & ~occupied
     unseen = int(CellState.UNDETERMINED) if paper.occluded == "votes" else NO_VOTE
-    states = np.empty((2, WORDS), dtype=np.uint8)
+    states = np.empty((2, N_WORDS), dtype=np.uint8)
+    # A table each for cells without and with points in the map.
     for mapped, if_occupied, if_empty in (
         (0, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY),
         (1, CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY),
@@ -194,15 +196,15 @@ def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32
         states[mapped, occupied] = if_occupied
         if voting.skip_tall_cells:
             states[mapped, words & _TALL[paper.tall_rule] != 0] = NO_VOTE
-    points = weight_table(voting.weighted, voting.a, voting.b, voting.k, paper.n_min, MOST_POINTS)
+    points = weight_table(voting.weighted, voting.a, voting.b, voting.k, paper.n_min, COUNTED_POINTS)
     return states, np.where(occupied, points[n], VOTE_UNIT).astype(np.int32)
 
 
 def classify_paper(words: U16, mapped: Bool, voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32]:
     """The paper's five states and the votes each is worth: (states uint8, weights int32 in VOTE_UNITs), (rows, cols).
 
-    ``words`` (rows, cols) what the scan says (:func:`sightings`), ``mapped`` where the map holds
-    obstacle points; see :func:`reading_table`.
+    ``words`` (rows, cols): the scan's (:func:`sightings`); ``mapped``: where the map holds obstacle points; see
+    :func:`reading_table`.
     """
     states, weights = reading_table(voting, paper)
     return states[mapped.astype(np.intp), words], weights[words]
@@ -244,18 +246,18 @@ def readings_of(base: PaperSettings, only: str | None = None) -> dict[str, Paper
 
     ``only``: the one setting that is varied; None: each in turn.
     """
-    found = {"as set": base}
+    readings = {"as set": base}
     for setting, field in PaperSettings.model_fields.items():
         for value in _TRIED.get(setting) or get_args(field.annotation):
             if only in (None, setting) and value != getattr(base, setting):
-                found[f"{setting} {value}"] = base.model_copy(update={setting: value})
-    return found
+                readings[f"{setting} {value}"] = base.model_copy(update={setting: value})
+    return readings
 
 
-def read(base: PaperSettings, said: str) -> PaperSettings:
-    """``base`` with what ``said`` changes: "occluded=abstains, n_min=3". MapvoteError names what there is."""
+def read(base: PaperSettings, changes: str) -> PaperSettings:
+    """``base`` with ``changes`` such as "occluded=abstains, n_min=3". MapvoteError names the settings that exist."""
     values = base.model_dump()
-    for piece in said.split(","):
+    for piece in changes.split(","):
         setting, _, value = (part.strip() for part in piece.partition("="))
         if setting not in values:
             raise MapvoteError(f"reading {piece.strip()!r}: choose {', '.join(values)}, as in occluded=abstains")

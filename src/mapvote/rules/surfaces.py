@@ -1,7 +1,7 @@
 """The voter of surfaces: a drive is counted scan by scan, and judged at its end, one window of tiles after another.
 
-With its states go the looks of each cell that it calls changed. The vehicle's confidence in the cell follows from them:
-log-odds that the cell did change, by its own evidence. Most cells that are wrongly called changed lie at the rim of a
+Each changed cell carries its features. The vehicle's confidence in the cell follows from them: log-odds that the cell
+did change, by its own evidence. Most cells that are wrongly called changed lie at the rim of a
 true change, where centimetres decide which of two cells holds a surface. They are distinguished by the size of the
 object, the number of neighbouring cells with the same change, the cell's share of the object beside its neighbours',
 the height of a deleted object, and how deep in the cell the surface lies. The number of rays that crossed a deleted
@@ -12,6 +12,7 @@ its calibration).
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
@@ -22,21 +23,62 @@ from mapvote.config import Settings, VotingSettings
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.sensors import Sensor
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import one_hot
 from mapvote.perception.frontend import Observation
-from mapvote.rules.evidence import NOTHING, WORDS, Facts, count_scan, free_words, judge_window, weigh_voxels
+from mapvote.rules.evidence import (
+    NO_VOXELS,
+    SURFACE_RULE,
+    WORDS,
+    Facts,
+    SurfaceRule,
+    count_scan,
+    free_words,
+    judge_window,
+    weigh_voxels,
+)
 from mapvote.rules.packed_tiles import PackedTiles
 from mapvote.rules.voter import TileVotes
 
-_BLOCK = 2
-"""Tiles along the side of a block: with the cells around it 60 MB at a time."""
-HALO = 96
-"""Cells around a block that are judged along, so that what lies across its edge is judged alike from both sides: 29 m,
-a house and what stands before it."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class JudgedBlocks:
+    """Numbers of the windows in which a drive is judged at its end."""
+
+    side_tiles: int = 2
+    """Tiles along the side of a block: with the cells around it 60 MB at a time."""
+    halo_cells: int = 96
+    """Cells judged around a block, 29 m, a house and the space before it: objects across its edge are judged alike from
+    both sides."""
+
+
+JUDGED_BLOCKS = JudgedBlocks()
+
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class ChangeOdds:
+    """The curve of a vehicle's log-odds that a cell did change; ``benchmarks/probability.py`` at 9f8814a fitted it.
+
+    Coefficients: constant; the features of :func:`looks`; metres of depth (:func:`depths_m`).
+    """
+
+    most_cells: int = 200
+    """Cells of an object that count at most."""
+    most_height_m: float = 6.0
+    """Height of a deleted object that counts at most."""
+    built: tuple[float, ...] = (-4.104, 0.525, 3.454, 0.382, 0.0, 21.98)
+    """Coefficients for changed-occupied, nats."""
+    demolished: tuple[float, ...] = (-8.435, 0.982, 2.939, 0.689, 0.474, 22.654)
+    """Coefficients for changed-empty, nats."""
+
+
+CHANGE_ODDS = ChangeOdds()
 
 
 def surface_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> SurfaceVoter:
@@ -47,34 +89,45 @@ def surface_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Su
 class SurfaceVoter:
     """Surfaces: evidence per voxel over the drive, weighed at its end. Decides alone: its tally is one vote a cell."""
 
-    def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
+    def __init__(
+        self,
+        voting: VotingSettings,
+        point_map: PointMap,
+        rule: SurfaceRule = SURFACE_RULE,
+        judged: JudgedBlocks = JUDGED_BLOCKS,
+        odds: ChangeOdds = CHANGE_ODDS,
+    ) -> None:
         self.voting, self.point_map = voting, point_map
+        self.rule, self.judged, self.odds = rule, judged, odds
         self.evidence = PackedTiles(point_map.lattice, WORDS)
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        return count_scan(self.evidence, seen)
+        return count_scan(self.evidence, seen, self.rule)
 
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
         """Every tile with evidence, block by block; ``only``: of these tiles."""
         counted = self.evidence
-        for tiles, window in blocks(self.point_map.lattice, counted if only is None else counted.keys() & set(only)):
+        wanted = counted if only is None else counted.keys() & set(only)
+        for tiles, window in blocks(self.point_map.lattice, wanted, self.judged):
             yield from self._judge(tiles, window)
 
     def _judge(self, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, TileVotes]]:
+        # The evidence of all tiles of the window, weighed by the map.
         here = reference_window(self.point_map, window)
-        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        known_free = here.free if here.free is not None else above_ground_points(self.point_map, window)
         height_m = here.top_z - here.ground_z
         weighed, counted, free = Facts.none(window.shape), self.evidence, {}
         for tile in window.tiles():
             if tile in counted:
                 planes = counted[tile]
-                weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known, weighed)
+                weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known_free, weighed, self.rule)
                 if tile in tiles:
                     free[tile] = free_words(planes)
-        states, gone, new = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m)
+        states, gone, new = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m, self.rule)
+        # The votes of each tile of the block.
         amount = np.where(here.occupied != 0, np.bitwise_count(here.occupied), weighed.hits)
-        told = here.free if here.free is not None else np.zeros_like(known)
+        mapped_free = here.free if here.free is not None else np.zeros_like(known_free)
         for tile in tiles:
             cut = self._cut(tile, window)
             if (states[cut] != NO_VOTE).any():
@@ -87,8 +140,8 @@ class SurfaceVoter:
                         states=own,
                         gone=np.ascontiguousarray(gone[cut]),
                         new=_with_the_unknown(new[cut], weighed.beyond[cut], upwards),
-                        free=np.where(told[cut] != 0, NOTHING, free[tile] & ~here.occupied[cut]),
-                        looked=looks(states, amount, height_m, cut),
+                        free=np.where(mapped_free[cut] != 0, NO_VOXELS, free[tile] & ~here.occupied[cut]),
+                        looked=looks(states, amount, height_m, cut, self.odds),
                     ),
                 )
 
@@ -96,12 +149,15 @@ class SurfaceVoter:
         return self.point_map.lattice.tile(tile).slices_in(window)
 
 
-def blocks(lattice: Lattice, tiles: Iterable[TileIndex]) -> Iterator[tuple[list[TileIndex], Grid]]:
-    """Tiles whose votes are wanted together, each tile once, and the window in which they are judged."""
+def blocks(
+    lattice: Lattice, tiles: Iterable[TileIndex], judged: JudgedBlocks = JUDGED_BLOCKS
+) -> Iterator[tuple[list[TileIndex], Grid]]:
+    """Tiles that are judged together, each tile once, and the window in which they are judged."""
     every = sorted(tiles)
-    for row, col in sorted({(r // _BLOCK, c // _BLOCK) for r, c in every}):
-        inner = [t for t in every if (t[0] // _BLOCK, t[1] // _BLOCK) == (row, col)]
-        yield inner, reduce(Grid.union, map(lattice.tile, inner)).padded(HALO)
+    side = judged.side_tiles
+    for row, col in sorted({(r // side, c // side) for r, c in every}):
+        inner = [t for t in every if (t[0] // side, t[1] // side) == (row, col)]
+        yield inner, reduce(Grid.union, map(lattice.tile, inner)).padded(judged.halo_cells)
 
 
 def _with_the_unknown(new: U64, beyond: U64, free: U64 | None) -> U64:
@@ -110,22 +166,16 @@ def _with_the_unknown(new: U64, beyond: U64, free: U64 | None) -> U64:
     below_top = new.copy()
     for shift in (1, 2, 4, 8, 16, 32):
         below_top |= below_top >> np.uint64(shift)
-    return np.where(new != 0, new | beyond | ~(below_top | (EVERY_BIT if free is None else free)), NOTHING)
+    return np.where(new != 0, new | beyond | ~(below_top | (EVERY_BIT if free is None else free)), NO_VOXELS)
 
 
-LOOKS = 4
-MOST_CELLS = 200
-"""Sizes of objects are cut here."""
-MOST_HEIGHT_M = 6.0
-_BESIDE = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
-# By benchmarks/probability.py at 9f8814a.
-_BUILT = np.array([-4.104, 0.525, 3.454, 0.382, 0.0, 21.98])
-_DEMOLISHED = np.array([-8.435, 0.982, 2.939, 0.689, 0.474, 22.654])
-"""Coefficients of the log-odds: constant; the LOOKS features of the cell; metres of depth."""
+N_FEATURES = 4
+"""Features of :func:`looks`."""
+_NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
-def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice]) -> F64:
-    """(m, LOOKS) features of the cells of one ``tile`` of a window that its ``states`` call changed, ascending.
+def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice], odds: ChangeOdds = CHANGE_ODDS) -> F64:
+    """(m, N_FEATURES) features of the cells of one ``tile`` of a window that its ``states`` call changed, ascending.
 
     The features of a cell: ln(1 + cells of its 8-connected object); the share of its eight neighbours with the same
     state; ln(1 + its amount) - ln(1 + the largest amount of these neighbours), where ``amount`` is the number of mapped
@@ -134,26 +184,27 @@ def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice]) -> 
     """
     cells = changed_cells_of(np.ascontiguousarray(states[tile]))
     rows, cols = cells // TILE_CELLS + tile[0].start, cells % TILE_CELLS + tile[1].start
-    out = np.zeros((len(cells), LOOKS))
+    out = np.zeros((len(cells), N_FEATURES))
     for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY) if len(cells) else ():
-        mine = states[rows, cols] == state
+        of_state = states[rows, cols] == state
         alike = states == state
-        sizes, around_it, share = _of_things(alike, amount, rows[mine], cols[mine])
-        height = np.minimum(np.nan_to_num(height_m[rows[mine], cols[mine]]), MOST_HEIGHT_M)
+        sizes, neighbours, share = _features_of_objects(alike, amount, rows[of_state], cols[of_state])
+        height = np.minimum(np.nan_to_num(height_m[rows[of_state], cols[of_state]]), odds.most_height_m)
         rises = height if state == CellState.CHANGED_EMPTY else np.zeros(len(height))
-        out[mine] = np.column_stack([np.log1p(np.minimum(sizes, MOST_CELLS)), around_it / len(_BESIDE), share, rises])
+        large = np.log1p(np.minimum(sizes, odds.most_cells))
+        out[of_state] = np.column_stack([large, neighbours / len(_NEIGHBOURS), share, rises])
     return out
 
 
-def _of_things(alike: Bool, amount: I32, rows: I64, cols: I64) -> tuple[I64, I64, F64]:
+def _features_of_objects(alike: Bool, amount: I32, rows: I64, cols: I64) -> tuple[I64, I64, F64]:
     """For the cells (n,): the size of their 8-connected group of ``alike``, the number of their eight neighbours in
     ``alike``, and ln(1 + their amount) - ln(1 + the largest amount of these)."""
     group, _ = ndimage.label(alike, structure=np.ones((3, 3)))
     sizes = np.bincount(group.ravel())[group[rows, cols]]
-    mine = np.where(alike, amount, 0)
-    beside = np.stack([alike[rows + i, cols + j] for i, j in _BESIDE])
-    most = np.max([mine[rows + i, cols + j] for i, j in _BESIDE], axis=0)
-    return sizes, beside.sum(axis=0), np.log1p(mine[rows, cols]) - np.log1p(most)
+    amount_alike = np.where(alike, amount, 0)
+    beside = np.stack([alike[rows + i, cols + j] for i, j in _NEIGHBOURS])
+    most = np.max([amount_alike[rows + i, cols + j] for i, j in _NEIGHBOURS], axis=0)
+    return sizes, beside.sum(axis=0), np.log1p(amount_alike[rows, cols]) - np.log1p(most)
 
 
 def depths_m(states: U8, mapped: Tile | None, new_points: F32) -> F64:
@@ -179,9 +230,10 @@ def _deepest_m(points: F32) -> F64:
     return deep
 
 
-def log_odds(states: U8, looked: F64, depth_m: F64) -> F64:
+def log_odds(states: U8, looked: F64, depth_m: F64, odds: ChangeOdds = CHANGE_ODDS) -> F64:
     """(n,) log-odds, nats, that cells with ``states`` (n,), CHANGED_OCCUPIED or CHANGED_EMPTY, did change.
     ``looked`` (n, k): the features of :func:`looks`; ``depth_m`` (n,): see :func:`depths_m`."""
-    curve = np.where((states == CellState.CHANGED_OCCUPIED)[:, None], _BUILT, _DEMOLISHED)
+    built = (states == CellState.CHANGED_OCCUPIED)[:, None]
+    curve = np.where(built, np.array(odds.built), np.array(odds.demolished))
     features = np.column_stack([np.ones(len(states)), looked, depth_m])
     return np.asarray((curve * features).sum(axis=1))
