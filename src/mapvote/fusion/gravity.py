@@ -143,11 +143,18 @@ def lattice_cell(key: int) -> tuple[int, int]:
     return key >> 32, (key & 0xFFFFFFFF) - _HALF
 
 
-def fall_within(index: TileIndex, site: Remains) -> tuple[Fallen, frozenset[TileIndex]]:
+def fall_within(index: TileIndex, left: Remains) -> tuple[Fallen, frozenset[TileIndex]]:
     """(what falls in one tile whatever lies around it, the tiles without which more cannot be decided)."""
-    if not site.deleted.any():
+    rows, cols = (np.flatnonzero(left.deleted.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
         return Fallen.none(), frozenset()
-    fallen, missing = _fall_in(index, {index: site})
+    # What falls has a voxel in the box around all that was deleted, or a little beyond.
+    margin = 2 * GRAVITY.reach_cells + GRAVITY.touch_voxels + 1
+    within = min(rows[0], cols[0]) >= margin and max(rows[-1], cols[-1]) < TILE_CELLS - margin
+    box = slice(rows[0] - margin, rows[-1] + margin + 1), slice(cols[0] - margin, cols[-1] + margin + 1)
+    if within and not (left.rest[box] & ~left.holds[box]).any():
+        return Fallen.none(), frozenset()
+    fallen, missing = _fall_in(index, {index: left})
     return fallen.get(index, Fallen.none()), missing
 
 
@@ -287,7 +294,7 @@ _ANYWHERE.flags.writeable = False
 def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iterator[_Body]:
     """The insides of the objects of which a deleted cell lies in the cells ``own``; those that unknown tiles may extend
     are asked for instead."""
-    rows, cols = np.nonzero(window.deleted)
+    rows, cols = np.nonzero(window.deleted != 0)
     if not len(rows):
         return
     # Objects among the deleted cells, each by row, then column.
