@@ -45,7 +45,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.store import database
-from mapvote_server.store.admission import Intake, Receipt, examine
+from mapvote_server.store.admission import Intake, Receipt
+from mapvote_server.store.examination import examine
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import preview, publish
 from mapvote_server.store.store import Store

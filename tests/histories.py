@@ -17,7 +17,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote_server.errors import Conflict, NotFound
-from mapvote_server.store.admission import Intake, Receipt, examine
+from mapvote_server.store.admission import Intake, Receipt
+from mapvote_server.store.examination import examine
 from mapvote_server.store.policy import KeepPolicy, Policy
 from mapvote_server.store.publish import publish
 from mapvote_server.store.retention import clear

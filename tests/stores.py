@@ -9,7 +9,8 @@ from hand_made import Cell, Say, make_ballot, states_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import I8, NO_VOTE, CellState, MapvoteError
-from mapvote_server.store.admission import Intake, Receipt, examine
+from mapvote_server.store.admission import Intake, Receipt
+from mapvote_server.store.examination import examine
 from mapvote_server.store.store import Store
 
 NewStore = Callable[..., Store]

@@ -28,7 +28,8 @@ from mapvote_server.errors import Conflict, Forbidden, NotFound, TooLarge, TooMa
 from mapvote_server.questions.clouds import Clouds
 from mapvote_server.questions.history import Feed
 from mapvote_server.store import keys
-from mapvote_server.store.admission import Incoming, Intake, Quota, Receipt
+from mapvote_server.store.admission import Intake, Quota, Receipt
+from mapvote_server.store.examination import Incoming
 from mapvote_server.store.fusion_jobs import Watched
 from mapvote_server.store.integrity import KINDS
 from mapvote_server.store.publish import Gate

@@ -5,7 +5,6 @@ OpenAPI is the contract for vehicles in other languages: every answer is declare
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from functools import partial
 from typing import Any
 
 import msgspec
@@ -32,7 +31,8 @@ from mapvote_server.api.schemas import (
 )
 from mapvote_server.api.services import Parts, own, services
 from mapvote_server.questions.history import origin_of
-from mapvote_server.store.admission import Receipt, examine
+from mapvote_server.store.admission import Intake, Receipt
+from mapvote_server.store.examination import Examination, Incoming
 from mapvote_server.store.votes import withdraw
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
@@ -144,6 +144,21 @@ class BallotRoute(APIRoute):
         return handle
 
 
+_SLICE_S = 0.01
+"""A ballot is unpacked for this long, then other vehicles have their turn."""
+
+
+def _open(
+    intake: Intake, body: bytes, drive: tuple[str, str], key_hash: str | None
+) -> tuple[Examination, Incoming | None]:
+    """A ballot that nothing in its envelope forbids, and its first slice unpacked; its refusal is raised."""
+    examined = Examination(body, drive, key_hash)
+    refused = intake.refuse_early(examined)
+    if refused is not None:
+        raise refused
+    return examined, examined.go_on(_SLICE_S)
+
+
 async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     """One ballot, on disk before the answer. 201: new; 200: it replaced one of the same drive, or was there already.
 
@@ -152,8 +167,10 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     own(request, vehicle)
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
-    work = partial(examine, body, (vehicle, drive), request.state.key_hash)
-    incoming = await parts.vehicle.run(work)
+    given = parts.intake, body, (vehicle, drive), request.state.key_hash
+    examined, incoming = await parts.vehicle.run(_open, *given)
+    while incoming is None:  # behind the other vehicles that wait
+        incoming = await parts.vehicle.run(examined.go_on, _SLICE_S)
     receipt = await parts.writer.put(incoming)
     parts.metrics.ballots.labels(receipt.result).inc()
     created = receipt.result == "created"

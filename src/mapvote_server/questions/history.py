@@ -193,7 +193,7 @@ def _drives(record: Record, sound: Mapping[int, tuple[StoredVote, TileVote]]) ->
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
 """Kinds that concern the map alone: actor and reason are open to every reader."""
-OF_VEHICLES = ("ballot", "withdraw")
+OF_VEHICLES = ("ballot", "withdraw", "two places")
 """Kinds that reveal the minute of a drive."""
 _MOST = 500
 POLL_S = 0.9

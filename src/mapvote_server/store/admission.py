@@ -1,30 +1,42 @@
-"""Admission of ballots. :func:`examine` decodes a ballot and unpacks its planes, beside others and without a database.
-:class:`Intake` checks it against the map, the policy and the quota of its vehicle, within the transaction that writes
-it: idempotent, one standing ballot per drive, nothing overwritten.
+"""Admission of ballots. :class:`Intake` checks a ballot against the map, the policy and the quota of its vehicle:
+:meth:`Intake.refuse_early` by its envelope alone, before its planes are unpacked, and :meth:`Intake.write` within the
+transaction that writes it: idempotent, one standing ballot per drive, nothing overwritten.
 
-Where a vehicle can have been is checked too: near the map, on one path, at heights that the map allows.
+Where a vehicle can have been is checked too (:mod:`mapvote_server.store.place`).
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, BallotTile, Planes, check_path, decode, tile_key, unpack_planes
+from mapvote.codec.ballot import Ballot, tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_ground_plane
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.types import F64, Bool, MapvoteError
+from mapvote.core.grid import TileIndex
+from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote_server.store import keys, schema
-from mapvote_server.store.database import insert_rows, remembered, sum_of
+from mapvote_server.store.database import Question, insert_rows
+from mapvote_server.store.examination import Examination, Incoming, Votes, cells_of
+from mapvote_server.store.place import (
+    MAX_ABOVE_M,
+    MAX_BELOW_M,
+    TWO_PLACES,
+    apart_m,
+    are_two_places,
+    around,
+    refuse_far_tiles,
+    refuse_out_of_reach,
+    touched,
+)
 from mapvote_server.store.policy import RoundPolicy, policy_in
 from mapvote_server.store.queries import (
     load_blob,
@@ -40,49 +52,8 @@ from mapvote_server.store.store import Store
 MAX_CLOCK_AHEAD_NS = 300 * 10**9
 """A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
 other votes look old."""
-MAX_UNPACKED_BYTES = 512 << 20
-"""All planes of one ballot together, decompressed: some ten kilometres of street."""
-
-MIN_SCANS = 3
-"""Fewer localised scans found no ballot: their place was never confirmed by others."""
-MAX_MISFIT_SIGMAS = 3.0
-MISFIT_SLACK_M = 1.0
-"""A drive whose fixes lie steadily farther off its priors is held back: its clock, its GNSS or its place is wrong."""
-
-
-@dataclass(frozen=True, slots=True)
-class Votes:
-    """What admission needs of a ballot's votes on one tile."""
-
-    tile: TileIndex
-    spoken: bytes
-    """The cells that it votes on: 65536 bits, row by row."""
-    heights_m: tuple[float, float] | None
-    """Of its lowest and highest new point, map metres; None: it brings none."""
-    stored: tuple[Any, ...] = field(repr=False)
-    """Base, planes and sum, as the last columns of ``ballot_tiles``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Incoming:
-    """A ballot that is sound in itself."""
-
-    ballot: Ballot
-    votes: Sequence[Votes]
-    """The votes on each of its tiles."""
-    digest: str
-    """SHA-256 of the bytes that the vehicle sent."""
-    cast_by: str
-    """Method and stage: all ballots of a round agree on them."""
-    size: int
-    """Bytes."""
-    key_hash: str | None = None
-    """Hash of the key that sent the ballot; None: a client of this machine that needs none."""
-
-    @property
-    def drive(self) -> tuple[str, str]:
-        """(vehicle, drive)."""
-        return self.ballot.vehicle, self.ballot.drive
+_COMPARED = 16
+"""Other drives of a vehicle at the same time that a ballot is compared with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,57 +69,73 @@ class Receipt:
     """Its number in the log."""
 
 
-def examine(data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> Incoming:
-    """Decode a ballot and unpack every plane, once; MapvoteError on the first defect, or if it is of another ``drive``
-    (vehicle, drive) than its URL. The key is not checked."""
-    ballot = decode(data)
-    if not ballot.tiles:
-        raise MapvoteError("ballot: votes on no tile")
-    _check_founded(ballot)
-    if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
-        raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
-    if ballot.path is not None:
-        check_path(ballot.path, [tile.tile for tile in ballot.tiles])
-    votes, size = [], 0
-    for tile in ballot.tiles:
-        planes = unpack_planes(tile)
-        size += planes.nbytes
-        if size > MAX_UNPACKED_BYTES:
-            raise MapvoteError(
-                f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed; send a shorter drive"
-            )
-        votes.append(_votes_of(tile, ballot.base[tile_key(tile.tile)], planes))
-    cast_by = f"{ballot.method}, {ballot.stage}"
-    incoming = Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data), key_hash)
-    if drive not in (None, incoming.drive):
-        raise MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {drive[0][:64]}/{drive[1][:64]}")
-    return incoming
+class RoundNow:
+    """What the newest version and the policy ask of ballots, as of the last :meth:`catch_up`."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._policy = 0
+        """Number of the policy."""
+        self._asked = RoundPolicy()
+        self._cast_by = ""
+        self.newest = 0
+        """The newest version; 0: nothing was read yet."""
+        self.tiles: dict[TileIndex, TileHashes] = {}
+        """Its tiles."""
+
+    def catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
+        """Read what has changed of the map and the policy."""
+        if policy != self._policy:
+            self._policy, self._asked = policy, policy_in(connection).round
+            self._cast_by = self._asked.cast_by
+        if newest != self.newest:
+            touched = tiles_set_between(connection, self.newest, newest) if self.newest else None
+            for index in touched or ():
+                self.tiles.pop(index, None)
+            self.tiles |= tiles_of(connection, newest, touched)
+            self.newest = newest
+
+    def refusal(self, one: Incoming | Examination, now_ns: int) -> MapvoteError | None:
+        """The reason why an envelope does not fit the round, the clock or the map; None if it does."""
+        ballot, asked = one.ballot, self._asked
+        mend = "Vote again with the fleet's configuration (mapvote config)"
+        if self._cast_by != one.cast_by:
+            accepted = f"the current round accepts only {self._cast_by}"
+            return Conflict(f"This ballot uses method {one.cast_by}; {accepted}. {mend}")
+        if not ballot.settings_hash.startswith(asked.settings_hash):
+            accepted = f"the current round accepts only {asked.settings_hash[:16]}"
+            return Conflict(f"This ballot uses settings {ballot.settings_hash[:16]}; {accepted}. {mend}")
+        if ballot.map_id != self._store.map_id:
+            return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
+        tiles = [tile.tile for tile in ballot.tiles]
+        impossible = self._wrong_time(ballot, now_ns) or refuse_far_tiles(tiles, self.tiles.keys())
+        if impossible is not None:
+            return impossible
+        if ballot.version > self.newest:
+            return Conflict(f"there is no version {ballot.version} yet; the newest is {self.newest}: fetch it")
+        if ballot.version == self.newest:
+            for tile in tiles:
+                refused = wrong_base(ballot, tile, self.tiles.get(tile))
+                if refused is not None:
+                    return refused
+        return None
+
+    def _wrong_time(self, ballot: Ballot, now_ns: int) -> MapvoteError | None:
+        if ballot.start_ns < 0 or ballot.end_ns <= 0:
+            return MapvoteError("ballot: the drive lies before 1970; set the vehicle's clock")
+        if ballot.end_ns > now_ns + MAX_CLOCK_AHEAD_NS:
+            return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
+        if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
+            return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
+        return None
 
 
-def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
-    packed = base, *(getattr(tile, plane) for plane in schema.BALLOT_PLANES)
-    digest = sum_of(*packed)
-    remembered.put(digest, planes)
-    z = () if planes.new_points is None else planes.new_points[:, 2]
-    heights = (float(np.min(z)), float(np.max(z))) if len(z) else None
-    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), heights, (*packed, digest))
-
-
-def _check_founded(ballot: Ballot) -> None:
-    if ballot.scans_localised < MIN_SCANS:
-        raise MapvoteError(
-            f"ballot: only {ballot.scans_localised} of {ballot.scans} scans were localised, {MIN_SCANS} are needed; "
-            "drive farther on the map"
-        )
-    if ballot.prior_misfit_m is None or ballot.prior_sigma_m is None:
-        return
-    allowed = MAX_MISFIT_SIGMAS * ballot.prior_sigma_m + MISFIT_SLACK_M
-    if ballot.prior_misfit_m > allowed:
-        raise MapvoteError(
-            f"ballot held back: fixes and priors of {ballot.vehicle}/{ballot.drive} lie {ballot.prior_misfit_m:.1f} m "
-            f"apart (median), the priors claim {ballot.prior_sigma_m:.2f} m; check the vehicle's clock and GNSS, state "
-            "its true sigma, or vote without a prior (--prior none)"
-        )
+def wrong_base(ballot: Ballot, tile: TileIndex, then: TileHashes | None) -> Conflict | None:
+    """The refusal of a vote against another tile than the version's, ``then``; None if it is the same."""
+    if ballot.base[tile_key(tile)] == ("" if then is None else then.points):
+        return None
+    other = f"the base of tile {tile_key(tile)} is not that of version {ballot.version}"
+    return Conflict(f"{other}: fetch the map and vote again")
 
 
 class Intake:
@@ -157,12 +144,36 @@ class Intake:
     def __init__(self, store: Store, quota: Quota | None = None) -> None:
         self._store, self._quota = store, quota
         self._used: dict[str, _Used] = {}
-        self._newest, self._tiles = 0, dict[TileIndex, TileHashes]()
-        """The newest version, and its tiles."""
-        self._policy, self._asked, self._cast_by = 0, RoundPolicy(), ""
-        """Number of the policy, and what it asks of a round's ballots."""
+        self._round = RoundNow(store)
+        """Of the thread that writes."""
+        self._early = RoundNow(store)
+        """Of the threads that examine, under this lock."""
+        self._early_lock = Lock()
         self._lowest_m: dict[str, float] = {}
         """Lowest ground of a tile, by its plane's hash."""
+
+    def refuse_early(self, one: Examination) -> MapvoteError | None:
+        """The refusal of a ballot by its envelope: its round, time, tiles, base and quota. None if its planes must be
+        unpacked, or if it stands already.
+
+        Thread-safe. The store is read only before a refusal; :meth:`write` checks everything again.
+        """
+        now = self._store.clock()
+        with self._early_lock:
+            used = self._used.get(one.ballot.vehicle)
+            fits = self._early.newest and self._early.refusal(one, now) is None
+            if fits and self._over_quota(one, used) is None:
+                return None
+            with self._store.database.reading() as connection:
+                newest, policy, _ = connection.execute(_HEAD).one()
+                self._early.catch_up(connection, newest, policy)
+                refused = self._early.refusal(one, now)
+                if refused is None and self._quota is not None:
+                    refused = self._over_quota(one, _count(connection, one.ballot.vehicle, now))
+                if refused is None:
+                    return None
+                _, standing = _heard_of(connection, [one])
+        return None if standing.get(one.drive, (0, ""))[1] == one.digest else refused
 
     def write(self, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
         """Store the ballots that are admitted, in one durable transaction: for each a receipt, or why not.
@@ -179,11 +190,12 @@ class Intake:
         replaced: list[dict[str, int]] = []
         with self._store.database.writing() as connection:
             newest, policy, seq = connection.execute(_HEAD).one()
-            self._catch_up(connection, newest, policy)
+            self._round.catch_up(connection, newest, policy)
             came_with = {ballot.key_hash for ballot in ballots if ballot.key_hash is not None}
             valid = keys.of(connection, came_with, now) if came_with else {}
             first, standing = _heard_of(connection, ballots)
             rows: Rows = defaultdict(list)
+            admitted: list[Incoming] = []
             for one in ballots:
                 old, old_digest = standing.get(one.drive, (None, ""))
                 if old is not None and old_digest == one.digest:
@@ -199,6 +211,10 @@ class Intake:
                 if old is not None:
                     replaced.append({"old": old, "by": seq})
                 standing[one.drive] = seq, one.digest
+                for warning in elsewhere(connection, one, admitted):
+                    seq += 1
+                    rows[schema.events].append((seq, now, "two places", one.ballot.vehicle, warning))
+                admitted.append(one)
                 results.append(Receipt(*one.drive, "created" if old is None else "replaced", seq))
             for table, some in rows.items():
                 insert_rows(connection, table, some)
@@ -206,69 +222,40 @@ class Intake:
                 connection.execute(_REPLACED, replaced)
         return results
 
-    def _catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
-        """Read what has changed of the map and the policy since the last ballots."""
-        if policy != self._policy:
-            self._policy, self._asked = policy, policy_in(connection).round
-            self._cast_by = self._asked.cast_by
-        if newest != self._newest:
-            touched = tiles_set_between(connection, self._newest, newest) if self._newest else None
-            for index in touched or ():
-                self._tiles.pop(index, None)
-            self._tiles |= tiles_of(connection, newest, touched)
-            self._newest = newest
-
     def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
-        ballot, newest, asked = one.ballot, self._newest, self._asked
-        mend = "Vote again with the fleet's configuration (mapvote config)"
-        if self._cast_by != one.cast_by:
-            accepted = f"the current round accepts only {self._cast_by}"
-            return Conflict(f"This ballot uses method {one.cast_by}; {accepted}. {mend}")
-        if not ballot.settings_hash.startswith(asked.settings_hash):
-            accepted = f"the current round accepts only {asked.settings_hash[:16]}"
-            return Conflict(f"This ballot uses settings {ballot.settings_hash[:16]}; {accepted}. {mend}")
-        if ballot.map_id != self._store.map_id:
-            return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
-        impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, self._tiles.keys())
-        impossible = impossible or self._out_of_height(connection, one.votes)
-        if impossible is not None:
-            return impossible
-        if ballot.version > newest:
-            return Conflict(f"there is no version {ballot.version} yet; the newest is {newest}: fetch it")
-        counts = ballot.version == newest
+        ballot, tiles = one.ballot, self._round.tiles
+        refused = self._round.refusal(one, now) or refuse_out_of_reach(one.votes, tiles.keys())
+        refused = refused or self._out_of_height(connection, one.votes)
+        if refused is not None:
+            return refused
+        counts = ballot.version == self._round.newest
         for votes in one.votes:
-            now_there = self._tiles.get(votes.tile)
-            then = now_there if ballot.version == newest else tile_of(connection, ballot.version, votes.tile)
-            if ballot.base[tile_key(votes.tile)] != ("" if then is None else then.points):
-                known = f"the base of tile {tile_key(votes.tile)} is not that of version {ballot.version}"
-                return Conflict(f"{known}: fetch the map and vote again")
+            now_there = tiles.get(votes.tile)
+            if ballot.version != self._round.newest:
+                refused = wrong_base(ballot, votes.tile, tile_of(connection, ballot.version, votes.tile))
+                if refused is not None:
+                    return refused
             counts = counts or _counts_somewhere(connection, votes, ballot.version, now_there)
         if not counts:
             stale = names(votes.tile for votes in one.votes)
             return Conflict(
                 f"every cell voted on has changed since version {ballot.version}: fetch tiles {stale} and vote again"
             )
-        return None if self._quota is None else self._over_quota(connection, one, now, self._quota)
-
-    def _wrong_time(self, ballot: Ballot, now: int) -> MapvoteError | None:
-        if ballot.end_ns > now + MAX_CLOCK_AHEAD_NS:
-            return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
-        if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
-            return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
-        return None
+        return self._count_in(connection, one, now)
 
     def _out_of_height(self, connection: sa.Connection, votes: Sequence[Votes]) -> MapvoteError | None:
         """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
 
         The nearest tiles tell: itself and its neighbours, else those in reach.
         """
+        tiles = self._round.tiles
         for one in votes:
             if one.heights_m is None:
                 continue
             low, high = one.heights_m
-            near = _touched(one.tile, self._tiles) or [index for index in _around(one.tile) if index in self._tiles]
-            ground_m = min((self._ground_m(connection, self._tiles[index].ground) for index in near), default=np.inf)
+            near = touched(one.tile, tiles) or [index for index in around(one.tile) if index in tiles]
+            ground_m = min((self._ground_m(connection, tiles[index].ground) for index in near), default=np.inf)
             if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low <= high <= ground_m + MAX_ABOVE_M:
                 span = f"{low:.1f} to {high:.1f} m on tile {tile_key(one.tile)}"
                 below = f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there"
@@ -287,20 +274,28 @@ class Intake:
             self._lowest_m[ground] = float(plane[np.isfinite(plane)].min(initial=np.inf))
         return self._lowest_m[ground]
 
-    def _over_quota(self, connection: sa.Connection, one: Incoming, now: int, quota: Quota) -> MapvoteError | None:
-        """Why a ballot is too much of its vehicle; None lets it through and counts it. What a vehicle has used is
-        counted in the store once an hour and before a refusal, in between from what was let through."""
-        vehicle, tiles = one.ballot.vehicle, len(one.ballot.tiles)
-        if tiles > quota.tiles_a_drive:
-            limit = f"the drive votes on {tiles} tiles, the limit is {quota.tiles_a_drive}"
+    def _over_quota(self, one: Incoming | Examination, used: _Used | None) -> MapvoteError | None:
+        """The refusal of a ballot that is too much of its vehicle; None if it is not. ``used``: None if unknown."""
+        if self._quota is None:
+            return None
+        if len(one.ballot.tiles) > self._quota.tiles_a_drive:
+            limit = f"the drive votes on {len(one.ballot.tiles)} tiles, the limit is {self._quota.tiles_a_drive}"
             return MapvoteError(f"{limit}: send each part of it as a drive of its own")
+        return None if used is None else _exceeded(self._quota, used, one)
+
+    def _count_in(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
+        """The refusal of a ballot that is too much of its vehicle; None lets it through and counts it. What a vehicle
+        has used is counted in the store once an hour and before a refusal, in between from what was let through."""
+        if self._quota is None:
+            return None
+        vehicle = one.ballot.vehicle
         used = self._used.get(vehicle)
-        if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or _exceeded(quota, used, one) is not None:
+        if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or self._over_quota(one, used) is not None:
             used = self._used[vehicle] = _count(connection, vehicle, now)
-        why = _exceeded(quota, used, one)
-        if why is None:
+        refused = self._over_quota(one, used)
+        if refused is None:
             used.ballots, used.size = used.ballots + 1, used.size + one.size
-        return why
+        return refused
 
 
 _HEAD = sa.select(
@@ -316,7 +311,7 @@ _REPLACED = _REPLACED.values(gone_seq=sa.bindparam("by"))
 
 
 def _heard_of(
-    connection: sa.Connection, ballots: Sequence[Incoming]
+    connection: sa.Connection, ballots: Sequence[Incoming | Examination]
 ) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], tuple[int, str]]]:
     """For the drives of these ballots: ({drive: its first event}, {drive: (number, digest) of its standing ballot})."""
     b = schema.ballots
@@ -347,6 +342,41 @@ def _enter(rows: Rows, incoming: Incoming, seq: int, first_seq: int, now: int) -
         rows[schema.paths].append((seq, ballot.path))
 
 
+_b = schema.ballots.c
+_SAME_TIME = Question(
+    sa.select(_b.seq, _b.drive, _b.start_ns, _b.end_ns)
+    .where(_b.vehicle == sa.bindparam("vehicle"), _b.drive != sa.bindparam("drive"), _b.gone_seq.is_(None))
+    .where(_b.end_ns >= sa.bindparam("after_ns"), _b.start_ns <= sa.bindparam("before_ns"))
+    .limit(_COMPARED)
+)
+"""Standing ballots of other drives of a vehicle in a span of time."""
+
+
+def elsewhere(connection: sa.Connection, one: Incoming, beside: Sequence[Incoming]) -> list[str]:
+    """Drives of the same vehicle at another place at the same time: in the store, or ``beside`` it in its batch."""
+    ballot, window_ns = one.ballot, round(TWO_PLACES.window_s * 1e9)
+    span = {"after_ns": ballot.start_ns - window_ns, "before_ns": ballot.end_ns + window_ns}
+    rows = _SAME_TIME.ask(connection, vehicle=ballot.vehicle, drive=ballot.drive, **span).all()
+    others = [(row.drive, row.start_ns, row.end_ns, _tiles_of_ballot(connection, row.seq)) for row in rows]
+    for other in beside:
+        if other.ballot.vehicle == ballot.vehicle and other.ballot.drive != ballot.drive:
+            tiles = [votes.tile for votes in other.votes]
+            others.append((other.ballot.drive, other.ballot.start_ns, other.ballot.end_ns, tiles))
+    warnings = []
+    for drive, start_ns, end_ns, tiles in others:
+        pause_s = max(0, start_ns - ballot.end_ns, ballot.start_ns - end_ns) / 1e9
+        distance_m = apart_m([votes.tile for votes in one.votes], tiles)
+        if are_two_places(distance_m, pause_s):
+            both = f"drives {ballot.drive} and {drive}, {pause_s:.0f} s apart, lie {distance_m / 1e3:.1f} km apart"
+            warnings.append(f"{both}: two vehicles send with one key; revoke it if it was stolen")
+    return warnings
+
+
+def _tiles_of_ballot(connection: sa.Connection, seq: int) -> list[TileIndex]:
+    t = schema.ballot_tiles.c
+    return [(row, col) for row, col in connection.execute(sa.select(t.row, t.col).where(t.ballot == seq))]
+
+
 def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
     """Whether a ballot determines a cell that has not changed since ``version``.
 
@@ -363,13 +393,7 @@ def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now
         return True
     if memory is None or not len(memory.changed_after(version)):
         return True
-    return bool((_cells(votes.spoken) & (memory.changed <= version)).any())
-
-
-def _cells(spoken: bytes) -> Bool:
-    """(256, 256) bool."""
-    bits = np.unpackbits(np.frombuffer(spoken, dtype=np.uint8))
-    return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)
+    return bool((cells_of(votes.spoken) & (memory.changed <= version)).any())
 
 
 _COUNTED_AGAIN_NS = DAY_NS // 24
@@ -393,7 +417,7 @@ class _Used:
     size: int
 
 
-def _exceeded(quota: Quota, used: _Used, one: Incoming) -> TooMany | None:
+def _exceeded(quota: Quota, used: _Used, one: Incoming | Examination) -> TooMany | None:
     vehicle = one.ballot.vehicle
     if used.ballots >= quota.drives_a_day:
         said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
@@ -410,75 +434,3 @@ def _count(connection: sa.Connection, vehicle: str, now: int) -> _Used:
     today = sa.func.sum(sa.case((b.c.received_ns > now - DAY_NS, 1), else_=0))
     row = connection.execute(sa.select(today, sa.func.sum(b.c.bytes)).where(b.c.vehicle == vehicle)).one()
     return _Used(now, int(row[0] or 0), int(row[1] or 0))
-
-
-MAX_BELOW_M, MAX_ABOVE_M = 10.0, 120.0
-"""New points lie between so much below and so much above the lowest ground of the map around them."""
-MAX_REACH_M = 200.0
-"""Twice what a LiDAR sees: a vote farther from the map than this cannot come from a vehicle that localised in it."""
-_TILE_M = TILE_CELLS * CELL_SIZE
-_TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
-
-
-def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the
-    map, or on tiles in groups that lie farther apart than that. None if it may have been there."""
-    for votes in said:
-        if _touched(votes.tile, map_tiles):
-            continue  # the whole tile is within reach
-        near = [index for index in _around(votes.tile) if index in map_tiles]
-        if not near or _farthest_m(votes, near) > MAX_REACH_M:
-            where = f"tile {tile_key(votes.tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
-            return MapvoteError(f"{where}: a vehicle votes on what it saw while it localised in the map")
-    apart = _first_apart([votes.tile for votes in said])
-    if apart is not None:
-        first, other = (tile_key(index) for index in apart)
-        why = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
-        return MapvoteError(f"{why}: a drive is one way; send each part as a drive of its own")
-    return None
-
-
-_AROUND = [
-    (row, col)
-    for row in range(-_TILES_AWAY, _TILES_AWAY + 1)
-    for col in range(-_TILES_AWAY, _TILES_AWAY + 1)
-    if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= MAX_REACH_M
-]
-"""Steps to the tiles within reach of any part of a tile."""
-
-
-def _around(index: TileIndex) -> list[TileIndex]:
-    """The tiles that are within reach of any part of a tile, itself too."""
-    return [(index[0] + row, index[1] + col) for row, col in _AROUND]
-
-
-def _touched(index: TileIndex, map_tiles: Collection[TileIndex]) -> list[TileIndex]:
-    """The map's tiles that touch a tile, corners included, itself too."""
-    beside = ((index[0] + row, index[1] + col) for row in (-1, 0, 1) for col in (-1, 0, 1))
-    return [tile for tile in beside if tile in map_tiles]
-
-
-def _farthest_m(votes: Votes, near: Collection[TileIndex]) -> float:
-    """From the map's nearest tile to the cell that is farthest from all of them, of those voted on; metres."""
-    rows, cols = np.nonzero(_cells(votes.spoken))
-    if not len(rows):
-        return 0.0
-    y = (votes.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
-    x = (votes.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
-    least: F64 = np.full(len(rows), np.inf)
-    for row, col in near:
-        dy = np.maximum(np.maximum(row * _TILE_M - y, y - (row + 1) * _TILE_M), 0.0)
-        dx = np.maximum(np.maximum(col * _TILE_M - x, x - (col + 1) * _TILE_M), 0.0)
-        least = np.minimum(least, np.hypot(dx, dy))
-    return float(least.max())
-
-
-def _first_apart(tiles: list[TileIndex]) -> tuple[TileIndex, TileIndex] | None:
-    """The first tile, and one that cannot be reached from it over the others; None if there is none."""
-    left = set(tiles[1:]) - {tiles[0]}
-    reached = [tiles[0]]
-    while reached and left:
-        found = [index for index in _around(reached.pop()) if index in left]
-        left.difference_update(found)
-        reached += found
-    return (tiles[0], min(left)) if left else None

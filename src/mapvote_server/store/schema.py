@@ -131,6 +131,8 @@ ballots = sa.Table(
     sum_but("gone_seq", "bytes"),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
     sa.Index("ix_ballots_gone_seq", "gone_seq"),
+    sa.Index("ix_ballots_end", "vehicle", "end_ns"),
+    sa.Index("ix_ballots_received_ns", "received_ns"),
 )
 """``cast_by``: method and stage; ``bytes``: size of the upload; ``version``: the version that the vehicle used.
 ``first_seq``: the event with which this drive first arrived; ``gone_seq``: the event that replaced or withdrew this

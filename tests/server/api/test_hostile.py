@@ -23,7 +23,7 @@ from live_server import serving_here
 from mapvote.codec.ballot import MAX_TILE_INDEX, encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote_server.store import keys
-from mapvote_server.store.admission import examine
+from mapvote_server.store.examination import examine
 from mapvote_server.store.policy import Policy, RoundPolicy
 from mapvote_server.store.store import Store
 from mutants import bomb, mutants
@@ -144,7 +144,9 @@ def test_a_bomb_of_a_gigabyte_costs_no_memory() -> None:
         (changed(map_id="another map"), 409, "another map"),
         (changed(vehicle="v2"), 422, "v2/d1"),
         (changed(end_ns=(1 << 64) - 1), 422, "future"),
-        (changed(start_ns=-(1 << 63)), None, ""),
+        (changed(start_ns=0), None, ""),
+        (changed(start_ns=-(1 << 63)), 422, "before 1970"),
+        *((changed(start_ns=ns, end_ns=ns), 422, "before 1970") for ns in (-(1 << 63), -1, 0)),
         (changed(settings_hash="a\x00b"), 422, "not readable"),
         (changed(settings_hash="0" * 64), 409, "fleet's configuration"),
         (changed(method="evidence"), 409, "evidence"),

@@ -13,23 +13,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall
+from hand_made import SHAPE, Say, make_ballot, make_map, make_tile, states_plane, two_walls, wall
 from mapvote.codec.ballot import Ballot, Planes, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.api.schemas import refuse
 from mapvote_server.errors import TooMany
-from mapvote_server.store.admission import (
-    Incoming,
-    Intake,
-    Quota,
-    Receipt,
-    Votes,
-    examine,
-    refuse_out_of_reach,
-)
+from mapvote_server.questions.history import events_after, newest_event
+from mapvote_server.store.admission import Intake, Quota, Receipt
 from mapvote_server.store.database import Remembered
+from mapvote_server.store.examination import Examination, Incoming, Votes, examine
+from mapvote_server.store.place import refuse_out_of_reach
+from mapvote_server.store.policy import Policy, RoundPolicy
 from mapvote_server.store.store import Store
 from stores import Clock
 
@@ -200,3 +196,89 @@ def test_what_was_not_asked_for_longest_is_forgotten_first_and_never_more_is_kep
     remembered = Remembered(BYTES - 1)
     remembered.put("a", unpacked(0))
     assert (remembered.get("a"), remembered.bytes) == ({}, 0), "larger than all that may be kept"
+
+
+ROW = make_map({(0, col): make_tile(wall([(3, 3)], [0.5]), index=(0, col)) for col in range(60)})
+
+
+def far_drive(name: str, tile: TileIndex, end_s: float, vehicle: str = "v1") -> Incoming:
+    """Ten seconds on one tile of a map of 60 tiles in a row."""
+    says = {tile: Say(states_plane({(3, 3): CellState.UNCHANGED_EMPTY}))}
+    sent = make_ballot(ROW, says, vehicle, name, end_ns=round(end_s * 1e9))
+    return examine(encode(msgspec.structs.replace(sent, start_ns=sent.end_ns - 10**10)))
+
+
+@pytest.mark.parametrize(
+    ("tile", "end_s", "vehicle", "told"),
+    [
+        ((0, 45), 1000.0, "v1", True),
+        ((0, 45), 1005.0, "v1", True),
+        ((0, 45), 1020.0, "v1", True),
+        ((0, 45), 1070.0, "v1", False),
+        ((0, 45), 5000.0, "v1", False),
+        ((0, 10), 1000.0, "v1", False),
+        ((0, 45), 1000.0, "v2", False),
+    ],
+)
+@pytest.mark.parametrize("together", [True, False])
+def test_one_key_at_two_places_at_the_same_time_is_told_to_the_operator(
+    tmp_path: Path, tile: TileIndex, end_s: float, vehicle: str, told: bool, together: bool
+) -> None:
+    """Column 45 begins 3.4 km from column 0: a drive of the same vehicle there within a minute is not its own."""
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", ROW)
+    before = newest_event(store)
+    drives = [far_drive("d0", (0, 0), 1000.0), far_drive("d1", tile, end_s, vehicle)]
+    for batch in [drives] if together else [[one] for one in drives]:
+        assert all(isinstance(answer, Receipt) for answer in Intake(store).write(batch))
+    events = events_after(store, before)
+    warned = [event for event in events if event.kind == "two places"]
+    assert len(warned) == told
+    for event in warned:
+        assert (event.actor, "3.4 km apart" in event.detail) == ("v1", True)
+    assert [event.seq for event in events] == list(range(before + 1, before + 3 + told)), "the log has no gap"
+    store.close()
+
+
+def early(intake: Intake, sent: Ballot) -> str | None:
+    refused = intake.refuse_early(Examination(encode(sent)))
+    return None if refused is None else str(refused)
+
+
+def test_an_envelope_is_refused_before_a_plane_is_unpacked_and_by_the_present_state(tmp_path: Path) -> None:
+    clock = Clock(1_800_000_000_000_000_000)
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), clock=clock)
+    intake = Intake(store, Quota(drives_a_day=2, tiles_a_drive=2, stored_bytes=1 << 40))
+    says = Say(states_plane({(3, 3): CellState.UNCHANGED_EMPTY}))
+    good = make_ballot(two_walls(), {(0, 0): says}, "a", "d0")
+    refused = {
+        "more than 200 m from the map": make_ballot(two_walls(), {(0, 9): says}, "a"),
+        "3 tiles, the limit is 2": make_ballot(two_walls(), {(0, col): says for col in range(3)}, "a"),
+        "uses method paper": make_ballot(two_walls(), {(0, 0): says}, "a", method="paper"),
+        "no version 7 yet": make_ballot(two_walls(), {(0, 0): says}, "a", version=7),
+        "the base of tile 0,0": make_ballot(two_walls(), {(0, 0): says}, "a", base={(0, 0): "f" * 64}),
+        "ends in the future": make_ballot(two_walls(), {(0, 0): says}, "a", end_ns=clock.now + 10**12),
+    }
+    for broken in (b"", b"no frame", bytes(100)):
+        for reason, ballot in refused.items():
+            tiles = [msgspec.structs.replace(tile, states=broken) for tile in ballot.tiles]
+            told = early(intake, msgspec.structs.replace(ballot, tiles=tiles))
+            assert told is not None
+            assert reason in told
+    assert early(intake, good) is None
+    for i in range(2):
+        assert isinstance(intake.write([examine(encode(msgspec.structs.replace(good, drive=f"d{i}")))])[0], Receipt)
+    assert "2 drives in 24 hours" in str(early(intake, msgspec.structs.replace(good, drive="d2")))
+    assert early(intake, good) is None, "what stands already is answered by its receipt"
+    store.set_policy(Policy(round=RoundPolicy(method="paper")))
+    assert "drives in 24 hours" in str(early(intake, refused["uses method paper"])), "the policy of now holds"
+    store.close()
+
+
+def test_a_ballot_unpacked_in_slices_is_the_ballot_unpacked_at_once() -> None:
+    says = {(0, col): Say(states_plane({(3, col): CellState.UNCHANGED_EMPTY})) for col in range(5)}
+    data = encode(make_ballot(two_walls(), says, "a"))
+    sliced, slices = Examination(data), 1
+    while (incoming := sliced.go_on(0.0)) is None:
+        slices += 1
+    assert slices == 5
+    assert incoming == examine(data)

@@ -12,7 +12,8 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.errors import NotFound, Unauthorised
 from mapvote_server.store import keys
-from mapvote_server.store.admission import Intake, examine
+from mapvote_server.store.admission import Intake
+from mapvote_server.store.examination import examine
 from mapvote_server.store.publish import publish
 from mapvote_server.store.rollback import replay
 from mapvote_server.store.store import Store

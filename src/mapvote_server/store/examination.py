@@ -1,0 +1,159 @@
+"""A ballot as it arrives: its envelope is decoded at once, its planes are unpacked a slice at a time. No database."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mapvote.codec.ballot import Ballot, BallotTile, Planes, check_path, decode, tile_key, unpack_planes
+from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.types import Bool, MapvoteError
+from mapvote_server.store import schema
+from mapvote_server.store.database import remembered, sum_of
+
+MAX_UNPACKED_BYTES = 512 << 20
+"""All planes of one ballot together, decompressed: some ten kilometres of street."""
+
+MIN_SCANS = 3
+"""Fewer localised scans found no ballot: their place was never confirmed by others."""
+MAX_MISFIT_SIGMAS = 3.0
+MISFIT_SLACK_M = 1.0
+"""A drive whose fixes lie steadily farther off its priors is held back: its clock, its GNSS or its place is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Votes:
+    """What admission needs of a ballot's votes on one tile."""
+
+    tile: TileIndex
+    spoken: bytes
+    """The cells that it votes on: 65536 bits, row by row."""
+    heights_m: tuple[float, float] | None
+    """Of its lowest and highest new point, map metres; None: it brings none."""
+    stored: tuple[Any, ...] = field(repr=False)
+    """Base, planes and sum, as the last columns of ``ballot_tiles``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A ballot that is sound in itself."""
+
+    ballot: Ballot
+    votes: Sequence[Votes]
+    """The votes on each of its tiles."""
+    digest: str
+    """SHA-256 of the bytes that the vehicle sent."""
+    cast_by: str
+    """Method and stage: all ballots of a round agree on them."""
+    size: int
+    """Bytes."""
+    key_hash: str | None = None
+    """Hash of the key that sent the ballot; None: a client of this machine that needs none."""
+
+    @property
+    def drive(self) -> tuple[str, str]:
+        """(vehicle, drive)."""
+        return self.ballot.vehicle, self.ballot.drive
+
+
+class Examination:
+    """A ballot whose envelope is sound; :meth:`go_on` unpacks its planes.
+
+    MapvoteError if the envelope is not, or if the ballot is of another ``drive`` (vehicle, drive) than its URL. The key
+    is not checked.
+    """
+
+    def __init__(self, data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> None:
+        ballot = decode(data)
+        if not ballot.tiles:
+            raise MapvoteError("ballot: votes on no tile")
+        _check_founded(ballot)
+        if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
+            raise MapvoteError(
+                "ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage"
+            )
+        self.ballot = ballot
+        self.cast_by = f"{ballot.method}, {ballot.stage}"
+        self.size = len(data)
+        self.digest = hashlib.sha256(data).hexdigest()
+        self._key_hash = key_hash
+        self._votes: list[Votes] = []
+        self._unpacked_bytes = 0
+        if drive not in (None, self.drive):
+            raise MapvoteError(f"the ballot is of {'/'.join(self.drive)}, not {drive[0][:64]}/{drive[1][:64]}")
+
+    @property
+    def drive(self) -> tuple[str, str]:
+        """(vehicle, drive)."""
+        return self.ballot.vehicle, self.ballot.drive
+
+    @property
+    def tiles(self) -> list[TileIndex]:
+        """The tiles that it votes on."""
+        return [tile.tile for tile in self.ballot.tiles]
+
+    def go_on(self, for_s: float = math.inf) -> Incoming | None:
+        """Unpack tiles until all are done or ``for_s`` seconds have passed; the ballot once all are done, else None.
+
+        MapvoteError on the first defect.
+        """
+        if not self._votes and self.ballot.path is not None:
+            check_path(self.ballot.path, self.tiles)
+        ends_s = time.monotonic() + for_s
+        for tile in self.ballot.tiles[len(self._votes) :]:
+            planes = unpack_planes(tile)
+            self._unpacked_bytes += planes.nbytes
+            if self._unpacked_bytes > MAX_UNPACKED_BYTES:
+                most = f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed"
+                raise MapvoteError(f"{most}; send a shorter drive")
+            self._votes.append(_votes_of(tile, self.ballot.base[tile_key(tile.tile)], planes))
+            if time.monotonic() > ends_s:
+                break
+        if len(self._votes) < len(self.ballot.tiles):
+            return None
+        return Incoming(self.ballot, self._votes, self.digest, self.cast_by, self.size, self._key_hash)
+
+
+def examine(data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> Incoming:
+    """The whole of :class:`Examination` at once; MapvoteError as there."""
+    incoming = Examination(data, drive, key_hash).go_on()
+    assert incoming is not None
+    return incoming
+
+
+def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
+    packed = base, *(getattr(tile, plane) for plane in schema.BALLOT_PLANES)
+    digest = sum_of(*packed)
+    remembered.put(digest, planes)
+    z = () if planes.new_points is None else planes.new_points[:, 2]
+    heights = (float(np.min(z)), float(np.max(z))) if len(z) else None
+    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), heights, (*packed, digest))
+
+
+def _check_founded(ballot: Ballot) -> None:
+    if ballot.scans_localised < MIN_SCANS:
+        raise MapvoteError(
+            f"ballot: only {ballot.scans_localised} of {ballot.scans} scans were localised, {MIN_SCANS} are needed; "
+            "drive farther on the map"
+        )
+    if ballot.prior_misfit_m is None or ballot.prior_sigma_m is None:
+        return
+    allowed = MAX_MISFIT_SIGMAS * ballot.prior_sigma_m + MISFIT_SLACK_M
+    if ballot.prior_misfit_m > allowed:
+        raise MapvoteError(
+            f"ballot held back: fixes and priors of {ballot.vehicle}/{ballot.drive} lie {ballot.prior_misfit_m:.1f} m "
+            f"apart (median), the priors claim {ballot.prior_sigma_m:.2f} m; check the vehicle's clock and GNSS, state "
+            "its true sigma, or vote without a prior (--prior none)"
+        )
+
+
+def cells_of(spoken: bytes) -> Bool:
+    """(256, 256) bool, of packed bits."""
+    bits = np.unpackbits(np.frombuffer(spoken, dtype=np.uint8))
+    return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)
