@@ -178,7 +178,7 @@ def test_below_n_min_a_cell_is_undetermined_or_empty_but_never_occupied() -> Non
     st.integers(1, 8),
     st.booleans(),
 )
-def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_changed_or_not(
+def test_under_every_reading_n_min_points_make_a_cell_occupied(
     occluded: Any, few_points: Any, movers: Any, sight: Any, tall_rule: Any, n_min: int, tall: bool
 ) -> None:
     paper = PaperSettings(
@@ -242,7 +242,7 @@ def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     assert (left.gone, left.free) == (None, None), "the paper's vote is of whole cells"
 
 
-def test_scans_vote_in_a_square_around_the_vehicle_and_nothing_is_said_of_cells_outside_it() -> None:
+def test_scans_vote_only_in_a_square_around_the_vehicle() -> None:
     rows, cols = np.nonzero(votes_in(Grid(Lattice(), 0, 0, 100, 140), np.array([24.0, 9.0, 3.0]), 6.0))
     assert (rows.min(), cols.min()) == (20, 70)
     assert (rows.max(), cols.max()) == (40, 90), "cells that the square ends in"

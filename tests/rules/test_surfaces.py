@@ -62,7 +62,7 @@ def after(
     return dict(voter.each())[0, 0]
 
 
-def test_a_wall_set_back_by_half_a_metre_is_an_old_wall_gone_and_a_new_one_come() -> None:
+def test_a_wall_set_back_by_half_a_metre_is_a_deleted_wall_and_a_new_one() -> None:
     votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y + 0.6))
     assert all(votes.states[cell] == CE for cell in WALL)
     assert all(votes.states[ROW + 2, c] == CO for c in COLUMNS)
@@ -71,7 +71,7 @@ def test_a_wall_set_back_by_half_a_metre_is_an_old_wall_gone_and_a_new_one_come(
     assert not votes.new[votes.states != CO].any()
 
 
-def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
+def test_a_wall_hit_some_centimetres_off_its_place_stands() -> None:
     votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y + 0.5 * CELL_SIZE + 0.5 * SURFACE_RULE.hit_reach_m))
     assert all(votes.states[cell] == UO for cell in WALL)
     assert not (votes.states == CO).any()
@@ -88,7 +88,7 @@ def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
         pytest.param([0.45], ROW, UN, id="what is no higher than a kerb"),
     ],
 )
-def test_how_much_must_go_to_be_a_change(heights: list[float], row: int, state: CellState) -> None:
+def test_voxels_that_are_enough_for_a_change(heights: list[float], row: int, state: CellState) -> None:
     assert after(town(([(row, 105)], heights), first_row=min(row, 85))).states[row, 105] == state
 
 
@@ -104,7 +104,7 @@ def test_twigs_fall_neither_with_a_wall_near_by_nor_together_at_the_edge_of_all_
     assert [int(edge[0, c]) for c in (105, 107)] == [UN, UN]
 
 
-def test_what_a_hit_of_a_wall_explains_is_nothing_new_in_the_cell_beside_it() -> None:
+def test_a_return_that_the_wall_explains_is_not_new_in_the_cell_beside_it() -> None:
     """Range noise puts every second hit behind the wall's face, into voxels that the map knows to be free."""
     beside = OLD_Y + 0.5 * CELL_SIZE + 0.8 * SURFACE_RULE.hit_reach_m
     voter = SurfaceVoter(VotingSettings(), town((WALL, HEIGHTS)))
@@ -112,7 +112,7 @@ def test_what_a_hit_of_a_wall_explains_is_nothing_new_in_the_cell_beside_it() ->
     assert struck == [False, True]
 
 
-def test_a_wall_that_went_shows_what_stands_behind_it_and_one_that_stands_does_not() -> None:
+def test_surfaces_behind_a_deleted_wall_are_new_and_behind_a_standing_one_not() -> None:
     """Behind a wall the map knows no free space; whether what is met there is new, only the wall can tell."""
     tile, free = town((WALL, HEIGHTS)).tiles[0, 0], np.full((TILE_CELLS, TILE_CELLS), ~np.uint64(0))
     free[ROW:] = 0
@@ -122,7 +122,7 @@ def test_a_wall_that_went_shows_what_stands_behind_it_and_one_that_stands_does_n
     assert not (rows[1] == CO).any()
 
 
-def test_free_space_is_told_of_columns_of_which_the_map_knows_none_and_never_of_mapped_voxels() -> None:
+def test_free_space_is_sent_for_columns_that_the_map_does_not_know_and_never_for_mapped_voxels() -> None:
     tile, known = town((WALL, HEIGHTS)).tiles[0, 0], np.zeros((TILE_CELLS, TILE_CELLS), np.uint64)
     known[:, :105] = 0b10
     free = after(make_map({(0, 0): replace(tile, free=known)}), standing_at(OLD_Y)).free
@@ -132,7 +132,7 @@ def test_free_space_is_told_of_columns_of_which_the_map_knows_none_and_never_of_
     assert free[ROW, 110], "beside and above the wall"
 
 
-def test_what_some_rays_crossed_goes_with_its_wall_and_what_few_scans_or_no_ray_crossed_does_not() -> None:
+def test_cells_that_rays_crossed_are_deleted_with_their_wall_and_others_stay() -> None:
     def half_unseen(but: int) -> Callable[[int, U64], None]:
         """Half of the wall is out of sight in all scans but the first ones."""
         return lambda scan, words: words[:, 106:].fill(0) if scan >= but else None
@@ -181,13 +181,13 @@ def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_be
     assert not any(votes.gone[cell] >> np.uint64(7) for cell in WALL)
 
 
-def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_none_passed_has_no_vote() -> None:
+def test_an_unmapped_cell_that_rays_passed_is_empty_and_one_that_none_passed_has_no_vote() -> None:
     states = after(town((WALL, HEIGHTS)), standing_at(OLD_Y), passed=lambda _, words: words[:, :105].fill(0)).states
     assert (states[ROW + 5, 110], states[ROW + 5, 100]) == (CellState.UNCHANGED_EMPTY, NO_VOTE)
     assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
-def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> None:
+def test_a_car_that_drove_by_far_off_is_not_new_and_one_that_parked_is() -> None:
     """30 m away beams lie wider apart than voxels: nothing of the place is ever crossed from side to side."""
     point_map, found = town((WALL, HEIGHTS)), []
     for scans_there in (2, 12):
@@ -218,7 +218,7 @@ def looked_at(states: U8, amount: I32 | None = None) -> np.ndarray:
     return looks(windowed(states), windowed(full, fill=0), LOW, TILE)
 
 
-def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None:
+def test_features_of_a_cell_follow_from_its_object_and_its_fullest_neighbour() -> None:
     states = states_plane({(5, 5): CE, (5, 6): CE, (6, 7): CE, (5, 7): CO, (40, 40): CE}, fill=1)
     amount = np.ones((256, 256), dtype=np.int32)
     amount[5, 6] = 9
@@ -230,7 +230,7 @@ def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None
     assert found[:, 3] == pytest.approx([1.0, 1.0, 0.0, 1.0, 1.0]), "the map rises in what is gone"
 
 
-def test_a_thing_goes_on_where_tiles_meet_and_is_as_large_as_any_at_last() -> None:
+def test_an_object_continues_across_tiles_and_its_size_is_bounded() -> None:
     left, right = (states_plane({(r, c): CE for r in range(20)}) for c in (255, 0))
     full = np.ones(LOW.shape, dtype=np.int32)
     found = looks(windowed(left, right), full, LOW, TILE)
@@ -257,7 +257,9 @@ def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides
 
 @settings(max_examples=30, deadline=None)
 @given(arrays(np.float64, (2, N_FEATURES), elements=st.floats(0, 5)), st.floats(0, 0.15), st.sampled_from([CO, CE]))
-def test_a_deeper_surface_and_a_larger_thing_make_it_surer(looked: np.ndarray, deep: float, state: CellState) -> None:
+def test_a_deeper_surface_and_a_larger_object_raise_the_log_odds(
+    looked: np.ndarray, deep: float, state: CellState
+) -> None:
     states = np.array([state], dtype=np.uint8)
     low, high = looked.min(axis=0)[None], looked.max(axis=0)[None]
     shallow = log_odds(states, low, np.array([0.0]))[0]

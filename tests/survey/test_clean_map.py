@@ -19,11 +19,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, I64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
 from mapvote.survey.clean_map import (
-    HIT_SHARE,
-    LARGEST_SPECK,
-    NEAR_M,
-    SEEN_THROUGH,
-    TALL_M,
+    CLEANING,
     Mapper,
     _leave_out,
     _unbroken,
@@ -50,21 +46,21 @@ def test_a_point_that_one_scan_of_sixty_met_is_no_surface_and_where_few_scans_we
     points, scans = np.array([[0.1, 0.1, 2.0], [3.1, 0.1, 2.0], [6.1, 0.1, 2.0]]), np.array([1, 2, 40], np.int32)
     assert strays(points, scans, road(60), LATTICE).tolist() == [True, False, False]
     waiting = np.concatenate([road(40), np.repeat([[5.0, -10.0, 0.0]], 600, axis=0)])  # at a light
-    for driven in (road(14), road(60) - np.array([0.0, NEAR_M, 0.0]), np.zeros((0, 3))):
+    for driven in (road(14), road(60) - np.array([0.0, CLEANING.near_m, 0.0]), np.zeros((0, 3))):
         assert not strays(points, scans, driven, LATTICE).any()
     assert not strays(points, scans + 2, waiting, LATTICE).any()
 
 
-def test_wherever_it_lies_a_point_is_asked_of_all_places_within_twenty_metres() -> None:
+def test_a_point_is_tested_against_all_places_within_twenty_metres() -> None:
     """One after the other, as the words have it."""
     rng = np.random.default_rng(2)
     driven = np.concatenate([road(60), road(60) * 1.3 + [40.0, 5.0, 0.0], [[200.0, 0.0, 0.0]]])
     points, scans = rng.uniform(-45.0, 90.0, (3000, 3)), rng.integers(1, 6, 3000).astype(np.int32)
     places = driven[thin(driven, 1.0)]
-    passed = (np.hypot(*(points[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1)) < NEAR_M).sum(axis=1)
-    assert 0 < (scans < HIT_SHARE * passed).sum() < 3000
+    passed = (np.hypot(*(points[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1)) < CLEANING.near_m).sum(axis=1)
+    assert 0 < (scans < CLEANING.hit_share * passed).sum() < 3000
     apart = voxel_downsample(points, 3.0)
-    expected = (scans < HIT_SHARE * passed)[apart]
+    expected = (scans < CLEANING.hit_share * passed)[apart]
     np.testing.assert_array_equal(strays(points[apart], scans[apart], driven, LATTICE), expected)
 
 
@@ -87,7 +83,7 @@ def test_a_wall_two_centimetres_from_a_face_is_one_wall(axis: int, side: float) 
 
 
 @pytest.mark.parametrize("lattice", [Lattice(), Lattice(100.1, -57.2)])
-def test_where_a_voxel_begins_is_the_lattices_business(lattice: Lattice) -> None:
+def test_voxels_begin_where_the_lattice_says(lattice: Lattice) -> None:
     face = np.array([lattice.x0 + 30 * 0.3, lattice.y0 + 7.1 * 0.3, 2.1])
     points = face + np.array([[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0], [0.62, 0.0, 0.0]])
     spilled = strays(points, np.array([3, 30, 3], np.int32), np.zeros((0, 3)), lattice)
@@ -120,7 +116,7 @@ def test_specks_are_the_small_groups_of_touching_voxels_that_were_hit_once_each(
             group |= ring
             ring = {j for j in left if any(np.abs(np.subtract(voxels[i], voxels[j])).max() <= 1 for i in ring)}
             left -= ring
-        expected[list(group)] = len(group) <= LARGEST_SPECK and all(times[i] == 1 for i in group)
+        expected[list(group)] = len(group) <= CLEANING.largest_speck and all(times[i] == 1 for i in group)
     points = 0.3 * (np.array(voxels, dtype=np.float64).reshape(-1, 3) + 0.5)
     np.testing.assert_array_equal(specks(points, np.array(times, np.int32), LATTICE), expected)
     twice = np.concatenate([points, points[:1] + 0.01])  # a second point in the first voxel
@@ -128,17 +124,19 @@ def test_specks_are_the_small_groups_of_touching_voxels_that_were_hit_once_each(
     assert not alone[:1].any()
 
 
-@pytest.mark.parametrize("n", [LARGEST_SPECK, LARGEST_SPECK + 1])
-def test_five_voxels_in_a_row_are_a_speck_and_six_are_a_thing(n: int) -> None:
-    assert (specks(row_of(n), np.ones(n, np.int32), LATTICE) == (n <= LARGEST_SPECK)).all()
+@pytest.mark.parametrize("n", [CLEANING.largest_speck, CLEANING.largest_speck + 1])
+def test_five_voxels_in_a_row_are_a_speck_and_six_are_an_object(n: int) -> None:
+    assert (specks(row_of(n), np.ones(n, np.int32), LATTICE) == (n <= CLEANING.largest_speck)).all()
 
 
 def test_a_voxel_that_rays_crossed_often_and_few_scans_hit_was_a_trail() -> None:
-    hit_passed_crossed = np.array([[1, 9, SEEN_THROUGH], [0, 9, SEEN_THROUGH - 1], [9, 9, 9], [2, 40, 0]])
+    hit_passed_crossed = np.array(
+        [[1, 9, CLEANING.seen_through], [0, 9, CLEANING.seen_through - 1], [9, 9, 9], [2, 40, 0]]
+    )
     assert seen_through(hit_passed_crossed).tolist() == [True, False, False, False]
 
 
-def test_of_a_map_from_elsewhere_a_point_alone_in_the_air_is_dropped_and_a_wall_or_a_pole_stays() -> None:
+def test_a_lone_point_of_a_foreign_map_is_dropped_and_a_wall_or_a_pole_stays() -> None:
     ground = wall([(r, c) for r in range(10, 40) for c in range(10, 40)], [0.05])
     pole = wall([(20, 20)], [0.45 + 0.3 * k for k in range(8)])
     lone = np.array([[9.1, 9.1, 3.1]])
@@ -150,9 +148,9 @@ def test_of_a_map_from_elsewhere_a_point_alone_in_the_air_is_dropped_and_a_wall_
     assert (dropped, cleaned.n_points) == (1, len(tile.points) - 1)
 
 
-def test_what_rises_above_a_lorry_did_not_drive_and_nor_did_what_nobody_knows_the_height_of() -> None:
+def test_cells_taller_than_a_lorry_or_of_unknown_height_are_no_trail() -> None:
     points, passed = row_of(3), np.full(3, -5)
-    assert trails(points, passed, np.array([1.0, TALL_M, np.nan]), LATTICE).tolist() == [True, False, False]
+    assert trails(points, passed, np.array([1.0, CLEANING.tall_m, np.nan]), LATTICE).tolist() == [True, False, False]
     column = np.array([[0.1, 0.1, 1.0], [0.1, 0.1, 5.0]])
     assert not trails(column, np.full(2, -5), column[:, 2], LATTICE).any(), "one cell, and it rises to five metres"
 
@@ -244,7 +242,7 @@ def test_ground_is_broken_up_to_two_cells_beside_a_leap_and_beside_what_is_not_k
     assert _unbroken((0.8 * step[:, :18]).astype(np.float32)).all(), "a step of less than half a metre is none"
 
 
-def test_where_a_vehicle_drove_below_a_bridge_nothing_is_left_out() -> None:
+def test_points_below_a_bridge_that_vehicles_drove_under_stay() -> None:
     street, bridge = sheet((0, 30), (0, 30), 0.0), sheet((12, 18), (0, 30), 6.0)
     over, under = road_along(15.0, 6.0)[:, [1, 0, 2]], road_along(15.0)
     kerb = np.array([[15.0, 5.0, 0.1]])  # below the bridge, beside its path: there the map keeps the bridge
@@ -319,21 +317,21 @@ def test_in_and_beside_cells_where_something_moves_low_points_stay_out_but_for_t
     points, found = np.column_stack([np.ones((n, 2)), z]), np.zeros(n, np.bool_)
     obstacle, scratch = points[:, 2] >= 0.3, np.zeros(16, np.bool_)
     ground_z = np.zeros((4, 4), np.float32)
-    _leave_out(points, np.zeros(3), 1e4, np.arange(n) == 0, obstacle, flat, ground_z, scratch, found)
+    _leave_out(points, np.zeros(3), 1e4, CLEANING.road_m, np.arange(n) == 0, obstacle, flat, ground_z, scratch, found)
     assert found.tolist() == out
 
 
-def test_what_is_beyond_the_reach_in_the_plane_stays_out_wherever_the_sensor_is() -> None:
+def test_points_beyond_the_reach_in_the_plane_stay_out() -> None:
     origin = np.array([20.0, -70.0, 900.0])
     points = np.array([[3.0, 3.9, 50.0], [3.0, 4.1, 0.0], [-3.1, 4.0, 0.0], [-2.9, -4.0, -9.0]]) + origin
     outside, out = np.full(4, -1, np.int32), np.zeros(4, np.bool_)
     nothing, ground_z = np.zeros(4, np.bool_), np.zeros((1, 1), np.float32)
-    _leave_out(points, origin, 25.0, nothing, nothing, outside, ground_z, np.zeros(1, np.bool_), out)
+    _leave_out(points, origin, 25.0, CLEANING.road_m, nothing, nothing, outside, ground_z, np.zeros(1, np.bool_), out)
     assert out.tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize("ground_m", [0.0, 6.3, -9.3])
-def test_of_a_voxel_scans_that_hit_it_and_scans_that_passed_it_are_counted_apart(ground_m: float) -> None:
+def test_scans_that_hit_a_voxel_and_scans_that_passed_it_are_counted_apart(ground_m: float) -> None:
     road = wall([(r, c) for r in range(40) for c in range(40)], [0.05]) + np.array([0, 0, ground_m], np.float32)
     street = make_map({(0, 0): make_tile(road, ground_m + 0.05)})
     one, other = np.array([[3.15, 3.15, ground_m + 1.65]]), np.array([[9.15, 9.15, ground_m + 1.65]])
@@ -357,14 +355,14 @@ def test_returns_from_farther_than_the_reach_do_not_enter_the_map() -> None:
 
 
 @pytest.mark.parametrize("drop", [True, False])
-def test_what_one_scan_of_many_hit_stays_out_of_the_map_unless_strays_are_kept(drop: bool) -> None:
+def test_a_point_that_one_scan_of_many_hit_stays_out_unless_strays_are_kept(drop: bool) -> None:
     street = box((-20.0, 80.0, 0.5), (-8.0, 8.0, 0.5), (0.0,))
     stray = np.concatenate([street, [[30.1, 5.1, 2.0]]])
     points = mapped(lambda i: stray if i == 50 else street, np.arange(60.0), street, drop_strays=drop)
     assert (points[:, 2] > 1.0).any() != drop
 
 
-def test_what_drove_past_a_parked_car_leaves_no_trail_beside_it() -> None:
+def test_a_vehicle_that_drove_past_a_parked_car_leaves_no_trail_beside_it() -> None:
     """Hits on the car strike the voxels next to it too; all scans but the two that hit the other see through those."""
     ground, house = box((-20.0, 60.0, 0.5), (-8.0, 8.0, 0.5), (0.0,)), box((-20, 60, 0.3), (8.0,), (0.15, 6.0, 0.3))
     parked, passing = (box((20.0, 24.0, 0.1), (y,), (0.5, 1.5, 0.1)) for y in (5.0, 4.65))

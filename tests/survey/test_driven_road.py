@@ -43,13 +43,13 @@ def test_on_a_hill_the_road_climbs_with_the_path() -> None:
     np.testing.assert_allclose(found[:, 2], 0.1 * found[:, 0], atol=0.02)
 
 
-def test_where_no_scan_was_registered_there_is_no_witness() -> None:
+def test_stretches_without_registered_scans_give_no_road() -> None:
     registered = (np.arange(60) < 20) | (np.arange(60) >= 40)
     x = road_under(driven(), registered, track(3000, 0.0, 0.02))[:, 0]
     assert not ((x > 19.01) & (x < 39.99)).any()
 
 
-def test_a_path_without_measured_road_says_so_instead_of_guessing() -> None:
+def test_a_path_without_measured_road_gives_no_road() -> None:
     for length_m, z, shown in ((8.0, 0.0, False), (30.0, 0.0, True), (60.0, 50.0, False)):
         cloud = track(300, z, 0.02, length_m)
         assert bool(len(road_under(driven(), ALL, cloud))) == shown

@@ -24,6 +24,7 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, lattice_of, map_from_points
+from mapvote.core.record import record
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
@@ -36,29 +37,41 @@ from mapvote.survey.driven_road import road_under, wrong_attitude
 from mapvote.survey.pose_graph import DriveTrack, carried_along, fit_to_priors, settle_poses
 
 Progress = Callable[[int, int], None]
-MOST_OFF = 0.3
-"""Share of a path that may disagree with the ground by more than 0.3 m before the map is refused: below, it is a place
-(a bridge over another drive, a stretch without points); above, something is wrong with the drive."""
-
 _FIRST_DATE_NS = 946_684_800 * 10**9
-"""2000. Clocks that count from zero are below it."""
-_MIN_INLIER_SHARE = 0.4
-"""As the setting of ndt, while the map is still growing: half of a scan may observe unmapped places."""
-_POINTS_M = 0.3
-"""Scans enter the NDT map thinned to one point per such voxel: the paper's storage resolution."""
-_FINE = replace(LEVELS[-1], floor_m=0.03, points_m=0.5)
-"""Of a last look at each scan, narrower than any vehicle needs."""
-_JUMP_M = 0.5
-"""A scan this far from where the last ones were heading, beyond what a vehicle can brake or swerve, is not there."""
-_POLISH_M = 0.1
-"""The last look moves a scan no farther."""
-_PATIENCE = 5
-"""Scans in turn without a registration before the map counts as broken."""
+"""Start of the year 2000. Clocks that count from zero are below it."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Numbers of the first pass of a survey."""
+
+    most_off: float = 0.3
+    """Share of a path that may lie more than 0.3 m off the ground before the map is refused: a smaller share is a place
+    (a bridge over another drive, a stretch without points), a larger one a fault of the drive."""
+    min_inlier_share: float = 0.4
+    """Share of a scan's points that must agree, the setting of ndt while the map grows: half of a scan may observe
+    unmapped places."""
+    points_m: float = 0.3
+    """Side of the voxels to whose one point scans are thinned in the NDT map: the paper's storage resolution."""
+    fine_floor_m: float = 0.03
+    """Least standard deviation of the distributions of a last look at each scan, narrower than any vehicle needs."""
+    fine_points_m: float = 0.5
+    """Side of the voxels to whose one point a scan is thinned for the last look."""
+    polish_m: float = 0.1
+    """Greatest distance by which the last look moves a scan."""
+    jump_m: float = 0.5
+    """Distance from the predicted position, beyond braking and swerving, at which a registration is refused."""
+    patience: int = 5
+    """Scans in turn without a registration before the map counts as broken."""
+
+
+SURVEY = Survey()
 
 
 @dataclass(frozen=True, slots=True)
 class BuildReport:
-    """What came of building a map."""
+    """Facts of a finished build."""
 
     tracks: tuple[DriveTrack, ...]
     points: int
@@ -76,7 +89,11 @@ class BuildReport:
 
 
 def build_map(
-    drives: Sequence[Drive], settings: Settings | None = None, *, progress: Progress | None = None
+    drives: Sequence[Drive],
+    settings: Settings | None = None,
+    *,
+    progress: Progress | None = None,
+    numbers: Survey = SURVEY,
 ) -> tuple[PointMap, BuildReport]:
     """One map of all ``drives``, in the frame of their priors (without any, the first scan's lidar frame).
 
@@ -87,16 +104,19 @@ def build_map(
     scans = sum(len(drive) for drive in drives)
     if scans == 0:
         raise MapvoteError("nothing to map: no drive with at least one scan")
+    # A precise prior that its scans contradict is used as a coarser one.
     wrong = [wrong_attitude(drive) for drive in drives]
     drives = [
         drive if w is None else replace(drive, prior_sigma_deg=w.sigma_deg)
         for drive, w in zip(drives, wrong, strict=True)
     ]
-    surveyor = Surveyor(settings, _lattice_of(drives), all(drive.has_precise_prior for drive in drives))
+    # The first pass: the poses.
+    surveyor = Surveyor(settings, _lattice_of(drives), all(drive.has_precise_prior for drive in drives), numbers)
     _go_through(chain.from_iterable(map(surveyor.follow, drives)), progress, 0, 2 * scans)
     tracks, bent_m = settle_poses(surveyor.tracks)
     cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
-    del surveyor  # and with it the largest part of what the first pass took
+    del surveyor  # frees the largest part of the first pass's memory
+    # The second pass: the points.
     road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud) for track in tracks])
     mapper = Mapper(map_from_points(cloud, lattice=lattice, road=road), settings, road)
     _go_through(chain.from_iterable(map(mapper.enter, tracks)), progress, scans, 2 * scans)
@@ -107,8 +127,8 @@ def build_map(
         surveyed_ns=_last_stamp(drives),
     )
     tracks = [
-        replace(track, heights=_agreed_heights(track, point_map), wrong_attitude=found)
-        for track, found in zip(tracks, wrong, strict=True)
+        replace(track, heights=_agreed_heights(track, point_map, numbers.most_off), wrong_attitude=error)
+        for track, error in zip(tracks, wrong, strict=True)
     ]
     return point_map, BuildReport(tuple(tracks), point_map.n_points, bent_m, two_levels(road) if len(road) else None)
 
@@ -122,13 +142,13 @@ def _go_through(scans: Iterable[None], progress: Progress | None, done: int, tot
 
 def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
     """Where the drives' priors lie. MapvoteError if they lie in different frames: the map could only be in one."""
-    known = [drive.georeference for drive in drives if drive.georeference]
-    if any(other != known[0] for other in known):
+    frames = [drive.georeference for drive in drives if drive.georeference]
+    if any(other != frames[0] for other in frames):
         raise MapvoteError(
             "the drives' priors lie in different frames (each at its own first fix?): give all of them the same origin "
             "in drive.toml"
         )
-    return known[0] if known else {}
+    return frames[0] if frames else {}
 
 
 def _last_stamp(drives: Sequence[Drive]) -> int | None:
@@ -137,10 +157,10 @@ def _last_stamp(drives: Sequence[Drive]) -> int | None:
     return max(ends) if min(ends) > _FIRST_DATE_NS else None
 
 
-def _agreed_heights(track: DriveTrack, point_map: PointMap) -> Heights:
+def _agreed_heights(track: DriveTrack, point_map: PointMap, most_off: float = SURVEY.most_off) -> Heights:
     """Heights of the driven positions over the ground; MapvoteError if that cannot be the road under them."""
     heights = check_heights(point_map, track.driven)
-    if heights.off_share > MOST_OFF:
+    if heights.off_share > most_off:
         raise MapvoteError(
             f"{track.drive.path}: {heights.complaint}. Such a map would be wrong: do the drives' heights "
             "agree (one datum, no drift in z), and is z up? `mapvote doctor` checks it; else build the drives apart"
@@ -162,25 +182,31 @@ def _lattice_of(drives: Sequence[Drive]) -> Lattice:
 class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
-    def __init__(self, settings: Settings, lattice: Lattice, all_precise: bool = False) -> None:
+    def __init__(
+        self, settings: Settings, lattice: Lattice, all_precise: bool = False, numbers: Survey = SURVEY
+    ) -> None:
         """``lattice``: of the map. ``all_precise``: only drives with a surveyor's prior will come; they get no final
         check."""
         self._all_precise = all_precise
-        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
+        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": numbers.min_inlier_share})
+        self.numbers = numbers
+        self._fine = replace(LEVELS[-1], floor_m=numbers.fine_floor_m, points_m=numbers.fine_points_m)
         self.ndt_map = NdtMap(np.zeros(3))
         self.fine_map: NdtMap | None = None
         """The same points in narrower distributions, of one level."""
         self.draft = VoxelCloud(lattice)
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
         self.tracks: list[DriveTrack] = []
-        """Of the drives followed so far, in the frame of the draft."""
-        self._found: list[F64] = []
-        self._told: list[F64] = []
-        """Positions (3,) of registered scans and of their priors, which determine the frame of the priors."""
+        """Tracks of the drives followed so far, in the frame of the draft."""
+        self._registered: list[F64] = []
+        """(3,) each: positions of registered scans with a prior ..."""
+        self._priors: list[F64] = []
+        """... and of these priors: together they determine the frame of the priors."""
 
     def follow(self, drive: Drive) -> Iterator[None]:
         """Find the trajectory of one drive, a scan a step: each is entered once registered. At the end it is the last
         of ``tracks``. MapvoteError if fewer than half of the scans could be registered."""
+        # Each scan is localised in the map so far; a prior is used only where that fails.
         tracker = Tracker(self.ndt_map.around, self.ndt)
         tracker.twist = _first_motion(drive)
         precise = drive.has_precise_prior
@@ -192,7 +218,7 @@ class Surveyor:
                 prior = self._in_draft(prior)
                 fix = self._locate(tracker, scan, prior)
             # A surveyor enters where no drive has been yet: a precise prior is as good as a registration.
-            if not fix.trusted and prior is not None and (precise or lost >= _PATIENCE):
+            if not fix.trusted and prior is not None and (precise or lost >= self.numbers.patience):
                 fix = tracker.begin(scan, prior.T_map_lidar)
                 broken += [] if precise else [i]
             lost = 0 if fix.trusted else lost + 1
@@ -201,6 +227,7 @@ class Surveyor:
             if fix.trusted:
                 self._enter(fix, drive, i)
             yield
+        # A drive that hardly fits the map is refused.
         if np.mean(registered) < 0.5:
             raise MapvoteError(
                 f"{drive.path}: only {int(np.sum(registered))} of {len(drive)} scans could be registered to the map "
@@ -210,7 +237,7 @@ class Surveyor:
         self.tracks.append(DriveTrack(drive, np.array(poses), np.array(registered), tuple(broken), unknown))
 
     def _locate(self, tracker: Tracker, scan: Scan, prior: PosePrior | None) -> Fix:
-        """The scan in the map so far; untrusted if it would jump."""
+        """The scan in the map so far; untrusted if its position would jump."""
         if not len(self.draft):
             return tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
         before = tracker.last_pose, tracker.last_stamp_ns, tracker.twist
@@ -221,7 +248,7 @@ class Surveyor:
         age = 1e-9 * (scan.stamp_ns - before[1])
         ahead = before[0] @ exp(age * before[2])
         off = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - ahead[:3, 3]))
-        if off <= _JUMP_M + 0.5 * ACCELERATION_MPS2 * age**2:
+        if off <= self.numbers.jump_m + 0.5 * ACCELERATION_MPS2 * age**2:
             return self._polished(tracker, fix, before[0], age) if prior is None else fix
         tracker.move_to(before[0], before[1], before[2], fix.registration.score)
         return replace(fix, trusted=False)
@@ -235,47 +262,49 @@ class Surveyor:
         T_map_lidar = fix.registration.T_map_lidar
         if self.fine_map is None:
             return fix
-        points = in_rows(fix.points[thin(fix.points, _FINE.points_m)])
-        found = self.fine_map.around(T_map_lidar[:3, 3]).refine([points], T_map_lidar)
-        if not found.converged or np.linalg.norm(found.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]) > _POLISH_M:
+        points = in_rows(fix.points[thin(fix.points, self._fine.points_m)])
+        polished = self.fine_map.around(T_map_lidar[:3, 3]).refine([points], T_map_lidar)
+        moved_m = np.linalg.norm(polished.T_map_lidar[:3, 3] - T_map_lidar[:3, 3])
+        if not polished.converged or moved_m > self.numbers.polish_m:
             return fix
-        tracker.correct(found.T_map_lidar, twist_between(last_pose, found.T_map_lidar, age))
-        return replace(fix, registration=replace(fix.registration, T_map_lidar=found.T_map_lidar))
+        tracker.correct(polished.T_map_lidar, twist_between(last_pose, polished.T_map_lidar, age))
+        return replace(fix, registration=replace(fix.registration, T_map_lidar=polished.T_map_lidar))
 
     def _in_draft(self, prior: PosePrior) -> PosePrior:
-        """A prior moved to the frame of what was driven so far, as uncertain as the priors proved there."""
-        if not self._told:
+        """A prior moved to the frame of the poses so far, as uncertain as the priors proved there."""
+        if not self._priors:
             return prior
-        found, told = np.array(self._found), np.array(self._told)
-        T_prior_draft = fit_to_priors(found, told, prior.sigma_m)
-        off = np.linalg.norm(found @ T_prior_draft[:3, :3].T + T_prior_draft[:3, 3] - told, axis=1)
+        positions = np.array(self._registered)
+        priors = np.array(self._priors)
+        T_prior_draft = fit_to_priors(positions, priors, prior.sigma_m)
+        off = np.linalg.norm(positions @ T_prior_draft[:3, :3].T + T_prior_draft[:3, 3] - priors, axis=1)
         T_map_lidar = inverse(T_prior_draft) @ prior.T_map_lidar
         return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.median(off))))
 
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
         points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
-        spread = points_map.take(thin(points_map - position, _POINTS_M), axis=0)
+        spread = points_map.take(thin(points_map - position, self.numbers.points_m), axis=0)
         self.ndt_map.around(position).enter(spread)
         if not self._all_precise:
             if self.fine_map is None:
-                self.fine_map = NdtMap(position, (_FINE,))
+                self.fine_map = NdtMap(position, (self._fine,))
             self.fine_map.enter(spread)
         self.draft.enter(points_map)
         if drive.T_map_lidar_prior is not None:
-            self._found.append(position.copy())
-            self._told.append(drive.T_map_lidar_prior[i, :3, 3])
+            self._registered.append(position.copy())
+            self._priors.append(drive.T_map_lidar_prior[i, :3, 3])
 
 
 def _first_motion(drive: Drive) -> F64:
     """(6,) motion per second at the start by the priors: to the next scan, or the middle one of several over a second
     if they are coarse, of which one may be wild."""
-    told = drive.T_map_lidar_prior
-    if told is None or len(drive) < 2:
+    priors = drive.T_map_lidar_prior
+    if priors is None or len(drive) < 2:
         return np.zeros(6)
     seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
     k = 1 if drive.has_precise_prior else max(1, int(np.searchsorted(seconds, 1.0)))
     k = min(k, len(drive) - 1)
     tries = 1 if drive.has_precise_prior else min(k, len(drive) - k)
-    motions = [twist_between(told[i], told[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
+    motions = [twist_between(priors[i], priors[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
     return np.asarray(np.median(motions, axis=0))

@@ -1,13 +1,13 @@
 """The second pass: scans at known poses become a map of points without moving objects, ground and known-free columns.
 
-A draft of the map gives the ground and the occupied voxels. Each scan is then counted as a vehicle counts it: in how
-many scans was a voxel hit, in how many did rays pass it (rules/evidence.py). At the end points that are no standing
-surface are dropped, one function a rule. Their voxels are unknown, not free.
+A draft of the map gives the ground and the occupied voxels. Each scan is then counted as a vehicle counts it: the scans
+that hit a voxel, and the scans whose rays passed it (rules/evidence.py). At the end points on no standing surface are
+dropped, one function a rule. Their voxels are unknown, not free. :class:`Cleaning` holds the numbers.
 
-| rule | a point is dropped if | what it was |
+| rule | a point is dropped if | cause |
 |---|---|---|
-| ``seen_through`` | rays crossed its voxel in SEEN_THROUGH scans or more, and most scans did not hit it | a trail |
-| ``trails`` | its low group of cells was passed more often than hit | a trail of what drove far off |
+| ``seen_through`` | rays crossed its voxel in six scans or more, and most scans did not hit it | a trail |
+| ``trails`` | its low group of cells was passed more often than hit | a trail of a vehicle far off |
 | ``strays`` | few of the places near by hit it, or it lies just over the face of another surface's voxel | noise |
 | ``specks`` | it is one of a few voxels that touch no other surface, each hit by one scan | noise |
 | ``mirrored`` | it lies below unbroken ground | a reflection |
@@ -16,12 +16,12 @@ Only points that passed the filter of moving objects enter the map, at whatever 
 surveyor is too far off for the counting. Returns from beyond the filter's reach are left out.
 
 Reflections. A wet road, a window or the side of a car deflects a ray, and the range puts its return below the ground.
-A point below ground that is known and level on all sides is such a return. Beside a leap of the ground it may be a wall
-that goes down to a yard, and near a place where vehicles drove above each other what lies below is real: both stay.
+A point below ground that is known and level on all sides is such a return. Two kinds of points below ground stay:
+beside a step of the ground, where a wall may go down to a yard, and near places where vehicles drove above each other.
 
 Strays. A beam that grazes an edge returns a place between two surfaces; a pane shows a room that is not there. No ray
-speaks against such points, because other scans saw the wall in front of them. A surface is hit by more than HIT_SHARE
-of the scans that pass within NEAR_M of it; strays are not. A wall two centimetres from a voxel's face has points in two
+speaks against such points, because other scans saw the wall in front of them. A surface is hit by more than 3 %
+of the scans that pass within 20 m of it; strays are not. A wall two centimetres from a voxel's face has points in two
 voxels: the fewer points just over the face belong to the same wall.
 
 Specks. Mixed pixels and mirrored rooms leave points that touch nothing, each hit once. A vehicle that comes by denies
@@ -35,7 +35,7 @@ drove was hit once or twice in each place, and rays passed there before and afte
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -48,6 +48,7 @@ from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import SCANS, PointMap, cut_tiles, map_from_points
+from mapvote.core.record import record
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensor_height import crossings
 from mapvote.core.tile import Tile
@@ -60,16 +61,53 @@ from mapvote.rules.evidence import HIT, PASSES, WORDS, count_scan, free_words, l
 from mapvote.rules.packed_tiles import PackedTiles, count_of
 from mapvote.survey.pose_graph import DriveTrack
 
-ROAD_M = 0.1
-"""Points this low above the ground are the road itself, also under a car."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Cleaning:
+    """Numbers of the rules that drop points."""
+
+    road_m: float = 0.1
+    """Height above the ground up to which points are the road itself, also under a car."""
+    below_m: float = 0.5
+    """Depth below the ground from which a point is no part of it, however rough."""
+    level_cells: int = 2
+    """Cells to each side of a reflection in which the ground must be known and level."""
+    bridge_m: float = 80.0
+    """Distance from a crossing of two roads on two levels within which points below ground stay: scans enter the map
+    from as far."""
+    near_m: float = 20.0
+    """Distance in the plane within which a scan should hit a standing surface."""
+    hit_share: float = 0.03
+    """Share of these places from which a surface must be hit: two scans of seventy, at 10 Hz and 40 km/h twice past."""
+    spill_m: float = 0.06
+    """Points of two voxels so near on both sides of their common face are one surface: three sigmas of range noise."""
+    place_m: float = 1.0
+    """Distance between two places that count."""
+    most_hits: int = 16
+    """Voxels hit by more scans are not tested: 500 places within 20 m are a survey of a dozen passes."""
+    seen_through: int = 6
+    """Scans that must have crossed a voxel before it can be a trail."""
+    trail_share: float = 0.3
+    """Share of the scans that crossed or hit a voxel below which, if hit, it is a trail."""
+    largest_speck: int = 5
+    """Voxels that touch each other and no other surface."""
+    tall_m: float = 4.0
+    """Height of a group of cells that is no vehicle: no lorry is taller (Directive 96/53/EC)."""
+
+
+CLEANING = Cleaning()
 
 
 class Mapper:
     """Collects the scans of all drives, then gives the map."""
 
-    def __init__(self, draft: PointMap, settings: Settings, road: F64 | None = None) -> None:
+    def __init__(
+        self, draft: PointMap, settings: Settings, road: F64 | None = None, numbers: Cleaning = CLEANING
+    ) -> None:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
         self.draft, self.road, self.settings = draft, road, settings
+        self.numbers = numbers
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = PackedTiles(draft.lattice, WORDS)
         self._driven = [np.zeros((0, 3))]
@@ -99,44 +137,46 @@ class Mapper:
             scan, moving = observation.scan, observation.moving
             ground_z, left_out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
             reach2, beside = self.settings.mapping.reach_m**2, np.zeros(ground_z.size, np.bool_)
-            where = scan.points_map, scan.origin_map, reach2
-            _leave_out(*where, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
+            places = scan.points_map, scan.origin_map, reach2, self.numbers.road_m
+            _leave_out(*places, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
             self.cloud.enter(scan.points_map, left_out)
             count_scan(self.evidence, observation)
 
     def finish(self) -> PointMap:
         """The map of all points added so far."""
+        numbers = self.numbers
         points, scans = self.cloud.points()
         counts = self._counts(points)
-        kept = ~(_standing(points, self.draft) & seen_through(counts))
+        kept = ~(_standing(points, self.draft) & seen_through(counts, numbers))
         points, scans, counts = points[kept], scans[kept], counts[kept]
-        # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
+        # The ground anew without trails, which lift the draft's: undersides of cars had passed for ground.
         laid, lattice = map_from_points(points, lattice=self.draft.lattice, road=self.road), self.draft.lattice
         obstacle = _standing(points, laid)
-        dropped = (obstacle & seen_through(counts)) | mirrored(points, laid, self.road)
+        dropped = (obstacle & seen_through(counts, numbers)) | mirrored(points, laid, self.road, numbers)
         if self.settings.mapping.drop_strays:
-            dropped |= obstacle & strays(points, scans, np.concatenate(self._driven), lattice)
+            dropped |= obstacle & strays(points, scans, np.concatenate(self._driven), lattice, numbers)
             left = np.flatnonzero(obstacle & ~dropped)
             height = points[left, 2] - laid.ground_under(points[left])
-            dropped[left] |= trails(points[left], counts[left, 0] - counts[left, 1], height, lattice)
+            dropped[left] |= trails(points[left], counts[left, 0] - counts[left, 1], height, lattice, numbers)
             left = np.flatnonzero(obstacle & ~dropped)
-            dropped[left] |= specks(points[left], scans[left], lattice)
+            dropped[left] |= specks(points[left], scans[left], lattice, numbers.largest_speck)
+        # The map of the points that are left, with its known-free columns.
         fields = {SCANS: np.minimum(scans[~dropped], 255).astype(np.uint8)}
         point_map = map_from_points(points[~dropped], lattice=lattice, road=self.road, fields=fields)
         tiles = {tile: replace(content, free=self._free(content)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 
     def _counts(self, points: F64) -> I64:
-        """(n, 3) in how many scans the voxels of points (n, 3) were hit, passed and crossed; 0 outside columns."""
+        """(n, 3) scans that hit, passed and crossed the voxels of points (n, 3); 0 outside columns."""
         out = np.zeros((len(points), 3), dtype=np.int64)
-        for index, mine in cut_tiles(points, self.draft.lattice):
+        for index, within in cut_tiles(points, self.draft.lattice):
             if index in self.evidence:
                 tile = self.draft.tile(index)
-                rows, cols, _ = tile.window.indices_of(points[mine])
-                bits = np.floor(points[mine, 2] / CELL_SIZE).astype(np.int64) - tile.base[rows, cols]
-                counts = np.zeros((len(mine), 3), dtype=np.int64)
+                rows, cols, _ = tile.window.indices_of(points[within])
+                bits = np.floor(points[within, 2] / CELL_SIZE).astype(np.int64) - tile.base[rows, cols]
+                counts = np.zeros((len(within), 3), dtype=np.int64)
                 _counts_of(self.evidence[index], rows, cols, bits, counts)
-                out[mine] = counts
+                out[within] = counts
         return out
 
     def _free(self, after: Tile) -> U64:
@@ -145,7 +185,7 @@ class Mapper:
             return np.zeros(after.window.shape, dtype=np.uint64)
         before = self.draft.tile(after.index).base
         free = free_words(self.evidence[after.index])
-        after = replace(after)  # what it works out for this alone goes with it
+        after = replace(after)  # a copy: the columns that it computes for this alone are freed with it
         out = rebased(free, before - after.base) & ~after.obstacle_words
         out[np.isnan(after.ground_z)] = 0
         return out
@@ -161,11 +201,12 @@ def _standing(points: F64, ground: PointMap) -> Bool:
 
 @kernel
 def _leave_out(
-    points: F64, origin: F64, reach2: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32, beside: Bool,
-    out: Bool,
+    points: F64, origin: F64, reach2: float, road_m: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32,
+    beside: Bool, out: Bool,
 ) -> None:  # fmt: skip
-    """Into ``out`` (n,) which of the points (n, 3) do not enter the map: what moves, what is beyond the reach, and what
-    is too low to be an obstacle, in or next to cells where something moves: wheels and bumpers, not road.
+    """Enter into ``out`` (n,) which of the points (n, 3) do not enter the map: moving points, points beyond the reach,
+    and points higher than ``road_m`` that are too low to be obstacles, in or next to cells with moving points: wheels
+    and bumpers, not road.
 
     ``cell`` (n,) row * cols + col of ``ground_z`` (rows, cols), -1 outside it; ``beside`` (rows * cols,): scratch, all
     False.
@@ -182,12 +223,12 @@ def _leave_out(
         out[i] = moving[i] | (x * x + y * y > reach2)
         if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
             r, c = divmod(cell[i], cols)
-            out[i] |= points[i, 2] - ground_z[r, c] > ROAD_M
+            out[i] |= points[i, 2] - ground_z[r, c] > road_m
 
 
 @kernel
 def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64, out: I64) -> None:
-    """Into ``out`` (n, 3) in how many scans the voxels (row, col, bit) of a tile were hit, passed and crossed; outside
+    """Enter into ``out`` (n, 3) the scans that hit, passed and crossed the voxels (row, col, bit) of a tile; outside
     columns ``out`` stays as it is."""
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
@@ -196,77 +237,59 @@ def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64, out: I64) -> None:
             out[i, 2] = least_passed(cell, bits[i])
 
 
-BELOW_M = 0.5
-"""A point so far under the ground is no part of it, however rough."""
-_BESIDE_CELLS = 2
-_BRIDGE_M = 80.0
-"""Of a place where two roads cross; as far as scans enter the map from."""
-
-
-def mirrored(points: F64, point_map: PointMap, road: F64 | None) -> Bool:
+def mirrored(points: F64, point_map: PointMap, road: F64 | None, numbers: Cleaning = CLEANING) -> Bool:
     """(n,) which of the points (n, 3), map metres, are reflections below the ground of ``point_map``.
 
     ``road`` (m, 3): the road under all drives.
     """
-    out = points[:, 2] - point_map.ground_under(points) < -BELOW_M
-    asked = np.flatnonzero(out)
-    for tile, mine, cell in point_map.by_tile(points[asked]):
-        out[asked[mine]] = _unbroken(tile.ground_z)[cell]
+    out = points[:, 2] - point_map.ground_under(points) < -numbers.below_m
+    below = np.flatnonzero(out)
+    for tile, within, cell in point_map.by_tile(points[below]):
+        out[below[within]] = _unbroken(tile.ground_z, numbers)[cell]
     if road is not None and len(road):
         above_each_other = road[np.unique(crossings(road))]
         if len(above_each_other):
             below = np.flatnonzero(out)
             tree = cKDTree(above_each_other[:, :2])
-            out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=_BRIDGE_M)[0])
+            out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=numbers.bridge_m)[0])
     return out
 
 
-def _unbroken(ground_z: F32) -> Bool:
-    """(rows, cols) cells around which the ground is known and nowhere leaps."""
-    side, known = 2 * _BESIDE_CELLS + 1, np.isfinite(ground_z)
+def _unbroken(ground_z: F32, numbers: Cleaning = CLEANING) -> Bool:
+    """(rows, cols) cells around which the ground is known and has no step."""
+    side, known = 2 * numbers.level_cells + 1, np.isfinite(ground_z)
     highest = ndimage.maximum_filter(np.where(known, ground_z, np.inf), side, mode="nearest")
     lowest = ndimage.minimum_filter(np.where(known, ground_z, -np.inf), side, mode="nearest")
     with np.errstate(invalid="ignore"):
-        return np.asarray(highest - lowest <= BELOW_M)
+        return np.asarray(highest - lowest <= numbers.below_m)
 
 
-NEAR_M = 20.0
-"""A scan nearer than this, in the plane, should hit a standing surface."""
-HIT_SHARE = 0.03
-"""Of these places, the share from which it must be hit: two scans of seventy, at 10 Hz and 40 km/h twice past."""
-SPILL_M = 0.06
-"""Points of two voxels so near on both sides of their common face are one surface: three sigmas of range noise."""
-_PLACE_M = 1.0
-_MOST_ASKED = 16
-"""Voxels hit by more scans than this are not tested: 500 places within 20 m are a survey of a dozen passes."""
-
-
-def strays(points: F64, scans: I32, driven: F64, lattice: Lattice) -> Bool:
+def strays(points: F64, scans: I32, driven: F64, lattice: Lattice, numbers: Cleaning = CLEANING) -> Bool:
     """(n,) which of a map's points (n, 3), one a voxel, in map metres, are no surface of their own.
 
-    ``scans`` (n,): how many scans hit each; ``driven`` (m, 3): where all scans were taken. Places count, a metre apart,
-    for who waits at a light sees the same again.
+    ``scans`` (n,): how many scans hit each; ``driven`` (m, 3): where all scans were taken. Places a metre apart count,
+    not scans: a vehicle that waits at a light sees the same again.
     """
-    places = driven[thin(driven, _PLACE_M)]
-    return _hardly_hit(points, scans, places) | _spilled(points, scans, lattice)
+    places = driven[thin(driven, numbers.place_m)]
+    return _hardly_hit(points, scans, places, numbers) | _spilled(points, scans, lattice, numbers)
 
 
-def _hardly_hit(points: F64, scans: I32, places: F64) -> Bool:
+def _hardly_hit(points: F64, scans: I32, places: F64, numbers: Cleaning) -> Bool:
     out = np.zeros(len(points), dtype=np.bool_)
     if not len(places):
         return out
     tree = cKDTree(places[:, :2])
     # Places near one point are near each other: voxels hit oftener than the largest number required are skipped.
-    most = tree.query_ball_point(places[:, :2], 2.001 * NEAR_M, return_length=True).max()
-    asked = np.flatnonzero(scans < min(_MOST_ASKED, HIT_SHARE * most))
-    if len(asked):
-        passed = tree.query_ball_point(points[asked, :2], NEAR_M, return_length=True)
-        out[asked] = scans[asked] < HIT_SHARE * passed
+    most = tree.query_ball_point(places[:, :2], 2.001 * numbers.near_m, return_length=True).max()
+    tested = np.flatnonzero(scans < min(numbers.most_hits, numbers.hit_share * most))
+    if len(tested):
+        passed = tree.query_ball_point(points[tested, :2], numbers.near_m, return_length=True)
+        out[tested] = scans[tested] < numbers.hit_share * passed
     return out
 
 
-def _spilled(points: F64, scans: I32, lattice: Lattice) -> Bool:
-    """Points over the side of a voxel beside which more scans hit a surface, less than SPILL_M off."""
+def _spilled(points: F64, scans: I32, lattice: Lattice, numbers: Cleaning) -> Bool:
+    """(n,) which points lie just over the side of a voxel whose surface more scans hit, nearer than ``spill_m``."""
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     order = np.argsort(keys)
     out = np.zeros(len(points), dtype=np.bool_)
@@ -277,37 +300,27 @@ def _spilled(points: F64, scans: I32, lattice: Lattice) -> Bool:
         for sign in (-1, 1):
             wanted = keys + sign * BESIDE[axis]
             beside = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
-            mine = CELL_SIZE - within if sign > 0 else within
-            theirs = within[beside] if sign > 0 else CELL_SIZE - within[beside]
-            same = (keys[beside] == wanted) & (mine + theirs < SPILL_M)
-            out |= same & (mine < theirs) & (scans < scans[beside])
+            own_m = CELL_SIZE - within if sign > 0 else within
+            other_m = within[beside] if sign > 0 else CELL_SIZE - within[beside]
+            same = (keys[beside] == wanted) & (own_m + other_m < numbers.spill_m)
+            out |= same & (own_m < other_m) & (scans < scans[beside])
     return out
 
 
-SEEN_THROUGH = 6
-"""Scans that must have crossed a voxel before it can be a trail."""
-_TRAIL_SHARE = 0.3
-"""Of the scans that crossed or hit a voxel, the share that must have hit it."""
-
-
-def seen_through(counts: I64) -> Bool:
-    """(n,) which voxels scans saw through, by ``counts`` (n, 3): in how many scans hit, passed, crossed.
+def seen_through(counts: I64, numbers: Cleaning = CLEANING) -> Bool:
+    """(n,) which voxels scans saw through, by ``counts`` (n, 3): scans that hit, passed and crossed each.
 
     A voxel of a standing surface can be crossed, too. So the bound is far below that of a vehicle that calls it gone.
     """
     hit, crossed = counts[:, 0], counts[:, 2]
-    return np.asarray((crossed >= SEEN_THROUGH) & (hit < _TRAIL_SHARE * (hit + crossed)))
+    return np.asarray((crossed >= numbers.seen_through) & (hit < numbers.trail_share * (hit + crossed)))
 
 
-LARGEST_SPECK = 5
-"""Voxels that touch each other and no other surface."""
-
-
-def specks(points: F64, times: I32, lattice: Lattice, largest: int = LARGEST_SPECK) -> Bool:
+def specks(points: F64, times: I32, lattice: Lattice, largest: int = CLEANING.largest_speck) -> Bool:
     """(n,) which of a map's obstacle points (n, 3), map metres, lie on nothing: in a group of at most ``largest``
     voxels that touch each other (26), touch no other voxel, and were hit once each.
 
-    ``times`` (n,): how many scans hit the voxel of each point; of a map from elsewhere, how many points it holds.
+    ``times`` (n,): how many scans hit the voxel of each point; in a map from elsewhere, how many points it holds.
     """
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     table = np.zeros(1 << max(2 * len(keys), 2).bit_length(), dtype=np.int64)
@@ -318,7 +331,7 @@ def specks(points: F64, times: I32, lattice: Lattice, largest: int = LARGEST_SPE
 
 def lone_points(tile: Tile) -> Bool:
     """(n,) which points of a tile of somebody's map are specks: an obstacle that is alone in its voxel, and whose voxel
-    touches no other. Points within a voxel of the tile's edge are none: what they touch may lie beyond."""
+    touches no other. Points within a voxel of the tile's edge are none: they may touch points of the next tile."""
     within = tile.points[:, :2].astype(np.float64)
     far = (within >= CELL_SIZE).all(axis=1) & (within < (TILE_CELLS - 1) * CELL_SIZE).all(axis=1)
     once = np.ones(len(within), dtype=np.int32)
@@ -354,10 +367,10 @@ def _specks(keys: I64, once: Bool, table: I64, often: Bool, group: I64, out: Boo
                 dx, dy, dz = around // 9 - 1, around // 3 % 3 - 1, around % 3 - 1
                 beside = group[k] + dx * BESIDE[0] + dy * BESIDE[1] + dz * BESIDE[2]
                 slot = slot_of(beside, table)
-                known = table[slot] == 0
+                empty_or_entered = table[slot] == 0
                 for j in range(n):
-                    known |= group[j] == beside
-                if known:
+                    empty_or_entered |= group[j] == beside
+                if empty_or_entered:
                     continue
                 if often[slot] or n == largest:
                     alone = False
@@ -368,16 +381,12 @@ def _specks(keys: I64, once: Bool, table: I64, often: Bool, group: I64, out: Boo
         out[i] = alone
 
 
-TALL_M = 4.0
-"""No lorry is taller (Directive 96/53/EC)."""
-
-
-def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
+def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice, numbers: Cleaning = CLEANING) -> Bool:
     """(n,) which of the points (n, 3), one a voxel, above the ground, are trails.
 
     ``balance`` (n,): the scans that hit each point's voxel, less the scans whose rays passed it without a return;
-    ``height_m`` (n,) over the ground, NaN if unknown. What belongs to an 8-connected group of cells that
-    was passed more often than hit is a trail, but for cells that rise to TALL_M: those did not drive.
+    ``height_m`` (n,) over the ground, NaN if unknown. The points of an 8-connected group of cells that was passed more
+    often than hit are a trail, without cells that rise to ``tall_m``: those did not drive.
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
@@ -390,4 +399,4 @@ def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
     graph = coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(flat), len(flat)))
     group = connected_components(graph, directed=False)[1]
     passed = np.bincount(group, weights=np.bincount(at, weights=balance))[group] < 0
-    return np.asarray((passed & (top < TALL_M))[at])
+    return np.asarray((passed & (top < numbers.tall_m))[at])

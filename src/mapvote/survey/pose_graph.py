@@ -23,6 +23,7 @@ from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
+from mapvote.core.record import record
 from mapvote.core.sensor_height import UNKNOWN, Heights
 from mapvote.core.types import F64, I64, PRECISE_PRIOR_M, Bool, Drive
 from mapvote.survey.driven_road import WrongAttitude
@@ -42,7 +43,7 @@ class DriveTrack:
     """The trajectory of one drive: as surveyed, in the frame of the draft, then settled, in that of the map."""
 
     drive: Drive
-    """As precise as its scans show it, see ``wrong_attitude``."""
+    """The drive, with a prior as precise as its scans show it, see ``wrong_attitude``."""
     T_map_lidar: F64
     """(n, 4, 4) a pose per scan; that of a scan that could not be registered is the best guess."""
     registered: Bool
@@ -52,9 +53,9 @@ class DriveTrack:
     sigma_m: F64
     """(n,) standard deviation of each settled position in the frame of the priors, NaN without any."""
     heights: Heights = UNKNOWN
-    """Of the sensor over the map's ground."""
+    """Heights of the sensor over the map's ground."""
     wrong_attitude: WrongAttitude | None = None
-    """What contradicts the precise attitude that the prior states: the drive is built with a coarser one."""
+    """The error of the precise attitude that the prior states: the drive is built with a coarser one."""
 
     @property
     def vehicle(self) -> str:
@@ -71,12 +72,12 @@ class DriveTrack:
 
     @property
     def length_m(self) -> float:
-        """Of the way from scan to scan."""
+        """Length of the way from scan to scan."""
         return float(np.linalg.norm(np.diff(self.T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
 
     @property
     def drift(self) -> Drift | None:
-        """Against the prior, where there is one."""
+        """Distance of the poses from the prior; None without a prior."""
         prior = self.drive.T_map_lidar_prior
         if prior is None:
             return None
@@ -106,8 +107,8 @@ class Anchors:
     """(k, 4, 4)."""
     sigma_m: float
     sigma_rad: float
-    said_m: float = 1.0
-    """What each claims of itself alone; ``sigma_m`` is wider where many err alike."""
+    stated_m: float = 1.0
+    """Sigma that each states for itself alone; ``sigma_m`` is wider where many err alike."""
     weights: F64 | None = None
     """(k,) in (0, 1], how far each is believed; None: all."""
 
@@ -124,12 +125,12 @@ def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations:
     return poses
 
 
-def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], asked: I64) -> F64:
-    """(k,) standard deviation of the positions of the poses ``asked`` (k,), the largest over all directions."""
+def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], chosen: I64) -> F64:
+    """(k,) standard deviation of the positions of the poses ``chosen`` (k,), the largest over all directions."""
     H, _ = _normal_equations(T_map, links, anchors)
     solve = splu(H).solve
     out = []
-    for i in asked.tolist():
+    for i in chosen.tolist():
         unit = np.zeros((6 * len(T_map), 3))
         unit[6 * i : 6 * i + 3] = np.eye(3)
         out.append(np.sqrt(np.linalg.eigvalsh(solve(unit)[6 * i : 6 * i + 3])[-1]))
@@ -137,7 +138,7 @@ def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], aske
 
 
 def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[sparse.csc_matrix, F64]:
-    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step itself keeps what is free."""
+    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step holds poses that nothing fixes."""
     n = len(poses)
     gradient = np.zeros((n, 6))
     every = np.arange(n)
@@ -174,67 +175,86 @@ def _weight(sigma_m: float, sigma_rad: float) -> F64:
     return np.array([sigma_m**-2] * 3 + [sigma_rad**-2] * 3)
 
 
-PRIOR_MEMORY_S = 20.0
-"""How long the errors of a coarser prior stay alike: those of GNSS without corrections change over such times."""
-_SLACK = 5.0
-"""Widens a precise prior's sigma: its errors are alike for a while."""
-_LINK_SIGMA_M, _LINK_SIGMA_RAD = 0.003, float(np.radians(0.01))
-"""Random error of the motion from scan to scan."""
-_REVISIT_M, _REVISIT_S = 10.0, 10.0
-"""A scan this near to one at least so much older is linked to it."""
-_REWEIGHTED = 3
-"""How often the priors' weights are taken anew."""
-_TOGETHER = 100_000
-"""Points that are moved together: each needs its own motion."""
-_ASKED = 12
-"""Poses of a drive whose covariance is worked out; the others lie between."""
+@record()
+@dataclass(frozen=True, slots=True)
+class PoseSettling:
+    """Numbers of the adjustment of all poses."""
+
+    prior_memory_s: float = 20.0
+    """Time for which the errors of a coarser prior stay alike: those of GNSS without corrections change over it."""
+    slack: float = 5.0
+    """Factor on a precise prior's sigma: its errors are alike for a while."""
+    link_sigma_m: float = 0.003
+    """Random error of the shift from scan to scan."""
+    link_sigma_rad: float = float(np.radians(0.01))
+    """Random error of the turn from scan to scan."""
+    revisit_m: float = 10.0
+    """Distance within which a scan is linked to a much older one."""
+    revisit_s: float = 10.0
+    """Least age of that older scan."""
+    reweighted: int = 3
+    """Rounds in which the priors' weights are taken anew."""
+    points_at_once: int = 100_000
+    """Points that are moved together: each needs its own motion."""
+    covariances: int = 12
+    """Poses of a drive whose covariance is computed; the others are interpolated."""
+    fit_rounds: int = 30
+    """Rounds of the robust fit to the priors at most."""
+    wild_sigmas: float = 2.5
+    """Sigmas at which a prior weighs half; farther off its weight falls on (Cauchy)."""
 
 
-def settle_poses(tracks: Sequence[DriveTrack]) -> tuple[list[DriveTrack], float]:
+POSE_SETTLING = PoseSettling()
+
+
+def settle_poses(tracks: Sequence[DriveTrack], numbers: PoseSettling = POSE_SETTLING) -> tuple[list[DriveTrack], float]:
     """(the tracks with poses that agree with each other's motion and with all priors; how far the priors moved a scan
-    at most, after the whole had been shifted and turned to fit them, metres). As given if there are no priors."""
+    at most, after the whole had been shifted and turned to fit them, metres). The given tracks, 0 without priors."""
     drives = [track.drive for track in tracks]
     starts = np.cumsum([0] + [len(track.T_map_lidar) for track in tracks])
     T = np.concatenate([track.T_map_lidar for track in tracks])
-    known = np.flatnonzero(np.concatenate([track.registered for track in tracks]))
+    placed = np.flatnonzero(np.concatenate([track.registered for track in tracks]))
     if not any(drive.T_map_lidar_prior is not None for drive in drives):
         return list(tracks), 0.0
     if not any(drive.has_precise_prior for drive in drives):
-        T = _laid_on_priors(drives, T, known, starts) @ T
+        T = _laid_on_priors(drives, T, placed, starts, numbers) @ T
     rigid = T
-    links = _links(drives, T, known, _pieces(tracks, starts))
-    anchors = _anchors(drives, T, starts)
-    for _ in range(_REWEIGHTED):
+    links = _links(drives, T, placed, _pieces(tracks, starts), numbers)
+    anchors = _anchors(drives, T, starts, numbers)
+    for _ in range(numbers.reweighted):
         T = optimise(T, links, anchors)
-        anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
+        anchors = [replace(a, weights=trust_in(_off(T, a), a.stated_m, numbers)) for a in anchors]
     bent_m = float(np.linalg.norm((T - rigid)[:, :3, 3], axis=1).max())
-    settled = zip(tracks, np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), strict=True)
+    settled = zip(tracks, np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts, numbers), strict=True)
     return [replace(track, T_map_lidar=poses, sigma_m=sigma_m) for track, poses, sigma_m in settled], bent_m
 
 
-def carried_along(points: F64, found: Sequence[DriveTrack], settled: Sequence[DriveTrack]) -> F64:
-    """Points (n, 3) of the draft, each moved as the nearest scan was when the tracks ``found`` were settled.
+def carried_along(
+    points: F64, surveyed: Sequence[DriveTrack], settled: Sequence[DriveTrack], numbers: PoseSettling = POSE_SETTLING
+) -> F64:
+    """Points (n, 3) of the draft, each moved as the nearest scan was when the tracks ``surveyed`` were settled.
 
     The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
     is not bent alike lies too high here and too low there, by all that the first pass has drifted.
     """
-    before, after = (np.concatenate([t.T_map_lidar[t.registered] for t in tracks]) for tracks in (found, settled))
+    before, after = (np.concatenate([t.T_map_lidar[t.registered] for t in tracks]) for tracks in (surveyed, settled))
     if np.array_equal(before, after):
         return points
     moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
-    for first in range(0, len(points), _TOGETHER):
-        some = points[first : first + _TOGETHER]
-        T = moved[tree.query(some)[1]]
-        out[first : first + _TOGETHER] = np.einsum("nij,nj->ni", T[:, :3, :3], some) + T[:, :3, 3]
+    for first in range(0, len(points), numbers.points_at_once):
+        part = slice(first, first + numbers.points_at_once)
+        T = moved[tree.query(points[part])[1]]
+        out[part] = np.einsum("nij,nj->ni", T[:, :3, :3], points[part]) + T[:, :3, 3]
     return out
 
 
-def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> list[F64]:
+def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64, numbers: PoseSettling) -> list[F64]:
+    """(n,) for each drive: position sigmas, computed at some poses and interpolated between them."""
     ends = list(pairwise(starts.tolist()))
-    asked = [np.unique(np.linspace(a, b - 1, _ASKED).round().astype(np.int64)) for a, b in ends]
-    sigmas = position_sigmas(T, links, anchors, np.concatenate(asked))
-    pieces = np.split(sigmas, np.cumsum([len(a) for a in asked])[:-1])
-    return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
+    computed = [np.unique(np.linspace(a, b - 1, numbers.covariances).round().astype(np.int64)) for a, b in ends]
+    sigmas = position_sigmas(T, links, anchors, np.concatenate(computed))
+    pieces = np.split(sigmas, np.cumsum([len(a) for a in computed])[:-1])
+    return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, computed, pieces, strict=True)]
 
 
 def _pieces(tracks: Sequence[DriveTrack], starts: I64) -> I64:
@@ -246,38 +266,38 @@ def _pieces(tracks: Sequence[DriveTrack], starts: I64) -> I64:
     return np.cumsum(begins)
 
 
-def _laid_on_priors(drives: Sequence[Drive], T: F64, known: I64, starts: I64) -> F64:
+def _laid_on_priors(drives: Sequence[Drive], T: F64, placed: I64, starts: I64, numbers: PoseSettling) -> F64:
     """(4, 4) one motion of the whole, from all drives' priors."""
-    positions, priors, said = [], [], []
+    positions, priors, sigmas_m = [], [], []
     for start, drive in zip(starts, drives, strict=False):
         if drive.T_map_lidar_prior is not None:
-            mine = known[(known >= start) & (known < start + len(drive))]
-            positions.append(T[mine, :3, 3])
-            priors.append(drive.T_map_lidar_prior[mine - start, :3, 3])
-            said.append(drive.prior_sigma_m)
-    return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(said))
+            of_drive = placed[(placed >= start) & (placed < start + len(drive))]
+            positions.append(T[of_drive, :3, 3])
+            priors.append(drive.T_map_lidar_prior[of_drive - start, :3, 3])
+            sigmas_m.append(drive.prior_sigma_m)
+    return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(sigmas_m), numbers=numbers)
 
 
-def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
-    """All priors of all drives; of errors that last, as many scans as share one share one weight."""
+def _anchors(drives: Sequence[Drive], T: F64, starts: I64, numbers: PoseSettling) -> list[Anchors]:
+    """All priors of all drives; scans that share one lasting error share one weight."""
     out = []
     for start, drive in zip(starts, drives, strict=False):
         if drive.T_map_lidar_prior is None:
             continue
-        slack = _SLACK
+        slack = numbers.slack
         if not drive.has_precise_prior:
             seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
-            alike = min(1.0, PRIOR_MEMORY_S / max(seconds, 1e-3)) * len(drive)
+            alike = min(1.0, numbers.prior_memory_s / max(seconds, 1e-3)) * len(drive)
             slack = float(np.sqrt(max(alike, 1.0)))
-        sigma_rad = _SLACK * slack * float(np.radians(drive.prior_sigma_deg))
+        sigma_rad = numbers.slack * slack * float(np.radians(drive.prior_sigma_deg))
         anchor = Anchors(
             np.arange(start, start + len(drive)),
             drive.T_map_lidar_prior,
             slack * drive.prior_sigma_m,
             sigma_rad if not drive.has_precise_prior else slack * float(np.radians(drive.prior_sigma_deg)),
-            said_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
+            stated_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
         )
-        out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
+        out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.stated_m, numbers)))
     return out
 
 
@@ -285,38 +305,43 @@ def _off(T: F64, anchors: Anchors) -> F64:
     return np.asarray(np.linalg.norm(T[anchors.pose, :3, 3] - anchors.T_map[:, :3, 3], axis=1))
 
 
-def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[Links]:
+def _links(drives: Sequence[Drive], T: F64, placed: I64, piece_of: I64, numbers: PoseSettling) -> list[Links]:
     """The motion from scan to scan, and from each scan to the nearest much older one near by: it was registered to the
     map that the older one made."""
     order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
-    consecutive = piece_of[known[:-1]] == piece_of[known[1:]]
-    pairs = [(known[:-1][consecutive], known[1:][consecutive])]
-    tree = cKDTree(T[known, :3, 3])
+    consecutive = piece_of[placed[:-1]] == piece_of[placed[1:]]
+    pairs = [(placed[:-1][consecutive], placed[1:][consecutive])]
+    tree = cKDTree(T[placed, :3, 3])
     first, second = [], []
-    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], _REVISIT_M), strict=True):
-        older = [i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j)))]
+    for j, near in zip(placed, tree.query_ball_point(T[placed, :3, 3], numbers.revisit_m), strict=True):
+        older = [
+            i
+            for i in placed[near]
+            if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j), numbers.revisit_s))
+        ]
         if older:
             first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
             second.append(j)
     pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
-    return [Links(a, b, inverses(T[a]) @ T[b], _LINK_SIGMA_M, _LINK_SIGMA_RAD) for a, b in pairs]
+    return [Links(a, b, inverses(T[a]) @ T[b], numbers.link_sigma_m, numbers.link_sigma_rad) for a, b in pairs]
 
 
-def _apart(stamps_ns: I64, i: int, j: int) -> bool:
-    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * _REVISIT_S)
+def _apart(stamps_ns: I64, i: int, j: int, revisit_s: float) -> bool:
+    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * revisit_s)
 
 
-_ROUNDS = 30
-WILD_SIGMAS = 2.5
-"""A prior so many sigmas off weighs half; farther off, less and less (Cauchy)."""
-
-
-def trust_in(off_m: F64, sigma_m: float) -> F64:
+def trust_in(off_m: F64, sigma_m: float, numbers: PoseSettling = POSE_SETTLING) -> F64:
     """(n,) weight in (0, 1] of priors that lie ``off_m`` (n,) from where the others have them."""
-    return np.asarray(1.0 / (1.0 + (off_m / (WILD_SIGMAS * sigma_m)) ** 2))
+    return np.asarray(1.0 / (1.0 + (off_m / (numbers.wild_sigmas * sigma_m)) ** 2))
 
 
-def fit_to_priors(positions: F64, prior_positions: F64, sigma_m: float, yaw_rad: float = 0.0) -> F64:
+def fit_to_priors(
+    positions: F64,
+    prior_positions: F64,
+    sigma_m: float,
+    yaw_rad: float = 0.0,
+    numbers: PoseSettling = POSE_SETTLING,
+) -> F64:
     """(4, 4) turn about z and shift that fits positions (n, 3) to their priors (n, 3), robustly.
 
     ``yaw_rad`` is kept where the track is too short to say anything about it. Source: Umeyama 1991 for the fit, Cauchy
@@ -325,8 +350,8 @@ def fit_to_priors(positions: F64, prior_positions: F64, sigma_m: float, yaw_rad:
     spread = float(np.linalg.norm(positions[:, :2].std(axis=0)))
     T = _shifted(positions, prior_positions, yaw_rad, np.ones(len(positions)))
     scale = max(sigma_m, float(np.median(_distances(T, positions, prior_positions))))
-    for _ in range(_ROUNDS):
-        weights = trust_in(_distances(T, positions, prior_positions), scale)
+    for _ in range(numbers.fit_rounds):
+        weights = trust_in(_distances(T, positions, prior_positions), scale, numbers)
         yaw = _yaw(positions, prior_positions, weights) if spread > 3.0 * sigma_m else yaw_rad
         moved = _shifted(positions, prior_positions, yaw, weights)
         # The scale comes down to the stated sigma step by step: at first the whole track may look wild.
