@@ -138,8 +138,7 @@ def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], chos
 
 
 def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[sparse.csc_matrix, F64]:
-    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step holds poses without constraints.
-    """
+    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step holds free poses."""
     n = len(poses)
     gradient = np.zeros((n, 6))
     every = np.arange(n)
