@@ -52,7 +52,7 @@ def kept(vote: TileVote, cells: Bool) -> TileVote:
         points = points[cells[at[:, 1], at[:, 0]]]
     states = np.where(cells, vote.states, np.uint8(NO_VOTE))
     free = None if vote.free is None else vote.free.within(cells)
-    return replace(vote, states=states, new_points=points, free=free, intensity=None, odds=None)
+    return replace(vote, states=states, new_points=points, free=free, fields={}, odds=None)
 
 
 def salted(share: float) -> Callable[[TileVote], TileVote]:
@@ -91,7 +91,7 @@ def shifted(vote: TileVote) -> TileVote:
     if free is not None:
         free = free.at(free.cells + TILE_CELLS < CELLS)
         free = Words(free.cells + TILE_CELLS, free.words)
-    return replace(vote, states=states, new_points=points, free=free, intensity=None, odds=None)
+    return replace(vote, states=states, new_points=points, free=free, fields={}, odds=None)
 
 
 def merged_with(own: Votes) -> Callable[[TileVote, TileIndex], TileVote]:
@@ -115,7 +115,7 @@ def merged_with(own: Votes) -> Callable[[TileVote, TileIndex], TileVote]:
             states=np.where(mine, b.states, a.states),
             new_points=np.concatenate(points) if points else None,
             free=Words.of(free.reshape(TILE_CELLS, TILE_CELLS)),
-            intensity=None,
+            fields={},
             odds=None,
         )
 

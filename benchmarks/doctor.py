@@ -104,7 +104,7 @@ def recorded(drive: Drive) -> Recording:
     """The drive as KITTI's files have it: rows of x, y, z, intensity."""
     assert drive.T_map_lidar_prior is not None
     read = list(drive)
-    scans = [np.column_stack([s.points, s.intensity if s.intensity is not None else 0 * s.points[:, 0]]) for s in read]
+    scans = [np.column_stack([s.points, s.fields.get("intensity", 0 * s.points[:, 0])]) for s in read]
     toml = {"prior_sigma_m": drive.prior_sigma_m, "motion_compensated": bool(read[0].time_s is None)}
     return Recording(scans, drive.T_map_lidar_prior, (drive.stamps_ns - drive.stamps_ns[0]) * 1e-9, toml)
 

@@ -26,8 +26,8 @@ def with_times(scan: Scan, field: str, of: Callable[[F64], NDArray[np.generic]])
     kinds = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
     table = np.zeros(len(scan.points), dtype=[*kinds, (field, values.dtype)])
     table["x"], table["y"], table["z"] = scan.points.T
-    if scan.intensity is not None:
-        table["intensity"] = scan.intensity
+    if "intensity" in scan.fields:
+        table["intensity"] = scan.fields["intensity"]
     table[field] = values
     return table
 

@@ -152,14 +152,14 @@ def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type |
     for i in range(6):
         scan, pose = scan_of(-1.0 + 0.1 * i, i)
         bright = np.where(np.arange(len(scan.points)) < len(NEW), 0.8, 0.2).astype(np.float32)
-        vehicle.observe(replace(scan, intensity=bright), pose)
+        vehicle.observe(replace(scan, fields={"intensity": bright}), pose)
     vehicle.finish()
     ballot = decode(encode(vehicle.ballot()))
     offers = [unpack_offer(tile.new_points, tile.intensity) for tile in ballot.tiles if tile.new_points is not None]
     if kind is None:
-        assert all(intensity is None for _, intensity in offers)
+        assert all(fields == {} for _, fields in offers)
         return
-    assert {int(v) for _, intensity in offers if intensity is not None for v in intensity} == {204}
+    assert {int(v) for _, fields in offers if fields for v in fields["intensity"]} == {204}
     after, _ = update_map(point_map, [ballot], FuseSettings(min_votes=1))
     new = np.abs(all_points(after)[:, 0] - 8.25) + np.abs(all_points(after)[:, 1] - 3.5) < 1.2
     found = all_fields(after)["intensity"][new & (all_points(after)[:, 2] > 0.3)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,10 +24,11 @@ from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.mount import Mount, mount_of_prior
 from mapvote.core.point_map import PointMap
+from mapvote.core.points import Values, among, point_field
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, PosePrior, Scan
+from mapvote.core.types import F32, F64, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
 from mapvote.formats.drives.sensor_estimate import sensor_upright
 from mapvote.matching.localiser import Localise, Localiser
@@ -79,7 +80,7 @@ class Vehicle:
         self._new_points = NewPoints(
             self.point_map.lattice,
             beyond=self._rule.takes_points_beyond,
-            intensity=self.point_map.has_intensity,
+            names=among(self.point_map.field_names),
         )
 
     @property
@@ -217,8 +218,8 @@ def write_ballot(
             f"{vehicle}: none of {report.scans} scans could be localised in map {point_map.map_id}; "
             "is the drive on this map, and its prior in the map's frame?"
         )
-    points, two_stage = new_points.by_tile(), settings.voting.two_stage
-    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in votes_of_tiles]
+    points, two_stage, names = new_points.by_tile(), settings.voting.two_stage, new_points.names
+    tiles = [_ballot_tile(point_map, tile, votes, points(tile), names, two_stage) for tile, votes in votes_of_tiles]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,
@@ -241,11 +242,14 @@ def write_ballot(
     )
 
 
-def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64, two_stage: bool) -> BallotTile:
+def _ballot_tile(
+    point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64, names: Sequence[str], two_stage: bool
+) -> BallotTile:
     """One-stage, the server decides: then every cell that got a vote for changed-occupied may need its points."""
     built = CellState.CHANGED_OCCUPIED
     came = votes.states == built if two_stage else votes.tally[..., built] > 0
-    kept, bright = offered(point_map, tile, np.where(came, votes.new, NOTHING), points)
+    kept, sent = offered(point_map, tile, np.where(came, votes.new, NOTHING), points, names)
+    measured = {name: values for name, values in sent.items() if (values != point_field(name).unmeasured).any()}
     odds = None
     if two_stage and votes.looked is not None:
         from mapvote.rules.surfaces import depths_m, log_odds  # brings scipy, as surfaces do
@@ -259,21 +263,23 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
         gone=None if votes.gone is None else pack_words(votes.gone),
         new_points=pack_points(kept) if len(kept) else None,
-        intensity=pack_plane(bright) if len(kept) and bright is not None and bright.any() else None,
+        intensity=pack_plane(measured["intensity"]) if "intensity" in measured else None,
         free=None if votes.free is None else pack_words(votes.free),
         odds=odds,
     )
 
 
-def offered(point_map: PointMap, tile: TileIndex, new: U64, points: F64) -> tuple[F32, U8 | None]:
-    """Those of a tile's ``points`` (n, 3 or 4), map metres, that lie in its ``new`` voxels (256, 256): (m, 3) from its
-    corner, and the intensity (m,) of those that came with one."""
+def offered(
+    point_map: PointMap, tile: TileIndex, new: U64, points: F64, names: Sequence[str]
+) -> tuple[F32, dict[str, Values]]:
+    """Those of a tile's ``points`` (n, 3 + k), map metres, that lie in its ``new`` voxels (256, 256): (m, 3) from its
+    corner, and their k attributes (m,) by ``names``."""
     if not len(points):
-        return np.empty((0, 3), dtype=np.float32), None
+        return np.empty((0, 3), dtype=np.float32), {}
     window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
     known = mapped is not None and mapped.has_ground
     base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
-    return points_in(window, points, new, base)
+    return points_in(window, points, new, base, names)
 
 
 def vote_drive(

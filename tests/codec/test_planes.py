@@ -281,12 +281,12 @@ def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
     (got,) = unpack_all(decode(encode(sent)))
     assert got.new_points is not None
     assert got.new_points.tobytes() == points.tobytes()
-    assert got.measured().tolist() == values
+    assert got.fields["intensity"].tolist() == values
 
 
 def test_a_ballot_without_intensity_has_none_and_every_point_must_have_one() -> None:
     points, two = pack_points(POINTS), pack_plane(np.zeros(2, np.uint8))
-    assert unpack_offer(points, None)[1] is None
+    assert unpack_offer(points, None)[1] == {}
     for offered, why in ((points, "2 bytes, expected 3"), (None, "none of those")):
         with pytest.raises(MapvoteError, match=why):
             unpack_offer(offered, two)

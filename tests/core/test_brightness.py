@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.brightness import Brightness, from_bytes, full_scale, in_bytes, shares, unit_intensity
+from mapvote.core.brightness import Brightness, from_counts, full_scale, in_bytes, shares, unit_intensity
 
 U = np.random.default_rng(0).random(4000)
 
@@ -56,6 +56,6 @@ def test_a_ballot_gives_brightness_back_on_the_scale_of_the_map(byte: int, kind:
     if kind == "u1" or (scale == 1.0 and kind != "f4"):
         scale = 255.0
     column = np.array([0.0, scale, 0.25 * scale]).astype(kind)
-    back = from_bytes(np.array([byte], np.uint8), column)
+    back = from_counts(np.array([byte], np.uint8), 255.0, column)
     assert back.dtype == column.dtype
     assert in_bytes(np.concatenate([column, back]))[-1] == byte

@@ -52,7 +52,10 @@ def tile(points: np.ndarray, ground_z: np.ndarray | None = None, free: np.ndarra
         (lambda: Scan(0, cast(Any, POINTS.tolist())), r"expected float32 \(n, 3\), got a list"),
         (lambda: Scan(0, with_nan(POINTS)), r"Scan\.points: 1 numbers are not finite, the first at \[1, 1\]"),
         (lambda: Scan(0, POINTS, np.zeros(4, np.float32)), r"Scan\.time_s: expected float32 \(5\), got float32 \(4,\)"),
-        (lambda: Scan(0, POINTS, None, with_nan(POINTS[:, 0])), r"Scan\.intensity: 1 numbers are not finite"),
+        (
+            lambda: Scan(0, POINTS, fields={"intensity": with_nan(POINTS[:, 0])}),
+            r"Scan\.fields.*: 1 numbers are not finite",
+        ),
         (
             lambda: PosePrior(np.eye(3), 1.0, 1.0),
             r"T_map_lidar of the prior: expected float64 \(4, 4\)",

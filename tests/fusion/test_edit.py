@@ -67,10 +67,11 @@ def test_one_point_a_voxel_the_nearest_to_the_mean_whoever_came_first(seed: int,
     points = np.concatenate([points, points[:40]])  # the same point offered twice
     voters = rng.integers(0, 4, len(points)).astype(np.int32)
     tile = make_tile(wall([(1, 1)], [0.45]))
-    bright = rng.integers(0, 256, len(points)).astype(np.uint8)
+    bright = {"intensity": rng.integers(0, 256, len(points)).astype(np.uint8)}
     edited, added = add_points(tile, points, bright, flat_cells(GRID, points), voters, min_votes)
     order = rng.permutation(len(points))
-    again, _ = add_points(tile, points[order], bright[order], flat_cells(GRID, points[order]), voters[order], min_votes)
+    other = {"intensity": bright["intensity"][order]}
+    again, _ = add_points(tile, points[order], other, flat_cells(GRID, points[order]), voters[order], min_votes)
     assert again.points.tobytes() == edited.points.tobytes()
 
     cell, layer = flat_cells(GRID, points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)
@@ -93,7 +94,8 @@ def test_of_a_point_that_two_vehicles_offer_the_darker_is_taken_whoever_came_fir
     points = wall([(5, 5), (5, 5), (5, 2), (5, 8)], [0.45])
     bright, voters = np.array([200, 100, 255, 255], np.uint8), np.array([0, 1, 0, 0], np.int32)
     for order in map(list, permutations(range(4))):
-        edited, _ = add_points(tile, points[order], bright[order], flat_cells(GRID, points[order]), voters[order], 1)
+        sent = {"intensity": bright[order]}
+        edited, _ = add_points(tile, points[order], sent, flat_cells(GRID, points[order]), voters[order], 1)
         assert sorted(edited.fields["intensity"].tolist()) == [100, 255, 255]
 
 

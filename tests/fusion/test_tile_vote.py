@@ -162,11 +162,13 @@ def test_points_of_a_cell_come_from_the_last_drive_that_speaks_there_and_of_no_o
 def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_others_keep_theirs() -> None:
     first, second = np.array([[1.0, 1.0, 0.5]], np.float32), np.array([[5.0, 5.0, 0.5]], np.float32)
     bare = drive("v", 1, {(3, 3): CO}, new_points=first)
-    full = drive("v", 2, {(16, 16): CO}, new_points=second, intensity=np.array([77], np.uint8))
+    full = drive("v", 2, {(16, 16): CO}, new_points=second, fields={"intensity": np.array([77], np.uint8)})
     one = fold([bare, full], WINDOW)
     assert one.new_points is not None
-    assert one.intensity is not None
-    assert sorted(zip(one.new_points[:, 0].tolist(), one.intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
-    assert len(drive("v", 3, {}).measured()) == 0
-    points, bright, _, voters = offered([one], states_plane({(3, 3): CO, (16, 16): CO}), WINDOW)
-    assert sorted(zip(points[:, 0].tolist(), bright.tolist(), voters.tolist(), strict=True)) == [(1, 0, 0), (5, 77, 0)]
+    intensity = one.fields["intensity"]
+    assert sorted(zip(one.new_points[:, 0].tolist(), intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
+    assert fold([bare, drive("v", 3, {})], WINDOW).fields == {}
+    points, fields, _, voters = offered([one], states_plane({(3, 3): CO, (16, 16): CO}), WINDOW)
+    assert points[:, 0].tolist() == [1, 5]
+    assert fields["intensity"].tolist() == [0, 77]
+    assert voters.tolist() == [0, 0]

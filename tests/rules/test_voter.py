@@ -77,8 +77,8 @@ def test_points_of_a_tile_are_cut_to_a_word_and_told_from_its_corner() -> None:
     words[3, 4] = 0b100
     inside = [2 * 76.8 + 4.5 * CELL_SIZE, 76.8 + 3.5 * CELL_SIZE]
     points = np.array([[*inside, 0.75], [*inside, 1.05], [inside[0] + 0.3, inside[1], 0.75]])
-    found, intensity = points_in(window, points, words, base)
-    assert intensity is None
+    found, fields = points_in(window, points, words, base)
+    assert fields == {}
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, [[1.35, 1.05, 0.75]], atol=1e-5)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mapvote.codec.planes import Words, compress, pack_plane, unpack_bytes, unpack_plane, unpack_sparse
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
+from mapvote.core.points import Fields, Values
 from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, Bool, CellState, MapvoteError
 
 FORMAT_VERSION = 1
@@ -180,8 +181,8 @@ class Planes:
     remnants, and the whole column above ground."""
     new_points: F32 | None = None
     """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
-    intensity: U8 | None = None
-    """(m,) of the new points, 255 for 1.0; None: not measured."""
+    fields: Fields = field(default_factory=dict)
+    """Attributes (m,) of the new points that were measured, see core/points.py."""
     free: Words | None = None
     """Column words that rays passed through."""
     odds: Odds | None = None
@@ -190,7 +191,7 @@ class Planes:
     @property
     def nbytes(self) -> int:
         """Bytes of all planes."""
-        planes: list[NDArray[Any] | None] = [self.states, self.tally, self.new_points, self.intensity]
+        planes: list[NDArray[Any] | None] = [self.states, self.tally, self.new_points, *self.fields.values()]
         planes += [*(self.gone or ()), *(self.free or ()), *(self.odds or ())]
         return sum(plane.nbytes for plane in planes if plane is not None)
 
@@ -205,14 +206,14 @@ class Planes:
 def unpack_planes(packed: BallotTile) -> Planes:
     """The votes on one tile, of a ballot or of a server's row with its planes; MapvoteError if a plane is damaged or
     impossible."""
-    new_points, intensity = unpack_offer(packed.new_points, packed.intensity)
+    new_points, fields = unpack_offer(packed.new_points, packed.intensity)
     states = None if packed.states is None else unpack_states(packed.states)
     return Planes(
         states=states,
         tally=None if packed.tally is None else unpack_tally(packed.tally),
         gone=None if packed.gone is None else unpack_sparse(packed.gone, "gone"),
         new_points=new_points,
-        intensity=intensity,
+        fields=fields,
         free=None if packed.free is None else unpack_sparse(packed.free, "free"),
         odds=unpack_sureness(packed.odds, states),
     )
@@ -231,15 +232,15 @@ def unpack_tally(data: bytes) -> U16:
     return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
 
 
-def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, U8 | None]:
-    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as :func:`unpack_points`,
-    and if there is not one for each."""
+def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, dict[str, Values]]:
+    """The new points (m, 3) of a tile and their attributes (m,), of their planes; MapvoteError as
+    :func:`unpack_points`, and if there is not one for each."""
     points = None if new_points is None else unpack_points(new_points)
     if intensity is None:
-        return points, None
+        return points, {}
     if points is None:
         raise MapvoteError("ballot: a tile has the intensity of new points, but none of those")
-    return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
+    return points, {"intensity": unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")}
 
 
 def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:

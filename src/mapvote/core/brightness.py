@@ -138,7 +138,7 @@ def in_bytes(values: NDArray[Any]) -> U8:
     return np.asarray(np.rint(255.0 * shares(values)), dtype=np.uint8)
 
 
-def from_bytes(brightness: U8, like: NDArray[Any]) -> NDArray[Any]:
-    """Brightness (m,), 255 for 1.0, on the scale and in the type of the column ``like`` (n,)."""
-    values = brightness * (full_scale(like) / 255.0)
+def from_counts(brightness: NDArray[Any], full: float, like: NDArray[Any]) -> NDArray[Any]:
+    """Brightness (m,), ``full`` for 1.0, on the scale and in the type of the column ``like`` (n,)."""
+    values = brightness * (full_scale(like) / full)
     return (values if like.dtype.kind == "f" else np.rint(values)).astype(like.dtype)

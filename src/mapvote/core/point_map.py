@@ -161,11 +161,6 @@ class PointMap:
         asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
         return sorted({name for index in asked for name in self.tiles[index].fields})
 
-    @property
-    def has_intensity(self) -> bool:
-        """Whether its points say how bright they are, so that new ones should."""
-        return "intensity" in self.field_names
-
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""
         return self.tiles.get(index) or Tile.empty(self.lattice.tile(index))

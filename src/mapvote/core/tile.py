@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.brightness import from_bytes
 from mapvote.core.columns import base_layers, column_bits, flat_cells, mark_obstacles
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
-from mapvote.core.types import F32, F64, I32, I64, U8, U32, U64, Bool, check_array, read_only
+from mapvote.core.points import Fields, point_fields
+from mapvote.core.types import F32, F64, I32, I64, U32, U64, Bool, check_array, read_only
 
 PLANES = 4
 """Of a tile's memory."""
@@ -171,17 +171,18 @@ class Tile:
         fields = {name: column.take(left) for name, column in self.fields.items()}
         return self.but(points=self.points.take(left, axis=0), fields=fields)
 
-    def with_new(self, points: F32, intensity: U8 | None = None) -> Tile:
+    def with_new(self, points: F32, sent: Fields | None = None) -> Tile:
         """The tile with more points (m, 3) after its own.
 
-        ``intensity`` (m,), 255 for 1.0, goes into the field of that name, on its scale; every other field is 0.
+        Attributes ``sent`` (m,), as in ballots, go into the fields of their names; every other field is 0.
         """
         check_array(points, "Tile.points", (None, 3), np.float32)
         fields = {}
         for name, column in self.fields.items():
-            new = np.zeros(len(points), dtype=column.dtype)
-            if name == "intensity" and intensity is not None:
-                new = from_bytes(intensity, column)
+            row, new = point_fields().get(name), np.zeros(len(points), dtype=column.dtype)
+            if row is not None:
+                values = sent[name] if sent and name in sent else row.unknown(len(points))
+                new = row.in_map(values, column)
             fields[name] = np.concatenate([column, new])
         return self.but(points=np.concatenate([self.points, points]), fields=fields)
 

@@ -105,8 +105,8 @@ class Scan:
     """(n, 3) lidar frame; finite, beyond the sensor's minimum range."""
     time_s: F32 | None = None
     """(n,) when each point was measured, relative to ``stamp_ns``; None if already motion-compensated."""
-    intensity: F32 | None = None
-    """(n,) in [0, 1], where known."""
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Attributes (n,) of the points by name, as core/points.py says; intensity is in [0, 1]."""
     ring: U16 | None = None
     """(n,) which beam measured each point, where known."""
     origin: F64 | None = None
@@ -120,14 +120,14 @@ class Scan:
     @classmethod
     def sweep(cls, stamp_ns: int, scans: Sequence[Scan]) -> Scan:
         """Scans that several LiDARs of one vehicle took in one revolution as one, at ``stamp_ns``. Their points must be
-        in one frame (:meth:`seen_from`). Intensity and ring stay where all scans have them."""
+        in one frame (:meth:`seen_from`). Fields and ring stay where all scans have them."""
         if all(scan.time_s is None and scan.stamp_ns == stamp_ns for scan in scans):
             time_s = None
         else:
             zero = (np.zeros(len(s.points), np.float32) if s.time_s is None else s.time_s for s in scans)
             later = (np.float32((s.stamp_ns - stamp_ns) * 1e-9) for s in scans)
             time_s = np.concatenate([t + late for t, late in zip(zero, later, strict=True)])
-        intensity = [s.intensity for s in scans if s.intensity is not None]
+        names = [name for name in scans[0].fields if all(name in s.fields for s in scans)]
         ring = [s.ring for s in scans if s.ring is not None]
         starts = np.cumsum([len(s.points) for s in scans[:-1]]).tolist()
         origins = [np.zeros(3) if s.origin is None else s.origin for s in scans]
@@ -135,7 +135,7 @@ class Scan:
             stamp_ns,
             np.concatenate([s.points for s in scans]),
             time_s,
-            np.concatenate(intensity) if len(intensity) == len(scans) else None,
+            {name: np.concatenate([s.fields[name] for s in scans]) for name in names},
             np.concatenate(ring) if len(ring) == len(scans) else None,
             scans[0].origin,
             tuple(zip(starts, origins[1:], strict=True)),
@@ -156,7 +156,7 @@ class Scan:
             self.stamp_ns,
             self.points[part],
             None if self.time_s is None else self.time_s[part],
-            None if self.intensity is None else self.intensity[part],
+            {name: values[part] for name, values in self.fields.items()},
             None if self.ring is None else self.ring[part],
             origin,
         )
@@ -173,9 +173,11 @@ class Scan:
 
     def __post_init__(self) -> None:
         check_array(self.points, "Scan.points", (None, 3), np.float32)
-        for name, values in (("Scan.time_s", self.time_s), ("Scan.intensity", self.intensity)):
-            if values is not None:
-                check_array(values, name, (len(self.points),), np.float32)
+        if self.time_s is not None:
+            check_array(self.time_s, "Scan.time_s", (len(self.points),), np.float32)
+        for name, values in self.fields.items():
+            dtype = getattr(values, "dtype", np.float32)
+            check_array(values, f"Scan.fields[{name!r}]", (len(self.points),), dtype)
 
 
 @dataclass(frozen=True, slots=True)

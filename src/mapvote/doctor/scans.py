@@ -129,7 +129,7 @@ class Looking:
         if i not in self._rows:
             self._rows[i] = _look(i, scan.points, self._R)
             self._times[scan.times or _UNTOLD[scan.time_s is not None]] += 1
-            self._intensity |= scan.intensity is not None
+            self._intensity |= "intensity" in scan.fields
         return scan
 
     def look(self, indices: Iterable[int], progress: Callable[[int, int], None] | None = None) -> Looks:
@@ -408,7 +408,9 @@ def _period(scan: Scan) -> tuple[int, int]:
     by column."""
     points = scan.points[:_PERIOD_POINTS].astype(np.float64)
     # Intensities may have been scaled when they were read: their column only keeps its place.
-    flat = (points if scan.intensity is None else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)).ravel()
+    flat = (
+        points if "intensity" not in scan.fields else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)
+    ).ravel()
     width = len(flat) // max(len(points), 1)
     if len(flat) < 1000:
         return width, width

@@ -18,6 +18,7 @@ from mapvote.codec.planes import Words, bits_of, counted, nothing_reached, words
 from mapvote.core.columns import EVERY_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.points import Fields, as_numbers
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
@@ -68,12 +69,12 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     return (tile.without(dropped), deleted) if deleted else (tile, 0)
 
 
-def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
+def add_points(tile: Tile, points: F32, fields: Fields, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
     """The tile with one representative per voxel that at least ``min_votes`` voters support, and how many came.
 
-    ``points`` (m, 3) from the tile's corner, ``intensity`` (m,) 255 for 1.0, ``cells`` (m,) flat, ``voters`` (m,) small
-    integers. A voter supports a voxel with a point in it or in the voxel above or below. Voxels that already hold a
-    point of the map stay as they are. New points follow the old ones, ordered by cell and height.
+    ``points`` (m, 3) from the tile's corner, their ``fields`` (m,) as in ballots, ``cells`` (m,) flat, ``voters`` (m,)
+    small integers. A voter supports a voxel with a point in it or in the voxel above or below. Voxels that already hold
+    a point of the map stay as they are. New points follow the old ones, ordered by cell and height.
     """
     if not len(points):
         return tile, 0
@@ -84,11 +85,13 @@ def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, 
     mapped = np.flatnonzero(asked[tile.cells])
     taken = np.isin(voxels, _voxels(tile.cells[mapped], tile.points[mapped]))
     chosen, seen = np.empty(len(voxels), np.int64), np.full(int(voters.max()) + 1, -1, dtype=np.int64)
-    n = _represent(points, intensity, voxels, voters, taken, order, min_votes, seen, chosen)
+    numbers = as_numbers(fields, len(points))
+    n = _represent(points, numbers, voxels, voters, taken, order, min_votes, seen, chosen)
     chosen = chosen[:n]
     if not len(chosen):
         return tile, 0
-    return tile.with_new(points[chosen], intensity[chosen]), len(chosen)
+    sent = {name: values[chosen] for name, values in fields.items()}
+    return tile.with_new(points[chosen], sent), len(chosen)
 
 
 def _voxels(cells: I64, points: F32) -> I64:
@@ -100,10 +103,11 @@ def _voxels(cells: I64, points: F32) -> I64:
 
 @kernel
 def _represent(
-    points: F32, intensity: U8, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int, seen: I64, out: I64
+    points: F32, numbers: U64, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int, seen: I64, out: I64
 ) -> int:
     """Into ``out`` (n,), returning how many, indices of one point per supported voxel, ascending by voxel: the one
-    nearest to the mean of all offered there, of several the first by x, y, z, intensity.
+    nearest to the mean of all offered there, of several the first by x, y, z, then by its attributes' ``numbers``
+    (n, k).
 
     ``seen`` holds -1 for each voter. ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a
     sum of whole micrometres.
@@ -125,14 +129,14 @@ def _represent(
                 support += 1
             i += 1
         if support >= min_votes and not taken[order[start]]:
-            out[found] = _nearest_to_mean(points, intensity, order, start, stop)
+            out[found] = _nearest_to_mean(points, numbers, order, start, stop)
             found += 1
         start = stop
     return found
 
 
 @inlined
-def _nearest_to_mean(points: F32, intensity: U8, order: I64, start: int, stop: int) -> int:
+def _nearest_to_mean(points: F32, numbers: U64, order: I64, start: int, stop: int) -> int:
     """Of the points ``order[start:stop]``, see :func:`_represent`."""
     x, y, z = np.int64(0), np.int64(0), np.int64(0)  # micrometres
     for k in range(start, stop):
@@ -145,17 +149,20 @@ def _nearest_to_mean(points: F32, intensity: U8, order: I64, start: int, stop: i
         i = order[k]
         dx, dy, dz = points[i, 0] - x / of, points[i, 1] - y / of, points[i, 2] - z / of
         distance = dx * dx + dy * dy + dz * dz
-        if distance < nearest or (distance == nearest and _before(points, intensity, i, best)):
+        if distance < nearest or (distance == nearest and _before(points, numbers, i, best)):
             best, nearest = i, distance
     return best
 
 
 @inlined
-def _before(points: F32, intensity: U8, one: int, other: int) -> bool:
+def _before(points: F32, numbers: U64, one: int, other: int) -> bool:
     for k in range(3):
         if points[one, k] != points[other, k]:
             return points[one, k] < points[other, k]
-    return intensity[one] < intensity[other]
+    for k in range(numbers.shape[1]):
+        if numbers[one, k] != numbers[other, k]:
+            return numbers[one, k] < numbers[other, k]
+    return False
 
 
 def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> tuple[U64 | None, EditVotes]:

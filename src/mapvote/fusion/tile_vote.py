@@ -17,6 +17,7 @@ from mapvote.codec.planes import Words, agreeing, mark, mark_among, mark_spoken,
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
+from mapvote.core.points import Fields, Values, joined
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, read_only
 
 DAY_NS = 86_400_000_000_000
@@ -49,12 +50,6 @@ class TileVote(Planes):
     def sent(self) -> U8 | None:
         """(256, 256) the states that were sent, whether they count or not; None in one stage."""
         return self.states if self.unrestricted is None else self.unrestricted
-
-    def measured(self) -> U8:
-        """(m,) the intensity of the new points; 0 where it was not measured."""
-        if self.intensity is not None:
-            return self.intensity
-        return np.zeros(0 if self.new_points is None else len(self.new_points), dtype=np.uint8)
 
     def supports(self, state: CellState, cells: NDArray[np.intp]) -> Bool:
         """(n,) at which of the flat ``cells`` this vote is, or in one stage also counts, for ``state``."""
@@ -200,12 +195,12 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     if any(drive.unrestricted is not None for drive in ordered):
         unrestricted = _laid_over([drive.sent for drive in ordered])
     points: list[F32] = []
-    intensity: list[U8] = []
+    fields: list[tuple[int, Fields]] = []
     for drive, mine in zip(ordered, last, strict=True):
         if drive.new_points is not None:
             here = mine[flat_cells(grid, drive.new_points)]
             points.append(drive.new_points[here])
-            intensity.append(drive.measured()[here])
+            fields.append((len(points[-1]), {name: values[here] for name, values in drive.fields.items()}))
     free = [drive.free.within(said) for drive, said in zip(ordered, spoken, strict=True) if drive.free is not None]
     return TileVote(
         vehicle=newest.vehicle,
@@ -216,7 +211,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         tally=tally,
         gone=union([_marked(drive, mine) for drive, mine in zip(ordered, last, strict=True)]),
         new_points=np.concatenate(points) if points else None,
-        intensity=np.concatenate(intensity) if any(drive.intensity is not None for drive in ordered) else None,
+        fields=joined(fields),
         free=union(free) if free else None,
         odds=folded(ordered, last),
     )
@@ -268,17 +263,18 @@ def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
     return [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
 
 
-def offered(votes: Sequence[TileVote], decided: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:
-    """(points (n, 3), intensity (n,), cells (n,), numbers of their votes (n,)) that ``votes`` offer for the cells
-    ``decided`` (256, 256) as changed-occupied for which they voted so too."""
-    found: list[tuple[F32, U8, I64, I32]] = [
-        (np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32))
-    ]
+def offered(votes: Sequence[TileVote], decided: U8, grid: Grid) -> tuple[F32, dict[str, Values], I64, I32]:
+    """(points (n, 3), their attributes (n,), cells (n,), numbers of their votes (n,)) that ``votes`` offer for the
+    cells ``decided`` (256, 256) as changed-occupied for which they voted so too."""
+    nothing = np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
+    found: list[tuple[F32, I64, I32]] = [nothing]
+    fields: list[tuple[int, Fields]] = []
     for number, vote in enumerate(votes):
         if vote.new_points is not None and len(vote.new_points):
             cells = flat_cells(grid, vote.new_points)
             keep = vote.agreed(cells, decided, CellState.CHANGED_OCCUPIED)
             whose = np.full(len(keep), number, dtype=np.int32)
-            found.append((vote.new_points.take(keep, axis=0), vote.measured()[keep], cells[keep], whose))
-    points, intensity, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return points, intensity, cells, voters
+            found.append((vote.new_points.take(keep, axis=0), cells[keep], whose))
+            fields.append((len(keep), {name: values[keep] for name, values in vote.fields.items()}))
+    points, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, joined(fields), cells, voters

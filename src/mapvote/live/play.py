@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse
+from mapvote.core.points import point_field
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.rosbag import Bag, is_rosbag
@@ -116,11 +117,11 @@ def _messages_of_drive(drive: Drive) -> Iterator[Message]:
 
 
 def cloud_message(scan: Scan, frame: str = LIDAR_FRAME) -> bytes:
-    """A PointCloud2 of a scan: x, y, z, and what it has of intensity (0 to 255), ring and time (seconds from the
-    stamp)."""
+    """A PointCloud2 of a scan: x, y, z, and what it has of attributes (scaled ones 0 to 255), ring and time (seconds
+    from the stamp)."""
     columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
-    if scan.intensity is not None:
-        columns["intensity"] = np.float32(255.0) * scan.intensity
+    for name, values in scan.fields.items():
+        columns[name] = np.float32(255.0) * values if point_field(name).scaled else values
     if scan.ring is not None:
         columns["ring"] = scan.ring
     if scan.time_s is not None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap
+from mapvote.core.points import Fields
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, PosePrior, Reference, Scan
@@ -132,8 +133,8 @@ class PlacedScan:
     """(n,) each point's cell in ``reference``, row * cols + col; -1 outside it."""
     by_first: bool = True
     """Whether the vehicle's first LiDAR took it, which the drive's sensor is."""
-    intensity: F32 | None = None
-    """(n,) in [0, 1]; None: the sensor does not measure it."""
+    fields: Fields = field(default_factory=dict)
+    """Attributes (n,) of the points that the sensor measures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,9 +251,9 @@ class Frontend:
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
         up_map = T_map_lidar[:3, 2]
-        by_first, intensity = scan.origin is None, scan.intensity
+        by_first = scan.origin is None
         return PlacedScan(
-            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, by_first, intensity
+            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, by_first, scan.fields
         )
 
     def _see(self, decided: list[Bool]) -> list[Observation]:

@@ -6,7 +6,7 @@ They are kept tile by tile, so that memory follows the road, not its length in s
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +17,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, cut_tiles
+from mapvote.core.points import Fields, Values, point_field
 from mapvote.core.rule import Rule
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, N_STATES, U8, U64, Bool
@@ -146,11 +147,11 @@ def _beyond(
 class NewPoints:
     """One point per 0.3 m voxel, the first one offered: candidates for changed-occupied cells."""
 
-    def __init__(self, lattice: Lattice, beyond: bool = True, *, intensity: bool = False) -> None:
+    def __init__(self, lattice: Lattice, beyond: bool = True, names: Sequence[str] = ()) -> None:
         """``beyond``: also take points outside the local grid. The paper takes none, and the filter of moving objects
-        does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``intensity``:
-        keep it with each point."""
-        self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
+        does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``names``:
+        attributes that are kept with each point."""
+        self.lattice, self.beyond, self.names = lattice, beyond, tuple(names)
         self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Slot]](list)
         """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
         self._last: F64 | None = None
@@ -167,8 +168,8 @@ class NewPoints:
             self._offer_of(scan, self._strange_beyond(scan))
 
     def _offer_of(self, scan: PlacedScan, chosen: I64) -> None:
-        intensity = None if scan.intensity is None or not self.intensity else scan.intensity[chosen]
-        self.offer(scan.points_map[chosen], intensity)
+        fields = {name: scan.fields[name][chosen] for name in self.names if name in scan.fields}
+        self.offer(scan.points_map[chosen], fields)
 
     def _strange_beyond(self, scan: PlacedScan) -> I64:
         """(m,) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
@@ -184,14 +185,13 @@ class NewPoints:
         )  # fmt: skip
         return found[:n].copy()
 
-    def offer(self, points_map: F64, intensity: F32 | None = None) -> None:
-        """Points (n, 3), map metres, and their intensity (n,); 0 where None."""
+    def offer(self, points_map: F64, fields: Fields | None = None) -> None:
+        """Points (n, 3), map metres, and those of their attributes (n,) that a scan has."""
         if len(points_map):
-            if self.intensity:
-                points_map = np.column_stack(
-                    [points_map, np.zeros(len(points_map)) if intensity is None else intensity]
-                )
-            self._waiting.append(points_map)
+            n, scanned = len(points_map), fields or {}
+            rows = {name: point_field(name) for name in self.names}
+            sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
+            self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
             self._count += len(points_map)
             if self._count > _COMPACT_AT:
                 self._compact()
@@ -209,17 +209,17 @@ class NewPoints:
         return [] if self._last is None else [self._last]
 
     def _run(self, place: Slot) -> F64:
-        return np.frombuffer(self._shelf.read(place)).reshape(-1, 4 if self.intensity else 3)
+        return np.frombuffer(self._shelf.read(place)).reshape(-1, 3 + len(self.names))
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
-        every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
+        every = np.concatenate([np.zeros((0, 3 + len(self.names))), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
         first = first_of_each(keys)
         return every[first[np.argsort(keys[first])]]
 
     def by_tile(self) -> Callable[[TileIndex], F64]:
-        """What gives the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 4) with their intensity. Those
-        of all tiles of a long drive are never held together."""
+        """What gives the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 3 + k) with the k
+        attributes of ``names`` as in ballots. Those of all tiles of a long drive are never held together."""
         rest = self._of_tiles(self._one_a_voxel([*self._short(), *self._waiting]))
 
         def of_tile(tile: TileIndex) -> F64:
@@ -232,11 +232,14 @@ class NewPoints:
         return {tile: points[mine] for tile, mine in cut_tiles(points, self.lattice)}
 
 
-def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32, U8 | None]:
-    """Those of ``points_map`` (n, 3 or 4) that lie in voxels of ``words`` (256, 256) of a tile: (m, 3) float32 from its
-    corner, and the intensity (m,) of those that came with one, 255 for 1.0."""
+def points_in(
+    window: Grid, points_map: F64, words: U64, base: I32, names: Sequence[str] = ()
+) -> tuple[F32, dict[str, Values]]:
+    """Those of ``points_map`` (n, 3 + k) that lie in voxels of ``words`` (256, 256) of a tile: (m, 3) float32 from its
+    corner, and their k attributes (m,) by ``names``, as in ballots."""
     rows, cols, _ = window.indices_of(points_map)
     cell = (rows * window.cols + cols).astype(np.int32)
     every = np.ones(len(points_map), np.bool_)
     kept = points_map[select(points_map, cell, every, ~every, words.ravel(), base.ravel())]
-    return window.from_map(kept[:, :3]), np.rint(kept[:, 3] * 255.0).astype(np.uint8) if kept.shape[1] == 4 else None
+    sent = {name: kept[:, 3 + k].astype(point_field(name).dtype) for k, name in enumerate(names)}
+    return window.from_map(kept[:, :3]), sent

@@ -67,8 +67,8 @@ def with_things(drive: Drive, things: Sequence[Thing], reference: F64) -> Drive:
         for k, thing in enumerate(things):
             met = keep & (ends_on == k)  # and not on what stands before it, whichever was put in first
             thing.met.append(transform(T, at[met]))
-        intensity = None if scan.intensity is None else scan.intensity[keep]
-        return replace(scan, points=points[keep], time_s=None, intensity=intensity)
+        fields = {name: values[keep] for name, values in scan.fields.items()}
+        return replace(scan, points=points[keep], time_s=None, fields=fields)
 
     return replace(drive, read_scan=read_scan)
 

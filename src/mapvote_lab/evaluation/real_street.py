@@ -290,7 +290,7 @@ def of_points(scan: Scan, keep: Bool) -> Scan:
         scan,
         points=scan.points[keep],
         time_s=None if scan.time_s is None else scan.time_s[keep],
-        intensity=None if scan.intensity is None else scan.intensity[keep],
+        fields={name: values[keep] for name, values in scan.fields.items()},
     )
 
 

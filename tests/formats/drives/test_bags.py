@@ -67,8 +67,7 @@ def test_a_ros2_bag_is_a_drive(tmp_path: Path, storage: StoragePlugin) -> None:
     for i in (0, 3, 1):  # in any order
         scan = drive.read_scan(i)
         assert np.array_equal(scan.points, cloud(i)[keep])
-        assert scan.intensity is not None
-        assert np.allclose(scan.intensity, 0.2)
+        assert np.allclose(scan.fields["intensity"], 0.2)
         assert scan.time_s is not None
         assert np.allclose(scan.time_s, np.arange(300)[keep] * 0.0003)
     assert drive.T_map_lidar_prior is not None

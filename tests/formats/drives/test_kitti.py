@@ -51,8 +51,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     for i, scan in enumerate(drive):
         assert np.array_equal(scan.points, cloud(i)[np.linalg.norm(cloud(i), axis=1) >= 0.9])
         assert scan.time_s is None
-        assert scan.intensity is not None
-        assert set(scan.intensity) == {0.5}
+        assert set(scan.fields["intensity"]) == {0.5}
     assert drive.T_map_lidar_prior is not None
     assert np.array_equal(drive.T_map_lidar_prior, along_x(6))
 

@@ -160,8 +160,7 @@ def test_a_wrong_time_is_dropped_with_its_point_and_counted(
     assert np.array_equal(scan.points, POINTS[good])
     assert scan.time_s is not None
     assert np.allclose(scan.time_s, TIMES[good], atol=1e-6)
-    assert scan.intensity is not None
-    assert np.allclose(scan.intensity, good / 1e5, atol=1e-6)
+    assert np.allclose(scan.fields["intensity"], good / 1e5, atol=1e-6)
     assert "dropped 2 points that hold no time of their scan" in caplog.text
     values[: len(values) // 10] = value
     with pytest.raises(MapvoteError, match=r"points hold no time of this scan in the field t, more than 5%"):

@@ -61,7 +61,7 @@ def test_fields_survive_an_edit_for_every_point_that_stays(tmp_path: Path) -> No
     edited, gone = delete_points(tile, np.full((256, 256), 2**64 - 1, dtype=np.uint64))
     new = np.array([[5.0, 5.0, 40.0]], dtype=np.float32)
     cells = flat_cells(edited.window, new)
-    bright = np.array([51], dtype=np.uint8)
+    bright = {"intensity": np.array([51], dtype=np.uint8)}
     edited, came = add_points(edited, new, bright, cells, np.zeros(1, dtype=np.int32), 1)
     assert gone > 0
     assert came == 1

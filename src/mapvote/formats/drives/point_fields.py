@@ -1,4 +1,4 @@
-"""Points with named fields (scan files, PCD, PointCloud2) as a Scan: positions, intensity, ring, time of each point.
+"""Points with named fields (scan files, PCD, PointCloud2) as a Scan: positions, attributes, ring, time of each point.
 
 Points that are no measurements are dropped, counted and reported.
 """
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.brightness import unit_intensity
 from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
+from mapvote.core.points import Values, point_fields
 from mapvote.core.sensors import UPRIGHT, Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
 from mapvote.formats.drives.point_times import (
@@ -94,7 +94,6 @@ class PointReader:
         points = xyz_view(where, table).astype(np.float32, copy=False)
         names = table.dtype.names or ()
         spelled = {plain(name): name for name in reversed(names)}
-        intensity = known_fields(names).get("intensity", spelled.get("i"))
         ring = next((spelled[name] for name in _RINGS if name in spelled), None)
         # Points that are measurements.
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
@@ -125,7 +124,7 @@ class PointReader:
             stamp_ns=stamp_ns,
             points=xyz,
             time_s=time_s,
-            intensity=None if intensity is None else unit_intensity(table[intensity][keep]),
+            fields=_attributes(where, table, keep),
             ring=None if ring is None else _ring(table[ring][keep]),
             times=told,
         )
@@ -206,6 +205,23 @@ class PointReader:
                 f"sensor turns (rate_hz in drive.toml), for scans may have been left out"
             )
         return rate_hz
+
+
+def _attributes(where: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:
+    """The attributes of the kept points that the table (n,) has. MapvoteError if one holds what it cannot be."""
+    names = table.dtype.names or ()
+    known, spelled = known_fields(names), {plain(name): name for name in reversed(names)}
+    attributes = {}
+    for name, row in point_fields().items():
+        column = next((spelled[other] for other in (plain(name), *row.spellings) if other in spelled), None)
+        column = known.get(name, column)
+        if column is None:
+            continue
+        try:
+            attributes[name] = row.in_scan(table[column][keep])
+        except MapvoteError as error:
+            raise MapvoteError(f"{where}: field {column}: {error}") from error
+    return attributes
 
 
 def _ring(values: NDArray[np.number]) -> U16:
@@ -353,7 +369,7 @@ def stamp_of(message: Any) -> int:
 def scan_from_point_cloud2(message: Any, sensor: Sensor, reader: PointReader | None = None) -> Scan:
     """A live sensor_msgs/PointCloud2 as a Scan: of rclpy, rosbags, or any object with its fields.
 
-    Its stamp is the message's; a field of times makes it be de-skewed, ``intensity`` and ``ring`` are kept. ``reader``:
+    Its stamp is the message's; a field of times makes it be de-skewed, attributes and ``ring`` are kept. ``reader``:
     of the LiDAR, with what is stated of its times. MapvoteError if the message is cut off, has no x, y, z, or holds no
     usable point.
     """
