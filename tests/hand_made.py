@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
 from mapvote.codec.ballot import Ballot, BallotTile, check_path, pack_odds, pack_points, tile_key, unpack_planes
-from mapvote.codec.planes import Words, mark, nothing_reached, pack_plane, pack_words
+from mapvote.codec.fields import pack_fields
+from mapvote.codec.planes import Words, compress, mark, nothing_reached, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.points import Fields
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, PosePrior, Scan
@@ -89,7 +91,7 @@ class Say:
     gone: U64 | None = None
     new_points: F32 | None = None
     free: U64 | None = None
-    intensity: U8 | None = None
+    fields: Fields | None = None
     odds: I8 | None = None
 
     def packed(self, tile: TileIndex) -> BallotTile:
@@ -100,7 +102,7 @@ class Say:
             gone=None if self.gone is None else pack_words(self.gone),
             new_points=None if self.new_points is None else pack_points(self.new_points),
             free=None if self.free is None else pack_words(self.free),
-            intensity=None if self.intensity is None else pack_plane(self.intensity, 1),
+            fields=compress(pack_fields(self.fields), 1) if self.fields else None,
             odds=None if self.odds is None else pack_odds(self.odds),
         )
 

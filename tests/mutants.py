@@ -95,7 +95,7 @@ def _plane(data: bytes, rng: random.Random) -> bytes:
     """One plane of one tile replaced: wrong size, wrong content, a bomb, points that are no points."""
     ballot = msgspec.msgpack.decode(data)
     tile = rng.choice(ballot["tiles"])
-    name = rng.choice(("states", "tally", "gone", "new_points", "intensity", "free"))
+    name = rng.choice(("states", "tally", "gone", "new_points", "fields", "free"))
     raw = [
         bytes(rng.randrange(1 << 17)),
         np.full(256 * 256, rng.randrange(5, 255), dtype=np.uint8).tobytes(),

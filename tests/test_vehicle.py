@@ -155,7 +155,7 @@ def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type |
         vehicle.observe(replace(scan, fields={"intensity": bright}), pose)
     vehicle.finish()
     ballot = decode(encode(vehicle.ballot()))
-    offers = [unpack_offer(tile.new_points, tile.intensity) for tile in ballot.tiles if tile.new_points is not None]
+    offers = [unpack_offer(tile.new_points, tile.fields) for tile in ballot.tiles if tile.new_points is not None]
     if kind is None:
         assert all(fields == {} for _, fields in offers)
         return

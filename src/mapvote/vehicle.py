@@ -18,7 +18,8 @@ from mapvote.codec.ballot import (
     pack_points,
     tile_key,
 )
-from mapvote.codec.planes import pack_plane, pack_words
+from mapvote.codec.fields import pack_fields
+from mapvote.codec.planes import compress, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
@@ -263,7 +264,7 @@ def _ballot_tile(
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
         gone=None if votes.gone is None else pack_words(votes.gone),
         new_points=pack_points(kept) if len(kept) else None,
-        intensity=pack_plane(measured["intensity"]) if "intensity" in measured else None,
+        fields=compress(pack_fields(measured)) if measured else None,
         free=None if votes.free is None else pack_words(votes.free),
         odds=odds,
     )

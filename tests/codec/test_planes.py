@@ -30,6 +30,7 @@ from mapvote.codec.ballot import (
     unpack_states,
     unpack_sureness,
 )
+from mapvote.codec.fields import pack_fields
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import (
     Words,
@@ -277,18 +278,31 @@ def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: i
 @given(st.lists(st.integers(0, 255), max_size=64))
 def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
     points, bright = np.repeat(POINTS[:1], len(values), axis=0), np.array(values, dtype=np.uint8)
-    sent = make_ballot(two_walls(), {(0, 0): Say(states_plane(), new_points=points, intensity=bright)})
+    sent = make_ballot(two_walls(), {(0, 0): Say(states_plane(), new_points=points, fields={"intensity": bright})})
     (got,) = unpack_all(decode(encode(sent)))
     assert got.new_points is not None
     assert got.new_points.tobytes() == points.tobytes()
     assert got.fields["intensity"].tolist() == values
 
 
-def test_a_ballot_without_intensity_has_none_and_every_point_must_have_one() -> None:
-    points, two = pack_points(POINTS), pack_plane(np.zeros(2, np.uint8))
+def attributes(**fields: np.ndarray) -> bytes:
+    return compress(pack_fields(fields))
+
+
+def test_a_ballot_without_attributes_has_none_and_every_point_must_have_them() -> None:
+    points, two = pack_points(POINTS), attributes(intensity=np.zeros(2, np.uint8))
     assert unpack_offer(points, None)[1] == {}
-    for offered, why in ((points, "2 bytes, expected 3"), (None, "none of those")):
+    for offered, why in ((points, "2 bytes, but there are 3 points"), (None, "none of those")):
         with pytest.raises(MapvoteError, match=why):
             unpack_offer(offered, two)
+    wrong = {
+        "type uint16, not uint8": attributes(intensity=np.zeros(3, "<u2")),
+        "'heat' is unknown; known are intensity": attributes(heat=np.zeros(3, "u1")),
+        "fields is larger than": attributes(**{str(k): np.zeros(3) for k in range(500)}),
+        "no fields of points": compress(b"bright"),
+    }
+    for why, sent in wrong.items():
+        with pytest.raises(MapvoteError, match=why):
+            unpack_offer(points, sent)
     with pytest.raises(MapvoteError, match="no states"):
         unpack_sureness(pack_odds(np.zeros(2, np.int8)), None)

@@ -15,10 +15,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.codec.fields import unpack_fields
 from mapvote.codec.planes import Words, compress, pack_plane, unpack_bytes, unpack_plane, unpack_sparse
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.points import Fields, Values
+from mapvote.core.points import Fields, Values, point_field
 from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, Bool, CellState, MapvoteError
 
 FORMAT_VERSION = 1
@@ -45,8 +46,9 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     """(256, 256) column words: which voxels of a changed-empty cell are gone (delete mask)."""
     new_points: bytes | None = None
     """(m, 3) from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
-    intensity: bytes | None = None
-    """(m,) uint8 of each of them, 255 for 1.0; None: the map holds no intensity, or the sensor measures none."""
+    fields: bytes | None = None
+    """Their attributes (m,), see :func:`mapvote.codec.fields.pack_fields`: those that the map has and the sensor
+    measures; None: there are none."""
     free: bytes | None = None
     """(256, 256) column words: voxels that this drive's rays passed through."""
     odds: bytes | None = None
@@ -206,7 +208,7 @@ class Planes:
 def unpack_planes(packed: BallotTile) -> Planes:
     """The votes on one tile, of a ballot or of a server's row with its planes; MapvoteError if a plane is damaged or
     impossible."""
-    new_points, fields = unpack_offer(packed.new_points, packed.intensity)
+    new_points, fields = unpack_offer(packed.new_points, packed.fields)
     states = None if packed.states is None else unpack_states(packed.states)
     return Planes(
         states=states,
@@ -232,15 +234,26 @@ def unpack_tally(data: bytes) -> U16:
     return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
 
 
-def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, dict[str, Values]]:
+MAX_ATTRIBUTE_BYTES = 16
+"""Of all attributes of a new point together."""
+
+
+def unpack_offer(new_points: bytes | None, fields: bytes | None) -> tuple[F32 | None, dict[str, Values]]:
     """The new points (m, 3) of a tile and their attributes (m,), of their planes; MapvoteError as
-    :func:`unpack_points`, and if there is not one for each."""
+    :func:`unpack_points`, if an attribute is unknown, or if it is not of each point."""
     points = None if new_points is None else unpack_points(new_points)
-    if intensity is None:
+    if fields is None:
         return points, {}
     if points is None:
-        raise MapvoteError("ballot: a tile has the intensity of new points, but none of those")
-    return points, {"intensity": unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")}
+        raise MapvoteError("ballot: a tile has fields of new points, but none of those")
+    raw = unpack_bytes(fields, 4096 + MAX_ATTRIBUTE_BYTES * len(points), "ballot: fields")
+    sent = unpack_fields(raw, len(points), "ballot: fields")
+    for name, values in sent.items():
+        if values.dtype != np.dtype(point_field(name).dtype):
+            raise MapvoteError(f"ballot: {name} of type {values.dtype}, not {np.dtype(point_field(name).dtype)}")
+        if not np.isfinite(values).all():
+            raise MapvoteError(f"ballot: {name} holds a number that is not finite")
+    return points, sent
 
 
 def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:

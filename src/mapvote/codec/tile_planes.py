@@ -7,11 +7,11 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.fields import decode_fields, pack_fields, unpack_fields
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
@@ -114,7 +114,7 @@ def unpack_fields_plane(data: bytes, digest: str, n: int) -> dict[str, NDArray[A
 
 def names_in_plane(data: bytes, digest: str) -> list[str]:
     """The content of a plane of fields."""
-    return list(_decoded(check_plane(data, digest), f"tile plane {digest[:12]}"))
+    return list(decode_fields(check_plane(data, digest), f"tile plane {digest[:12]}"))
 
 
 def check_plane(data: bytes, digest: str) -> bytes:
@@ -151,39 +151,6 @@ def unpack_memory_plane(data: bytes, digest: str) -> Memory:
     if rest or (n and cells[-1] >= CELLS):
         raise _wrong_size(len(raw), digest)
     return Memory(cells, np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n))
-
-
-# Fields: what points carry besides their place, columns of numbers by their names.
-
-FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
-
-_FIELDS = msgspec.msgpack.Decoder(dict[str, tuple[str, bytes]])
-
-
-def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
-    """Columns (n,) as a msgpack map of name to (type, little-endian values), in their order: equal fields, equal
-    bytes."""
-    columns = {name: (c.dtype.newbyteorder("<").str, c) for name, c in fields.items()}
-    return msgspec.msgpack.encode({name: (kind, raw_plane(c, kind)) for name, (kind, c) in columns.items()})
-
-
-def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
-    """The inverse, of ``n`` points; MapvoteError, by the name of ``what``, if it is damaged or not of so many."""
-    fields = {}
-    for name, (kind, values) in _decoded(raw, what).items():
-        if kind not in FIELD_TYPES:
-            raise MapvoteError(f"{what}: {name}: of type {kind[:20]!r}, which no field has; fetch it again")
-        if len(values) != n * np.dtype(kind).itemsize:
-            raise MapvoteError(f"{what}: {name} has {len(values)} bytes, but there are {n} points; fetch it again")
-        fields[name] = np.frombuffer(values, dtype=kind)
-    return fields
-
-
-def _decoded(raw: bytes, what: str) -> dict[str, tuple[str, bytes]]:
-    try:
-        return _FIELDS.decode(raw)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MapvoteError(f"{what}: no fields of points ({error}); fetch it again") from error
 
 
 def pack_cells(cells: Bool) -> bytes:

@@ -106,7 +106,9 @@ def point_field(name: str) -> Field:
     row = point_fields().get(name)
     if row is None:
         mend = "install the distribution that brings it"
-        raise MapvoteError(f"point attribute {name!r} is unknown; known are {', '.join(point_fields())}; or {mend}")
+        raise MapvoteError(
+            f"point attribute {name[:64]!r} is unknown; known are {', '.join(point_fields())}; or {mend}"
+        )
     return row
 
 

@@ -21,7 +21,7 @@ metadata = sa.MetaData(
 _Hash = sa.String(64)
 TILE_PLANES = "points", "ground", "free", "memory", "fields"
 """Columns of version_tiles: hashes of planes."""
-BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "intensity", "odds"
+BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "fields", "odds"
 """Columns of ballot_tiles that hold planes."""
 
 maps = sa.Table(

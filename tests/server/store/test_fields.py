@@ -20,7 +20,8 @@ from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, pack_points, unpack_points
-from mapvote.codec.tile_planes import FIELD_TYPES, pack_fields, pack_tile, unpack_fields
+from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import LazyTiles, PointMap, all_fields, all_points, map_from_points
 from mapvote.core.tile import Tile
@@ -62,7 +63,7 @@ def ballots(point_map: PointMap, vehicles: str = "ab") -> list[Ballot]:
     cells = np.unique(tile.cells[tile.columns[1]])[::2]
     states = states_plane({(200, 200): CellState.CHANGED_OCCUPIED})
     states.reshape(-1)[cells] = CellState.CHANGED_EMPTY
-    say = Say(states, new_points=BUILT, intensity=BRIGHT)
+    say = Say(states, new_points=BUILT, fields={"intensity": BRIGHT})
     return [make_ballot(point_map, {(0, 0): say}, vehicle) for vehicle in vehicles]
 
 
@@ -149,7 +150,7 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
     assert publish(store).published
     t = schema.ballot_tiles
     with store.database.writing() as connection:
-        connection.execute(t.update().values(intensity=None))
+        connection.execute(t.update().values(fields=None))
     assert {damage.kind for damage in check(store)} == {"ballot"}, "what a ballot said of it is covered too"
 
 
@@ -164,13 +165,13 @@ def test_packed_fields_come_back_in_their_type_and_order(data: st.DataObject) ->
     assert list(back) == names
     assert all(back[name].dtype == c.dtype and back[name].tobytes() == c.tobytes() for name, c in fields.items())
     if fields:
-        with pytest.raises(MapvoteError, match="points; fetch it again"):
+        with pytest.raises(MapvoteError, match="points; fetch or send it again"):
             unpack_fields(pack_fields(fields), n + 1, "tile")
 
 
 @pytest.mark.parametrize("damaged", [b"", b"\x81", pack_fields({"a": np.zeros(2, "S3")}), b"\xc0"])
 def test_what_holds_no_fields_is_one_clear_error(damaged: bytes) -> None:
-    with pytest.raises(MapvoteError, match="fetch it again"):
+    with pytest.raises(MapvoteError, match="fetch or send it again"):
         unpack_fields(damaged, 2, "tile")
 
 

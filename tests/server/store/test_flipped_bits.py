@@ -56,7 +56,7 @@ def damageable(url: str) -> None:
             built = (50, 50 + step)
             states = {cell: CellState.CHANGED_EMPTY, built: CellState.CHANGED_OCCUPIED}
             say = Say(states_plane(states, fill=CellState.UNDETERMINED), new_points=wall([built], [0.45, 0.75]))
-            say.intensity = np.array([51, 204], dtype=np.uint8)
+            say.fields = {"intensity": np.array([51, 204], dtype=np.uint8)}
             send(store, make_ballot(base, dict.fromkeys(TILES, say), vehicle, f"d{step}", store.clock() - 10**9))
         if step < 2:
             assert publish(store).published
