@@ -8,23 +8,30 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx2
+import laspy
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from command_line import typed
+from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.codec.ballot import Ballot, encode
-from mapvote.config import Settings, choose_case
+from mapvote.config import FuseSettings, Settings, choose_case
 from mapvote.core import rule
-from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.types import MapvoteError
+from mapvote.core.geometry import from_xyz_rpy, transform
+from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.points import point_fields
+from mapvote.core.types import F64, CellState, Drive, MapvoteError
+from mapvote.formats import DriveWriter, export_map, open_drive
 from mapvote.fusion.fuse import update_map
 from mapvote.matching.localiser import GivenPoses
 from mapvote.matching.matcher import map_around
 from mapvote.vehicle import vote_drive
 from mapvote_server.api.app import URL, in_process
-from stores import NewStore
+from mapvote_server.store.admission import examine
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from stores import NewStore, send
 from streets import drive_along, path, street
 
 PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text()
@@ -35,22 +42,25 @@ Install = Callable[[str], None]
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Lays an example of the page as an installed distribution."""
     own = list(rule.RULES)
+    caches = rule.plugged_in, point_fields
 
     def lay(module: str) -> None:
         (source,) = re.findall(rf"^```python\n(# {module}\.py\n.*?)^```", PAGE, re.M | re.S)
-        entries = re.findall(rf'^```toml\n\[project\.entry-points\."([^"]+)"\]\n{module} = "([^"]+)"\n```', PAGE, re.M)
-        ((group, target),) = entries
+        entry = rf'^```toml\n\[project\.entry-points\."([^"]+)"\]\n(\w+) = "({module}:[^"]+)"\n```'
+        ((group, name, target),) = re.findall(entry, PAGE, re.M)
         folder = tmp_path / "site"
         about = folder / f"{module}-1.0.dist-info"
         about.mkdir(parents=True)
         (folder / f"{module}.py").write_text(source)
         (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
-        (about / "entry_points.txt").write_text(f"[{group}]\n{module} = {target}\n")
+        (about / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
         monkeypatch.syspath_prepend(folder)
-        rule.plugged_in.cache_clear()
+        for cached in caches:
+            cached.cache_clear()
 
     yield lay
-    rule.plugged_in.cache_clear()
+    for cached in caches:
+        cached.cache_clear()
     for name in [name for name in rule.RULES if name not in own]:
         del rule.RULES[name]
         sys.modules.pop(name, None)
@@ -95,6 +105,48 @@ def test_a_rule_of_another_distribution_casts_ballots_that_fuse_and_that_a_serve
         refused = client.put(f"/v1/ballots/{other.vehicle}/other", content=encode(other))
         assert refused.status_code == 409
         assert "uses method surfaces, two-stage; the current round accepts only any_hit, two-stage" in refused.text
+
+
+def classed_drive(poses: F64, seed: int, folder: Path) -> Drive:
+    """A drive from files of x, y, z and class: 6 (building) above 0.3 m, 2 (ground) below."""
+    drive = drive_along(poses, seed, prior=poses)
+    writer = DriveWriter(folder, f"car_{seed}", drive.sensor, start_ns=0, motion_compensated=True).open()
+    for i, scan in enumerate(drive):
+        height_m = transform(poses[i], scan.points)[:, 2]
+        writer.write_scan(i, scan.points, np.where(height_m > 0.3, np.float32(6), np.float32(2)))
+    writer.close(drive.stamps_ns, poses)
+    return open_drive(folder, columns="x,y,z,class")
+
+
+def test_an_attribute_of_another_distribution_goes_from_a_drive_over_a_server_to_a_las_file(
+    install: Install, old_map: PointMap, new_store: NewStore, tmp_path: Path
+) -> None:
+    points = all_points(old_map)
+    classed = map_from_points(points, fields={"classification": np.where(points[:, 2] > 0.3, 5, 2).astype(np.uint8)})
+    poses = path(8)
+    drives = [classed_drive(poses, seed, tmp_path / f"drive_{seed}") for seed in (3, 4)]
+    settings = Settings()
+    without = vote_drive(drives[0], classed, settings, localise=GivenPoses(drives[0].stamps_ns, poses))[0]
+    assert all(tile.fields is None for tile in without.tiles), "nobody brings the attribute"
+    install("point_class")
+    ballots = [vote_drive(drive, classed, settings, localise=GivenPoses(drive.stamps_ns, poses))[0] for drive in drives]
+    store = new_store(classed, Policy(fuse=FuseSettings(min_votes=2, max_deleted_share=1.0)), name="fleet.db")
+    send(store, *ballots)
+    assert publish(store).added > 100, "the new house comes in"
+    export_map(store.point_map(), tmp_path / "out.las")
+    written = laspy.read(tmp_path / "out.las")
+    classes = np.asarray(written.classification)
+    assert set(classes.tolist()) == {2, 5, 6}
+    assert (classes == 6).sum() > 100
+    assert (np.asarray(written.z)[classes == 6] > 0.3).all()
+
+
+def test_a_server_refuses_an_attribute_that_no_distribution_brings(old_map: PointMap) -> None:
+    cell = {(100, 100): CellState.CHANGED_OCCUPIED}
+    fields = {"classification": np.array([6, 6], np.uint8)}
+    says = {(0, 0): Say(states_plane(cell), new_points=wall(list(cell), [0.45, 0.75]), fields=fields)}
+    with pytest.raises(MapvoteError, match="'classification' is unknown; known are intensity; or install"):
+        examine(encode(make_ballot(old_map, says)))
 
 
 def test_a_matcher_of_another_distribution_localises_a_drive(install: Install) -> None:

@@ -25,7 +25,7 @@ from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.mount import Mount, mount_of_prior
 from mapvote.core.point_map import PointMap
-from mapvote.core.points import Values, among, point_field
+from mapvote.core.points import Values, attributes_among, point_field
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
@@ -81,7 +81,7 @@ class Vehicle:
         self._new_points = NewPoints(
             self.point_map.lattice,
             beyond=self._rule.takes_points_beyond,
-            names=among(self.point_map.field_names),
+            names=attributes_among(self.point_map.field_names),
         )
 
     @property

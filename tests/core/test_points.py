@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from random import Random
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.points import FIELDS, Field, as_numbers, joined, point_field
+from mapvote.core import points
+from mapvote.core.points import FIELDS, Field, as_numbers, joined_fields, merged_values, point_field
 from mapvote.core.types import MapvoteError
 
 CLASS = Field("|u1", spellings=("class",))
@@ -48,12 +52,32 @@ def test_an_intensity_that_is_no_share_is_refused(values: np.ndarray) -> None:
 
 def test_clouds_of_which_one_lacks_an_attribute_are_joined_with_unmeasured_values() -> None:
     bright = np.array([7, 8], np.uint8)
-    assert joined([(3, {}), (2, {"intensity": bright})])["intensity"].tolist() == [0, 0, 0, 7, 8]
-    assert joined([(3, {})]) == {}
+    assert joined_fields([(3, {}), (2, {"intensity": bright})])["intensity"].tolist() == [0, 0, 0, 7, 8]
+    assert joined_fields([(3, {})]) == {}
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 3)), min_size=1, max_size=40), st.randoms())
+def test_the_class_of_a_voxel_is_the_one_that_most_vehicles_measured(
+    offers: list[tuple[int, int]], rng: Random
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        row = Field("|u1", merged="plurality")
+        patch.setattr(points, "point_fields", lambda: {"classification": row, **FIELDS})
+        voxel, value = np.array(offers).T.astype(np.int64)
+        first = np.unique(voxel, return_index=True)[1]
+        merged = merged_values("classification", value.astype(np.uint8), voxel, first)
+        for v, got in zip(voxel[first].tolist(), merged.tolist(), strict=True):
+            votes = Counter(c for w, c in offers if w == v and c != 0)
+            assert got == min(votes, key=lambda c: (-votes[c], c), default=0)
+        # In another order the points say the same.
+        order = np.array(rng.sample(range(len(offers)), len(offers)))
+        first = np.unique(voxel[order], return_index=True)[1]
+        again = merged_values("classification", value[order].astype(np.uint8), voxel[order], first)
+        assert again.tolist() == merged.tolist()
 
 
 def test_equal_numbers_are_equal_values_of_any_type() -> None:
-    fields = {"a": np.array([1, 1, 2], np.uint8), "b": np.array([0.5, 0.5, -1.0], np.float32)}
+    fields: dict[str, np.ndarray] = {"a": np.array([1, 1, 2], np.uint8), "b": np.array([0.5, 0.5, -1.0], np.float32)}
     numbers = as_numbers(fields, 3)
     assert numbers.shape == (3, 2)
     assert (numbers[0] == numbers[1]).all()

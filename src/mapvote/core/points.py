@@ -11,13 +11,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import from_counts, unit_intensity
-from mapvote.core.types import U64, MapvoteError
+from mapvote.core.types import I64, U64, MapvoteError
 
 Values = NDArray[Any]
 """(n,) of one attribute."""
@@ -39,6 +39,9 @@ class Field:
     """Other names of its column in scans: lower case, without underscores and blanks."""
     unmeasured: float = 0
     """Value for points of which it was not measured."""
+    merged: Literal["nearest", "plurality"] = "nearest"
+    """Fusion: of all points that vehicles offer for a voxel the map takes the one nearest to their mean, with its own
+    value (nearest), or with the value that most of them measured, of several the smallest (plurality)."""
 
     @property
     def full(self) -> float:
@@ -112,9 +115,29 @@ def point_field(name: str) -> Field:
     return row
 
 
-def among(names: Collection[str]) -> list[str]:
+def attributes_among(names: Collection[str]) -> list[str]:
     """Those of the attributes whose names are given, in the order of the table."""
     return [name for name in point_fields() if name in names]
+
+
+def merged_values(name: str, values: Values, voxels: I64, chosen: I64) -> Values:
+    """The values (k,) of the attribute ``name`` for the points ``chosen`` (k,), by what all points (n,) offer for their
+    ``voxels`` (n,). The order of the points makes no difference."""
+    row = point_field(name)
+    if row.merged == "nearest":
+        return values[chosen]
+    # Every pair of a voxel and a value that was measured there, and how many points have it.
+    measured = np.flatnonzero(values != row.unmeasured)
+    kinds, kind = np.unique(values[measured], return_inverse=True)
+    pairs, counts = np.unique(np.column_stack([voxels[measured], kind]), axis=0, return_counts=True)
+    # The most frequent one of each voxel, of several the smallest.
+    best = np.lexsort((pairs[:, 1], -counts, pairs[:, 0]))
+    of_voxel, first = np.unique(pairs[best, 0], return_index=True)
+    merged = row.unknown(len(chosen))
+    known = np.isin(voxels[chosen], of_voxel)
+    place = np.searchsorted(of_voxel, voxels[chosen][known])
+    merged[known] = kinds[pairs[best[first[place]], 1]]
+    return merged
 
 
 def as_numbers(fields: Fields, n: int) -> U64:
@@ -125,10 +148,10 @@ def as_numbers(fields: Fields, n: int) -> U64:
     return numbers
 
 
-def joined(parts: Sequence[tuple[int, Fields]]) -> dict[str, Values]:
+def joined_fields(parts: Sequence[tuple[int, Fields]]) -> dict[str, Values]:
     """The attributes of several clouds as one: of each how many points it has, and its attributes. Points of a cloud
     without an attribute that another has get its ``unmeasured`` value."""
-    names = among({name for _, fields in parts for name in fields})
+    names = attributes_among({name for _, fields in parts for name in fields})
     return {
         name: np.concatenate([fields[name] if name in fields else point_field(name).unknown(n) for n, fields in parts])
         for name in names

@@ -18,7 +18,7 @@ from mapvote.codec.planes import Words, bits_of, counted, nothing_reached, words
 from mapvote.core.columns import EVERY_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.points import Fields, as_numbers
+from mapvote.core.points import Fields, as_numbers, merged_values
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
@@ -90,8 +90,8 @@ def add_points(tile: Tile, points: F32, fields: Fields, cells: I64, voters: I32,
     chosen = chosen[:n]
     if not len(chosen):
         return tile, 0
-    sent = {name: values[chosen] for name, values in fields.items()}
-    return tile.with_new(points[chosen], sent), len(chosen)
+    merged = {name: merged_values(name, values, voxels, chosen) for name, values in fields.items()}
+    return tile.with_new(points[chosen], merged), len(chosen)
 
 
 def _voxels(cells: I64, points: F32) -> I64:

@@ -17,7 +17,7 @@ from mapvote.codec.planes import Words, agreeing, mark, mark_among, mark_spoken,
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.points import Fields, Values, joined
+from mapvote.core.points import Fields, Values, joined_fields
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, read_only
 
 DAY_NS = 86_400_000_000_000
@@ -211,7 +211,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         tally=tally,
         gone=union([_marked(drive, mine) for drive, mine in zip(ordered, last, strict=True)]),
         new_points=np.concatenate(points) if points else None,
-        fields=joined(fields),
+        fields=joined_fields(fields),
         free=union(free) if free else None,
         odds=folded(ordered, last),
     )
@@ -277,4 +277,4 @@ def offered(votes: Sequence[TileVote], decided: U8, grid: Grid) -> tuple[F32, di
             found.append((vote.new_points.take(keep, axis=0), cells[keep], whose))
             fields.append((len(keep), {name: values[keep] for name, values in vote.fields.items()}))
     points, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return points, joined(fields), cells, voters
+    return points, joined_fields(fields), cells, voters
