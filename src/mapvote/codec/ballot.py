@@ -114,6 +114,11 @@ def encode(ballot: Ballot) -> bytes:
     return msgspec.msgpack.encode(ballot)
 
 
+def is_ballot(data: bytes) -> bool:
+    """Whether bytes begin as a ballot does, with a map of msgpack: they may be damaged behind that."""
+    return bool(data) and (0x80 <= data[0] <= 0x8F or data[0] in (0xDE, 0xDF))
+
+
 def decode(data: bytes) -> Ballot:
     """Check the envelope; planes are checked when they are unpacked. MapvoteError if unusable."""
     try:

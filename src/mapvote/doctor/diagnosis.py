@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.codec.ballot import decode, unpack_states
+from mapvote.codec.ballot import decode, is_ballot, unpack_states
 from mapvote.core.mount import mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
@@ -88,7 +88,7 @@ def diagnose(
             found = in_order([*found, *check_cloud_on_map(point_map, cloud)])
         return Diagnosis(found)
     layout = drive_format(path)
-    if path.is_file() and layout is None:
+    if path.is_file() and layout is None and (path.suffix == ".ballot" or is_ballot(path.read_bytes())):
         return Diagnosis(list(check_ballot(path.read_bytes())))
     options = options or {}
     drive, unopened = _opened(path, options, point_map)
@@ -112,12 +112,33 @@ def _opened(path: Path, options: Mapping[str, Any], point_map: PointMap | None) 
     """(the drive as `vote` opens it, what stopped it from opening so): neither a broken prior nor points whose times
     cannot be told hide anything else."""
     found: list[Finding] = []
-    for without in ({}, {"prior": "none"}, {"motion_compensated": True}, {"prior": "none", "motion_compensated": True}):
+    unread: Drive | None = None
+    for without in ({}, {"motion_compensated": True}, {"prior": "none"}, {"prior": "none", "motion_compensated": True}):
         try:
-            return open_drive_on(point_map, path, **{**options, **without}), found
+            drive = open_drive_on(point_map, path, **{**options, **without})
         except MapvoteError as error:
             found = found or [Finding("error", str(error))]
-    return None, found
+            continue
+        refusal = _refusal_of_all(drive)
+        if not refusal:
+            return drive, found
+        unread = unread or drive
+        found = found or [Finding("error", refusal)]
+    # Scans that cannot be read in any way are told one by one.
+    return unread, found if unread is None else [f for f in found if f.what != _refusal_of_all(unread)]
+
+
+def _refusal_of_all(drive: Drive) -> str:
+    """Why the first, the middle and the last scan cannot be read; "" if one of them can."""
+    refusal = ""
+    for i in (0, len(drive) // 2, len(drive) - 1):
+        try:
+            drive.read_scan(i)
+        except MapvoteError as error:
+            refusal = refusal or str(error)
+        else:
+            return ""
+    return refusal
 
 
 def _with_map(

@@ -29,7 +29,7 @@ from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.las import beside_its_box
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.marked_points import MarkedPoints
-from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of
+from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of, on_earth
 from mapvote.survey.clean_map import lone_points
 
 _SOME, _NEAR = 400_000, 100_000
@@ -226,7 +226,7 @@ def _check_box(path: Path, points: NDArray[np.floating]) -> Iterator[Finding]:
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
     """The same of points as a file has them, of which no map has been made yet. MapvoteError if their coordinates
     cannot be made metres."""
-    finite = np.isfinite(cloud.points).all(axis=1)
+    finite = on_earth(cloud.points)
     n, bad, found = len(finite), int((~finite).sum()), []
     if bad:
         what = f"{bad} of {n} points are not finite"

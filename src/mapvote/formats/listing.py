@@ -27,13 +27,15 @@ def entry(folder: Path, name: str) -> Path:
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:
-    """The files that match ``pattern`` ("*.pcd", "lidar/*.bin") below ``folder``, by name; hidden files are none."""
+    """The files that match ``pattern`` ("*.pcd", "lidar/*.bin") below ``folder``, by name; hidden files are none. A
+    link to nothing is one, which its reader reports."""
     room, _, last = pattern.rpartition("/")
     place = entry(folder, room) if room else folder
     matches = re.compile(translate(last), re.IGNORECASE).match
     try:
         with os.scandir(place) as entries:
-            names = [e.name for e in entries if matches(e.name) and not e.name.startswith(".") and e.is_file()]
+            seen = [e for e in entries if matches(e.name) and not e.name.startswith(".")]
+            names = [e.name for e in seen if e.is_file() or (e.is_symlink() and not os.path.exists(e.path))]
     except OSError:
         return []
     return [place / name for name in sorted(names)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +11,13 @@ from mapvote.core.types import MapvoteError
 
 
 def read_text(file: Path) -> str:
-    """The whole text of a file; MapvoteError if it cannot be read or is not text."""
+    """The whole text of a file, UTF-8, or UTF-16 with a byte order mark; MapvoteError if it cannot be read or is not
+    text."""
     try:
-        return file.read_text(encoding="utf-8")
+        data = file.read_bytes()
+        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+        return text.replace("\r\n", "\n").replace("\r", "\n")
     except OSError as error:
         raise MapvoteError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:

@@ -147,7 +147,7 @@ def spoilt(points: int) -> Callable[[Path], object]:
         (text("prior.txt", ROW * 3 + "2 0 0 0 0 2 0 0 0 0 2 0\n" + ROW * 2), {}, r"pose 3 .*scale 2\.000"),
         (text("prior.txt", ROW * 3 + "1 0 0 0 0 -1 0 0 0 0 1 0\n" + ROW * 2), {}, "left-handed"),
         (text("prior.txt", ROW * 3 + "nan 0 0 0 0 1 0 0 0 0 1 0\n" + ROW * 2), {}, "not a number"),
-        (text("prior.txt", ROW * 3 + "1 0 0 0 0 1 0 0\n" + ROW * 2), {}, "expected 12 numbers, found 8"),
+        (text("prior.txt", ROW * 3 + "1 0 0 0 0 1 0 0\n" + ROW * 2), {}, r":4: 8 numbers, but a row has 12"),
         (str, {"prior": "nowhere.txt"}, "no such prior"),
         (str, {"mount": "1,2,3"}, "T_base_lidar must be"),
         (str, {"sensor": "hdl32"}, "did you mean 'hdl32e'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Callable
@@ -31,6 +32,8 @@ from mapvote.formats.listing import entry
 from mapvote.formats.reading import read_text
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_YEAR_2000_S, _YEAR_2100_S = 946_684_800, 4_102_444_800
+"""Seconds since 1970 between which drives are recorded."""
 
 
 class SaidOfDrive(TypedDict, total=False):
@@ -128,8 +131,12 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
         options = msgspec.convert(table, DriveOptions)
     except msgspec.ValidationError as error:
         raise MapvoteError(f"{file}: {error}") from error
-    if options.prior_sigma_m <= 0 or options.prior_sigma_deg <= 0:
-        raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive")
+    if not (0.0 < options.prior_sigma_m < math.inf and 0.0 < options.prior_sigma_deg < math.inf):
+        raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive numbers")
+    for unit, per_ns in (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3)):
+        if _YEAR_2000_S <= options.start_ns * per_ns / 1e9 <= _YEAR_2100_S:
+            what = f"{file}: start_ns = {options.start_ns} looks like {unit} since 1970"
+            raise MapvoteError(f"{what}: write nanoseconds, {options.start_ns * per_ns}")
     options = structs.replace(options, **{name: value for name, value in said.items() if value is not None})
     if options.time_unit not in (None, *UNITS_NS):
         raise MapvoteError(f"{file}: time_unit is {options.time_unit!r}; it must be {', '.join(UNITS_NS)}")
@@ -180,8 +187,8 @@ def map_frame(options: DriveOptions) -> MapFrame | None:
         return options.frame
     if options.origin is None:
         return None
-    if len(options.origin) != 3:
-        raise MapvoteError("drive.toml: origin must be latitude, longitude, altitude")
+    if len(options.origin) != 3 or not np.isfinite(options.origin).all() or abs(options.origin[0]) > 90.0:
+        raise MapvoteError("drive.toml: origin must be latitude, longitude (degrees), altitude (metres)")
     return enu_frame(*options.origin)
 
 

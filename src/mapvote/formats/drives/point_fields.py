@@ -108,8 +108,7 @@ class PointReader:
         self.bad_points.count(index, bad)
         if n == 0:
             raise MapvoteError(
-                f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: are they metres? "
-                "Else leave this scan out with --scans"
+                f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: {_unit_of_near(points)}"
             )
         keep: slice | I32 = slice(None) if n == len(points) else usable[:n]
         # Their times; where a point has none it is dropped.
@@ -253,8 +252,19 @@ def _sort_out(
     return n, measured, bad
 
 
+def _unit_of_near(points: F32) -> str:
+    """What points that are all too near may be."""
+    with np.errstate(invalid="ignore"):
+        distance = np.linalg.norm(points.astype(np.float64), axis=1)
+    distance = distance[np.isfinite(distance) & (distance > 0.0)]
+    if len(distance) and float(np.median(distance)) > 0.001 and float(distance.max()) < FAR_M / 1000.0:
+        return f"they look like kilometres (the farthest {distance.max():.3f}); multiply x, y, z by 1000"
+    return "are they metres? Else leave this scan out with --scans"
+
+
 def _likely_cause(points: F32) -> str:
-    distance = np.linalg.norm(points.astype(np.float64), axis=1)
+    with np.errstate(invalid="ignore"):  # damaged numbers
+        distance = np.linalg.norm(points.astype(np.float64), axis=1)
     finite = distance[np.isfinite(distance)]
     farthest = float(np.quantile(finite, 0.99)) if len(finite) else 0.0
     if len(finite) > 0.9 * len(distance) and FAR_M < farthest < 300_000.0:

@@ -68,11 +68,18 @@ class Header:
     """By role: x, y, z, qx, .., roll, .., latitude, time."""
 
 
+_DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)")
+
+
 def split_row(line: str) -> list[str]:
-    """The values of one line, between commas, semicolons, tabs or blanks; quotes are taken off."""
-    text = line.strip().replace(";", ",").replace("\t", ",")
-    words = text.split(",") if "," in text else text.split()
-    return [word.strip().strip("\"'").strip() for word in words]
+    """The values of one line, between commas, semicolons, tabs or blanks; quotes are taken off. Commas within numbers
+    that semicolons or tabs part are decimal points."""
+    text = line.strip()
+    apart = next((mark for mark in ";\t" if mark in text), "," if "," in text else None)
+    words = [word.strip().strip("\"'").strip() for word in text.split(apart)]
+    if apart in (";", "\t"):
+        words = [_DECIMAL_COMMA.sub(r"\1.\2", word) if _DECIMAL_COMMA.fullmatch(word) else word for word in words]
+    return words
 
 
 def find_header(lines: Sequence[str]) -> Header | None:

@@ -14,7 +14,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
 from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
-from mapvote.formats.drives.trajectory import Trajectory, check_rigid, of_scans, prior_of
+from mapvote.formats.drives.trajectory import Trajectory, check_rigid, date_ns, of_scans, prior_of
 from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import table_of, xyz
@@ -41,6 +40,8 @@ from mapvote.formats.maps.ply import stream_ply_tables
 from mapvote.formats.reading import read_text
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
+_EARLIEST_NS = 946_684_800 * 10**9
+"""The year 2000: no drive was recorded before it, and no clock that starts with the sensor has come so far."""
 
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
@@ -58,13 +59,11 @@ def read_times_ns(file: Path) -> I64:
         text = line.strip()
         if not text:
             continue
+        if ":" in text:
+            out.append(date_ns(text, f"{file}:{number}"))
+            continue
         try:
-            if ":" in text:
-                whole, _, fraction = text.partition(".")
-                moment = datetime.fromisoformat(whole).replace(tzinfo=UTC)
-                out.append(int(moment.timestamp()) * 10**9 + int(fraction.ljust(9, "0")[:9]))
-            else:
-                out.append(int((Decimal(text) * 10**9).to_integral_value()))
+            out.append(int((Decimal(text) * 10**9).to_integral_value()))
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise MapvoteError(f"{file}:{number}: not a time in seconds: {text!r}") from error
     if any(abs(ns) > _LATEST_NS for ns in out):
@@ -79,7 +78,11 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     """
     table = entry(folder, "times.txt")
     if table.is_file():
-        return options.start_ns + of_scans(read_times_ns(table), files, table)
+        times_ns = of_scans(read_times_ns(table), files, table)
+        if len(times_ns) and times_ns[0] > _EARLIEST_NS and options.start_ns > _EARLIEST_NS:
+            what = f"{table}: its times count from 1970 already, and drive.toml adds start_ns = {options.start_ns}"
+            raise MapvoteError(f"{what}: leave it out")
+        return options.start_ns + times_ns
     stamps_ns = None if options.rate_hz is not None else stamps_of_names_ns(files)
     if stamps_ns is not None:
         return stamps_ns
@@ -106,8 +109,20 @@ class ScanFolder:
     zero_is_no_return: bool = True
 
 
+def _tell_unread(files: Sequence[Path]) -> None:
+    """A message on scans of another format beside the ``files`` that are read."""
+    room, taken = files[0].parent, files[0].suffix.lower()
+    for suffix in (".pcd", *_SUFFIXES):
+        others = [] if suffix == taken else files_like(room, f"*{suffix}")
+        others = [file for file in others if file not in files]
+        if others:
+            what = "%s: %d files *%s lie beside the *%s that are read; they are left out"
+            log.warning(what, room, len(others), suffix, taken)
+
+
 def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
     """The drive of a folder; scans are read one by one. MapvoteError says what is missing or does not fit."""
+    _tell_unread(folder.files)
     reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
     own = folder.prior, folder.prior_name, folder.T_base_lidar
     T_prior, frame = prior_of(path, options, folder.files, folder.stamps_ns, *own)

@@ -5,8 +5,10 @@ the others each line belongs to a scan. So a drive gets its prior.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -32,16 +34,29 @@ MAX_GAP_NS = 500_000_000
 
 
 def read_numbers(file: Path, columns: int) -> F64:
-    """(n, columns) float64 of a text file of numbers; MapvoteError names the line that is not one."""
+    """(n, columns) float64 of a text file of numbers; MapvoteError names the line that is not one, or is cut off."""
     lines = read_text(file).splitlines()
-    rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(lines, 1) if _holds(line)]
+    rows = [(number, split_row(line)) for number, line in enumerate(lines, 1) if _holds(line)]
     out = np.empty((len(rows), columns))
     for i, (number, words) in enumerate(rows):
-        try:
-            out[i] = [float(word) for word in words]
-        except ValueError as error:
-            raise MapvoteError(f"{file}:{number}: expected {columns} numbers, found {len(words)}: {error}") from error
+        values = [_number(word) for word in words]
+        wrong = next((word for word, value in zip(words, values, strict=True) if not np.isfinite(value)), None)
+        if wrong is not None:
+            raise MapvoteError(f"{file}:{number}: not a number: {wrong[:40]!r}; correct the line, or leave it out")
+        if len(words) != columns:
+            mend = "copy it again" if i else _other_rows(len(words))
+            raise MapvoteError(f"{file}:{number}: {len(words)} numbers, but a row has {columns}; {mend}")
+        out[i] = values
     return out
+
+
+def _other_rows(numbers: int) -> str:
+    """What to do with a table whose first row has so many numbers."""
+    if numbers == 13:
+        return "is the first an index or a time? Leave it out, or write TUM (seconds x y z qx qy qz qw)"
+    if numbers in (4, 3):
+        return "write the matrix of a pose in one line"
+    return "name the columns in a first line (time,x,y,z,qx,qy,qz,qw or roll,pitch,yaw), or write rows of 3 x 4"
 
 
 def _holds(line: str) -> bool:
@@ -52,8 +67,13 @@ def _holds(line: str) -> bool:
 def read_poses(file: Path) -> F64:
     """(n, 4, 4) from rows of 12 numbers (3 x 4) or 16 (4 x 4), as they stand in the file. MapvoteError if not rigid."""
     first = next((line for line in read_text(file).splitlines() if line.strip()), "")
-    columns = 16 if len(first.replace(",", " ").split()) == 16 else 12
-    return rigid_motions(read_numbers(file, columns)[:, :12], str(file))
+    columns = 16 if len(split_row(first)) == 16 else 12
+    rows = read_numbers(file, columns)
+    wrong = np.flatnonzero((np.abs(rows[:, 12:] - np.eye(4)[3, : columns - 12]) > 1e-6).any(axis=1))
+    if len(wrong):
+        what = f"{file}: pose {wrong[0]} does not end in 0 0 0 1"
+        raise MapvoteError(f"{what}: is each matrix written column by column? Write it row by row")
+    return rigid_motions(rows[:, :12], str(file))
 
 
 def rigid_motions(rows: F64, where: str) -> F64:
@@ -243,20 +263,26 @@ def _in_tum_order(file: Path, rows: F64) -> F64:
     """Rows x, y, z, qx, qy, qz, qw of rows without a header, whose quaternions may have w first: only then a vehicle
     always drives to the same side of itself, and the order is told."""
     w_first = rows[:, [0, 1, 2, 4, 5, 6, 3]]
-    if len(rows) < 3 or _steadiness(rows) > _UNSTEADY or _steadiness(w_first) < _STEADY:
+    if len(rows) < 3 or _of_quaternions(rows) > _UNSTEADY or _of_quaternions(w_first) < _STEADY:
         return rows
     log.warning("%s: no header; read as time, x, y, z, qw, qx, qy, qz: so the vehicle drives straight ahead", file)
     return w_first
 
 
-def _steadiness(rows: F64) -> float:
-    """How steady up and the way driven are in the axes of the poses of rows x, y, z, qx, qy, qz, qw: 1 if always the
-    same; 1 of a vehicle that stands."""
+def _of_quaternions(rows: F64) -> float:
+    """How steady rows x, y, z, qx, qy, qz, qw are; 1 if a quaternion is none."""
     lengths = np.linalg.norm(rows[:, 3:], axis=1)
     if not (np.abs(lengths - 1.0) < 0.05).all():
         return 1.0
     R = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix()
-    steps = np.diff(rows[:, :3], axis=0)
+    return _steadiness(geometry.poses_at(rows[:, :3], R))
+
+
+def _steadiness(T: F64) -> float:
+    """How steady up and the way driven are in the axes of poses (n, 4, 4): 1 if always the same; 1 of a vehicle that
+    stands."""
+    R = T[:, :3, :3]
+    steps = np.diff(T[:, :3, 3], axis=0)
     way_m = np.linalg.norm(steps, axis=1)
     if way_m.sum() < 1.0:
         return 1.0
@@ -288,10 +314,11 @@ def read_columns(file: Path) -> tuple[I64, dict[str, F64]]:
     if time is None:
         raise MapvoteError(f"{file}: no column of times among {', '.join(header.names)}; name one timestamp, time or t")
     times_ns = exact_ns(file, [row[time.index] for row in rows], time.scale)
-    columns = {}
-    for role, column in header.columns.items():
-        values = np.array([_number(row[column.index]) for row in rows])
-        columns[role] = _in_radians(values, column) if role in _ANGLES else values * _metres(role, column)
+    values = {role: np.array([_number(row[column.index]) for row in rows]) for role, column in header.columns.items()}
+    columns = {role: values[role] * _scale(role, column) for role, column in header.columns.items()}
+    unstated = [role for role in _ANGLES if role in columns and header.columns[role].scale is None]
+    if _in_degrees(file, columns, unstated):
+        columns |= {role: np.radians(columns[role]) for role in unstated}
     if "nanoseconds" in columns:
         times_ns += needed(file, columns, "nanoseconds")[:, 0].astype(np.int64)
     return times_ns, columns
@@ -300,14 +327,32 @@ def read_columns(file: Path) -> tuple[I64, dict[str, F64]]:
 _ANGLES = ("roll", "pitch", "yaw", "heading")
 
 
-def _in_radians(values: F64, column: Column) -> F64:
-    if column.scale is not None:
-        return values * column.scale
-    return np.radians(values) if float(np.nanmax(np.abs(values), initial=0.0)) > 2.0 * np.pi + 0.01 else values
+def _scale(role: str, column: Column) -> float:
+    """Metres, or radians, in one of a column; 1 of what has no unit, or none that its header names."""
+    return column.scale or 1.0 if role in ("x", "y", "z", "down", *_ANGLES) else 1.0
 
 
-def _metres(role: str, column: Column) -> float:
-    return column.scale or 1.0 if role in ("x", "y", "z", "down") else 1.0
+def _in_degrees(file: Path, columns: Mapping[str, F64], unstated: Sequence[str]) -> bool:
+    """Whether the angles without a unit are degrees: one is beyond two turns of radians, or only so the vehicle drives
+    straight ahead. One file has one unit."""
+    if any(float(np.nanmax(np.abs(columns[role]), initial=0.0)) > 2.0 * np.pi + 0.01 for role in unstated):
+        return True
+    if not unstated or not {"x", "y"} <= set(columns):
+        return False
+    zero = np.zeros(len(columns["x"]))
+    rpy = {role: columns.get(role, zero) for role in ("roll", "pitch")}
+    steady = []
+    for radians in (1.0, np.pi / 180.0):
+        turned = {role: values * radians if role in unstated else values for role, values in columns.items()}
+        yaw = turned.get("yaw", np.pi / 2 - turned.get("heading", zero))
+        angles = [turned.get(role, values) for role, values in rpy.items()]
+        rows = np.column_stack([columns["x"], columns["y"], columns.get("z", zero), *angles, yaw])
+        steady.append(_steadiness(motions_of_rpy(rows)) if np.isfinite(rows).all() else 1.0)
+    unsteady = 1.0 - np.array(steady)
+    degrees = bool(unsteady[0] > 1.0 - _STEADY and unsteady[1] < 0.2 * unsteady[0])
+    if degrees:
+        log.warning("%s: angles without a unit; read as degrees: so the vehicle drives straight ahead", file)
+    return degrees
 
 
 def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
@@ -322,9 +367,28 @@ def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
     return found
 
 
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
+
+
+def date_ns(text: str, where: str) -> int:
+    """Nanoseconds since 1970 of a date and time such as KITTI's "2011-09-26 13:02:25.964389445", in UTC where it names
+    no other zone. MapvoteError if it is none."""
+    parts = _DATE.fullmatch(text.strip())
+    try:
+        if parts is None:
+            raise ValueError
+        zone = (parts[3] or "Z").replace("Z", "+00:00")
+        moment = datetime.fromisoformat(parts[1] + (zone if ":" in zone else f"{zone[:3]}:{zone[3:]}"))
+    except ValueError as error:
+        raise MapvoteError(f"{where}: not a date and time: {text!r}; write seconds, or 2025-10-01 13:00:00") from error
+    return round(moment.timestamp()) * 10**9 + int((parts[2] or "0").ljust(9, "0")[:9])
+
+
 def exact_ns(file: Path, texts: Sequence[str], unit_ns: float | None = None) -> I64:
-    """(n,) nanoseconds of times written as seconds, or as whole milli-, micro- or nanoseconds since 1970. Whole numbers
-    are exact: float64 holds no nanoseconds since 1970. ``unit_ns``: the unit, where it is known."""
+    """(n,) nanoseconds of times written as seconds, as whole milli-, micro- or nanoseconds since 1970, or as date and
+    time. Whole numbers are exact: float64 holds no nanoseconds since 1970. ``unit_ns``: the unit, where it is known."""
+    if texts and all(":" in text for text in texts):
+        return np.array([date_ns(text, str(file)) for text in texts], dtype=np.int64)
     if unit_ns is not None and all(_is_number(text) for text in texts):
         return np.array([round(Fraction(text) * int(unit_ns)) for text in texts], dtype=np.int64)
     if not all(text.strip().lstrip("-").isdigit() for text in texts):

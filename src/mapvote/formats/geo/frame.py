@@ -188,8 +188,18 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
     in radians about the local east, north and up; yaw 0 is east, counter-clockwise. ``frame``: the map's; None or a
     local one gives a plane that touches the Earth at the first place, with a message.
     """
-    if len(lonlat) == 0 or not (np.isfinite(lonlat).all() and (np.abs(lonlat[:, 1]) <= 90).all()):
-        raise MapvoteError("a prior from GNSS needs latitudes within 90 degrees and no holes")
+    if len(lonlat) == 0 or not np.isfinite(lonlat).all():
+        raise MapvoteError("a prior from GNSS needs a place for every row; leave out the others, or --prior none")
+    farthest = float(np.abs(lonlat[:, 1]).max())
+    if farthest > 90.0:
+        what = f"a prior from GNSS has a latitude of {farthest:.10g} degrees"
+        swapped = (np.abs(lonlat[:, 0]) <= 90.0).all() and farthest <= 180.0
+        mend = "are latitude and longitude swapped?" if swapped else "write decimal degrees, between -90 and 90"
+        raise MapvoteError(f"{what}: {mend}")
+    if (np.abs(lonlat[:, :2]) <= [np.pi, np.pi / 2.0]).all():
+        lon, lat = lonlat[0, :2].tolist()
+        what = f"a prior from GNSS lies in the sea at latitude {lat:.6f}, longitude {lon:.6f}"
+        raise MapvoteError(f"{what}: are they radians, or no fixes at all? Write degrees, or --prior none")
     if frame is None or frame.is_local:
         lon, lat, height = (float(v) for v in lonlat[0])
         what = "no place on Earth is known for the map: a plane at the first fix (origin = [%.7f, %.7f, %.2f])"

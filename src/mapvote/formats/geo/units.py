@@ -26,6 +26,10 @@ _UNITS: dict[str, Any] = {
 
 Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Points (n, 3) of a file to map metres; the same array if there is nothing to do."""
+_EARTH_M = (6.33e6, 6.40e6)
+"""From the Earth's centre to any street."""
+_HIGHEST_M = 10_000.0
+"""Above which no street lies, in coordinates whose z is a height."""
 
 
 def settle(
@@ -160,9 +164,17 @@ def _degrees(where: str, crs: Any, first: NDArray[np.floating]) -> str:
 
 def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
     """Refuse what can only be longitudes and latitudes: many points in a plate of degrees, far higher than wide."""
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         return
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
+    radius_m = float(np.linalg.norm(points.astype(np.float64), axis=1).mean())
+    if _EARTH_M[0] < radius_m < _EARTH_M[1] and float(np.abs(points[:, 2]).min()) > _HIGHEST_M:
+        raise MapvoteError(
+            f"{where}: the points lie {radius_m / 1000.0:.0f} km from (0, 0, 0): they look like metres from the "
+            f"Earth's centre; if so: mapvote import '{where}' MAP --from-crs EPSG:4978 --crs EPSG:n; "
+            "if not: --from-crs local"
+        )
     wide = float((high - low)[:2].max())
     on_earth = np.abs([low[0], high[0]]).max() <= 180.0 and np.abs([low[1], high[1]]).max() <= 90.0
     if on_earth and 0.0 < wide < 0.5 and float(high[2] - low[2]) > 4.0 * wide:

@@ -201,6 +201,9 @@ def _check_counts(path: Path) -> bool:
     with path.open("rb") as stream:
         header = stream.read(375).ljust(375, b"\0")
     version, compressed = header[25], bool(header[104] & 0xC0)
+    scales = struct.unpack_from("<3d", header, 131)
+    if header[:4] == b"LASF" and not all(0.0 < abs(scale) < 1e6 for scale in scales):
+        raise MapvoteError(f"{path}: its header scales x, y, z by {scales}: no coordinates; export the file again")
     start, vlrs = struct.unpack_from("<II", header, 96)
     record, legacy = struct.unpack_from("<HI", header, 105)
     evlrs, points = struct.unpack_from("<IQ", header, 243) if version >= 4 else (0, legacy)

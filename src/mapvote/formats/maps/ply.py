@@ -18,6 +18,8 @@ from mapvote.formats.reading import reading
 
 _BLOCK = 500_000
 """Vertices handed on at a time."""
+_LONGEST_HEADER = 100_000
+"""Bytes."""
 _TYPES = {
     "f8": "double", "f4": "float", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"
 }  # fmt: skip
@@ -41,9 +43,9 @@ def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
         with path.open("rb") as stream:
             is_text = b"ascii" in stream.readline() + stream.readline()
             stream.seek(0)
-            source = _full_lines(stream) if is_text else stream
+            source: Any = _full_lines(stream) if is_text else _ascii_header(stream)
             file = library.PlyData.read(source)
-            more = source.read() if is_text else stream.read().strip(b"\0\r\n ")
+            more = source.read() if is_text else source.read().strip(b"\0\r\n ")
         if more and file.elements[-1].name == "vertex":  # faces too many are nothing to a map
             raise MapvoteError(f"{path}: data follow the elements that its header counts ({_counts(file)}); {_MEND}")
         if "vertex" not in file:
@@ -58,6 +60,19 @@ def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
 def _full_lines(stream: BinaryIO) -> io.StringIO:
     """The lines of a text that hold something, as plyfile wants them."""
     return io.StringIO("".join(line.decode("latin-1").rstrip() + "\n" for line in stream if line.strip()))
+
+
+def _ascii_header(stream: BinaryIO) -> BinaryIO:
+    """The file from its start, with "?" for what is no ASCII in the comments of its header: plyfile refuses that."""
+    header = b""
+    for line in stream:
+        header += line
+        if line.strip() == b"end_header" or len(header) > _LONGEST_HEADER:
+            break
+    if header.isascii():
+        stream.seek(0)
+        return stream
+    return io.BytesIO(bytes(byte if byte < 128 else ord("?") for byte in header) + stream.read())
 
 
 def _counts(file: Any) -> str:

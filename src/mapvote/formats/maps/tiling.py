@@ -25,7 +25,7 @@ from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, in_memory_if_small, lattice_of
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, MapvoteError
+from mapvote.core.types import F32, F64, Bool, MapvoteError
 from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
@@ -36,6 +36,15 @@ _IN_MEMORY = 64 << 20
 """Bytes that are not worth a file."""
 
 Columns = dict[str, NDArray[Any]]
+
+
+_FARTHEST_M = 1e11
+"""Coordinates of no system on Earth are larger, not even in millimetres."""
+
+
+def on_earth(points: NDArray[np.floating]) -> Bool:
+    """(n,) which of the points (n, 3) are coordinates at all: finite, and no damaged number such as 1e30."""
+    return np.asarray((np.abs(points) < _FARTHEST_M).all(axis=1))
 
 
 class Spill:
@@ -180,7 +189,7 @@ class _Taken:
         self.gps_times = self.gps_times or cloud.gps_times
         self.flagged = self.flagged or bool(cloud.fields.get("las_flags", np.zeros(1)).any())
         self._kinds.append({name: column.dtype for name, column in {**cloud.fields, _XYZ: points}.items()})
-        good = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
+        good = on_earth(points)
         self.total += len(points)
         self.bad += len(points) - int(good.sum())
         columns = {_XYZ: points, **cloud.fields}
@@ -204,7 +213,8 @@ class _Taken:
             raise MapvoteError(f"{self.where}: holds no points; a map needs some")
         if self.bad == self.total or self.bad > self.most_bad * self.total:
             raise MapvoteError(
-                f"{self.where}: {self.bad} of {self.total} points are not finite, more than {self.most_bad:.0%}; "
+                f"{self.where}: {self.bad} of {self.total} points are not finite or no coordinates, more than "
+                f"{self.most_bad:.0%}; "
                 f"export the file again, or leave them out: mapvote import '{self.where}' MAP --unchecked"
             )
         if self.bad:
