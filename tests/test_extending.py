@@ -28,7 +28,7 @@ from mapvote.matching.localiser import GivenPoses
 from mapvote.matching.matcher import map_around
 from mapvote.vehicle import vote_drive
 from mapvote_server.api.app import URL, in_process
-from mapvote_server.store.admission import examine
+from mapvote_server.store.examination import examine
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
 from stores import NewStore, send
