@@ -12,9 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mapvote.core import points as attributes
 from mapvote.core.columns import flat_cells
 from mapvote.core.point_map import all_fields
+from mapvote.core.points import FIELDS, Field
 from mapvote.formats import export_map, import_cloud, read_map, write_map
+from mapvote.formats.maps import field_names
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.fusion.edit import add_points, delete_points
@@ -100,3 +103,27 @@ def test_a_map_without_classes_leaves_with_ground_and_returns(tmp_path: Path) ->
     assert set(np.asarray(back.number_of_returns).tolist()) == {1}
     assert back.header.parse_crs().to_epsg() == 32654
     assert all_fields(read_map(tmp_path / "a.laz"))["classification"].dtype == np.uint8
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".pcd", ".ply"])
+def test_an_attribute_of_another_distribution_stays_through_import_and_export(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, fields = las(200, 5)
+    heat = np.linspace(-20.0, 60.0, 200).astype(np.float32)
+    write_las(tmp_path / "a.las", Cloud(points, fields={**fields, "heat": heat}))
+    point_map, told = import_cloud(tmp_path / "a.las")
+    assert "heat" not in point_map.field_names
+    assert any(line.startswith("dropped fields: ") and line.endswith(", heat") for line in told)
+    every = {**FIELDS, "heat": Field("<f4", spellings=("heat",))}
+    for module in (attributes, field_names):
+        monkeypatch.setattr(module, "point_fields", lambda: every)
+    point_map, told = import_cloud(tmp_path / "a.las")
+    assert not any("heat" in line for line in told)
+    export_map(point_map, tmp_path / f"b{suffix}")
+    back = all_fields(read_map(tmp_path / f"b{suffix}"))
+    assert back["heat"].dtype == np.float32
+    assert sorted(back["heat"].tolist()) == sorted(heat.tolist())
+    assert sorted(zip(back["heat"].tolist(), back["intensity"].tolist(), strict=True)) == sorted(
+        zip(heat.tolist(), fields["intensity"].tolist(), strict=True)
+    )

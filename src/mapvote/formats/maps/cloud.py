@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapvote.core.brightness import Brightness
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.field_names import COLOURS, KEPT, known_fields, other_fields
+from mapvote.formats.maps.field_names import COLOURS, kept_fields, known_fields, other_fields
 
 log = logging.getLogger("mapvote.formats")
 
@@ -37,7 +37,7 @@ class Cloud:
     frame: MapFrame = field(default_factory=MapFrame)
     """The file's statement of its coordinates: they may be in feet or degrees still."""
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
+    """Columns (n,) of :func:`kept_fields`, with the values and in the type that the file has."""
     gps_times: str = ""
     """What ``gps_time`` counts from, "week" or "adjusted standard"; empty if the file does not say."""
 
@@ -107,7 +107,7 @@ def joined(pieces: Iterable[Cloud]) -> Cloud:
     pieces = list(pieces)
     if len(pieces) == 1:
         return pieces[0]
-    names = [name for name in KEPT if all(name in piece.fields for piece in pieces)]
+    names = [name for name in kept_fields() if all(name in piece.fields for piece in pieces)]
     return replace(
         pieces[0],
         points=np.concatenate([piece.points for piece in pieces]),
@@ -120,7 +120,8 @@ def cloud_of_table(where: str, table: NDArray[np.void]) -> Cloud:
     """The points of a structured array with x, y, z, and of its fields what a map keeps: numbers under LAS's names,
     PCL's packed rgb taken apart. MapvoteError as :func:`xyz`."""
     names = table.dtype.names or ()
-    out = {ours: np.ascontiguousarray(table[name]) for ours, name in known_fields(names).items() if ours in KEPT}
+    known = {ours: name for ours, name in known_fields(names).items() if ours not in ("x", "y", "z")}
+    out = {ours: np.ascontiguousarray(table[name]) for ours, name in known.items()}
     for packed in ("rgb", "rgba"):
         if packed in names and "red" not in out and table.dtype[packed].itemsize == 4:
             word = np.ascontiguousarray(table[packed]).view(np.uint32)

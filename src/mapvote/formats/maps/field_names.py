@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from mapvote.core.points import point_fields
+
 KEPT = (
     "intensity",
     "red",
@@ -19,7 +21,8 @@ KEPT = (
     "number_of_returns",
     "las_flags",
 )
-"""Fields of points that a map keeps, by LAS's names. ``las_flags`` holds the bits of ``LAS_FLAGS``."""
+"""Fields of points that a map keeps, by LAS's names; :func:`kept_fields` has the attributes of other distributions too.
+``las_flags`` holds the bits of ``LAS_FLAGS``."""
 LAS_FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
 """Bits of the flags of a point, as LAS 1.4 numbers them."""
 COLOURS = ("red", "green", "blue")
@@ -41,18 +44,24 @@ _SPELLINGS: Mapping[str, tuple[str, ...]] = {
 """Plain spellings of each field, the best first."""
 
 
+def kept_fields() -> tuple[str, ...]:
+    """Fields of points that a map keeps: ``KEPT``, then the attributes that other distributions bring."""
+    return (*KEPT, *(name for name in point_fields() if name not in KEPT))
+
+
 def plain(name: str) -> str:
     """A name without case, underscores, blanks and CloudCompare's prefix."""
     return name.lower().removeprefix("scalar_").replace("_", "").replace(" ", "")
 
 
 def known_fields(names: Sequence[str]) -> dict[str, str]:
-    """For x, y, z and each field of ``KEPT`` that ``names`` hold: which of them holds it."""
+    """For x, y, z and each of :func:`kept_fields` that ``names`` hold: which of them holds it."""
     by_spelling: dict[str, str] = {}
     for name in names:
         by_spelling.setdefault(plain(name), name)
     found: dict[str, str] = {}
-    for ours, spellings in _SPELLINGS.items():
+    brought = {name: (plain(name), *row.spellings) for name, row in point_fields().items()}
+    for ours, spellings in {**brought, **_SPELLINGS}.items():
         there = [by_spelling[spelling] for spelling in spellings if spelling in by_spelling]
         if ours in names:
             found[ours] = ours

@@ -11,8 +11,8 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
-from mapvote.formats.maps.field_names import other_fields
+from mapvote.formats.maps.field_names import kept_fields, known_fields, other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, FLAGS, Head, Piece, read_head, read_pieces
 from mapvote.formats.reading import reading
 
@@ -78,13 +78,29 @@ def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
     MapvoteError if it is damaged or cut off.
     """
     laspy = require("laspy", "las", str(path))
+    brought = [name for name in kept_fields() if name not in FIELDS]
     with reading(path, "LAS or LAZ file"):
         if _check_counts(path):
-            yield from _apart(path, extra=extra)
+            pieces = _apart(path, extra=extra or bool(brought))
         else:
-            with laspy.open(path) as file:
-                head = read_head(file, extra=extra)
-                yield from _clouds(path, head, read_pieces(file, head))
+            pieces = _beside(laspy, path, extra=extra or bool(brought))
+        for piece in pieces:
+            yield piece if extra else _only(piece, brought)
+
+
+def _only(piece: Cloud, brought: Sequence[str]) -> Cloud:
+    """The piece with LAS's own fields, and of those that the file defines itself the ones that are ``brought``."""
+    known = known_fields(list(piece.fields))
+    fields = {name: column for name, column in piece.fields.items() if name in FIELDS}
+    own = {name: piece.fields[known[name]] for name in brought if name in known}
+    return replace(piece, fields=fields | own)
+
+
+def _beside(laspy: Any, path: Path, *, extra: bool) -> Iterator[Cloud]:
+    """What a LAS file holds."""
+    with laspy.open(path) as file:
+        head = read_head(file, extra=extra)
+        yield from _clouds(path, head, read_pieces(file, head))
 
 
 def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
@@ -326,6 +342,9 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
     adjusted = clouds.gps_times == "adjusted standard"
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
     header.scales, header.offsets = steps_and_offsets(clouds.corners + shift, degrees=geographic)
+    own = [laspy.ExtraBytesParams(name, kind) for name, kind in clouds.kinds.items() if name not in FIELDS]
+    if own:
+        header.add_extra_dims(own)
     _tell_of_brightness(path, clouds)
     compressed = path.suffix.lower() == ".laz"
     with (
@@ -342,8 +361,9 @@ def _record(laspy: Any, header: Any, piece: Cloud, brightness: Mapping[str, Brig
     record = laspy.ScaleAwarePointRecord.zeros(len(piece.points), header=header)
     record.x, record.y, record.z = (piece.points.astype(np.float64, copy=False) + shift).T
     record.return_number = record.number_of_returns = np.ones(len(record), dtype=np.uint8)
-    for name in FIELDS:
-        if name not in piece.fields:
+    for name in piece.fields:
+        if name not in FIELDS:
+            record[name] = piece.fields[name]
             continue
         values = _as_las(name, piece.fields[name], brightness.get(SCALED.get(name, ""), Brightness()))
         if name != "las_flags":

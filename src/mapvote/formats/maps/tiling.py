@@ -30,7 +30,7 @@ from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import GROUND, Cloud, joined
-from mapvote.formats.maps.field_names import KEPT
+from mapvote.formats.maps.field_names import kept_fields
 
 _IN_MEMORY = 64 << 20
 """Bytes that are not worth a file."""
@@ -223,7 +223,7 @@ class _Taken:
 
     def blocks(self) -> Iterator[Columns]:
         """What was taken, in order: the fields that all pieces have, each in one type. Flags only if one is set."""
-        names = [name for name in (_XYZ, *KEPT) if all(name in kinds for kinds in self._kinds)]
+        names = [name for name in (_XYZ, *kept_fields()) if all(name in kinds for kinds in self._kinds)]
         if not self.flagged and "las_flags" in names:
             names.remove("las_flags")
         types = {name: np.result_type(*(kinds[name] for kinds in self._kinds)) for name in names}
