@@ -9,7 +9,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.drives import _stage
-from mapvote_lab.simulation.flaws import PULSE_M, Hits, Kinds, chance_of, mixed, spoil
+from mapvote_lab.simulation.flaws import FLAW_SIZES, Hits, Kinds, chance_of, mixed, spoil
 from mapvote_lab.simulation.lidar import Caster, Sweep, measure, sweep
 from mapvote_lab.simulation.scenario import Flaws, load_scenario
 
@@ -95,7 +95,7 @@ def test_at_an_edge_a_beam_reports_a_range_between_the_two_within_a_pulse_only()
     assert edge.tolist() == [True, True, False, False, False, False]
     assert ((changed[:2] > 10.0) & (changed[:2] < 10.8)).all()
     np.testing.assert_array_equal(changed[2:], ranges[2:])
-    assert PULSE_M < 19.0
+    assert FLAW_SIZES.pulse_m < 19.0
 
 
 def test_rain_ends_its_share_of_the_rays_near_the_sensor_and_never_lengthens_one() -> None:

@@ -9,7 +9,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.lidar import Caster, measure, sweep
-from mapvote_lab.simulation.truth import BEYOND_M, passed_surfaces
+from mapvote_lab.simulation.truth import TRUTH_RULE, passed_surfaces
 
 
 def at(T: F64) -> F64:
@@ -90,7 +90,7 @@ def test_ranges_carry_two_centimetres_of_noise_and_some_returns_are_lost() -> No
 def test_a_ray_passes_each_wall_of_a_demolished_house_behind_which_it_goes_on() -> None:
     walls = shapes.join([shapes.box(5.0, 5.1, -9, 9, -9, 9), shapes.box(8.0, 8.1, -9, 9, -9, 9)]).astype(np.float32)
     gone = Caster(walls, np.zeros(len(walls), dtype=np.int32))
-    ranges = np.array([4.0, 5.1 + BEYOND_M / 2, 6.0, 20.0], dtype=np.float32)
+    ranges = np.array([4.0, 5.1 + TRUTH_RULE.beyond_m / 2, 6.0, 20.0], dtype=np.float32)
     directions = np.tile(np.array([[1.0, 0.0, 0.0]], np.float32), (4, 1))
     passed = passed_surfaces(gone, np.zeros((4, 3), np.float32), directions, ranges)
     np.testing.assert_allclose(np.sort(passed[:, 0]), [5.0, 5.0, 5.0, 5.1, 5.1, 8.0, 8.1], atol=1e-4)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mapvote.core.types import F64
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import load_scenario
-from mapvote_lab.simulation.world import KERB_M, make_terrain
+from mapvote_lab.simulation.world import STREET, make_terrain
 
 sizes = st.floats(0.2, 5.0)
 few = settings(max_examples=20)
@@ -116,6 +116,6 @@ def test_the_mesh_of_the_ground_is_its_height_and_has_no_holes() -> None:
 def test_the_mesh_of_the_carriageway_keeps_to_its_height_up_to_both_kerbs(name: str) -> None:
     terrain = make_terrain(load_scenario(name), np.random.default_rng(4))
     middles = terrain.triangles().mean(axis=1)
-    road = middles[terrain.road_distance(middles[:, 0], middles[:, 1]) < KERB_M - 0.01]
+    road = middles[terrain.road_distance(middles[:, 0], middles[:, 1]) < STREET.kerb_m - 0.01]
     assert len(road) > 100
     np.testing.assert_allclose(road[:, 2], terrain.height(road[:, 0], road[:, 1]), atol=0.03)

@@ -7,9 +7,9 @@ import pytest
 
 from mapvote.core.types import MapvoteError
 from mapvote_lab.simulation.actors import make_traffic
-from mapvote_lab.simulation.routes import PRIOR_MEMORY_S, ar1, make_routes
+from mapvote_lab.simulation.routes import DRIVE_PLAN, ar1, make_routes
 from mapvote_lab.simulation.scenario import load_scenario, scenario_names
-from mapvote_lab.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
+from mapvote_lab.simulation.truth import Label, label_cells, truth_grid
 from mapvote_lab.simulation.world import Body, Role, make_world
 
 
@@ -127,18 +127,18 @@ def test_priors_are_as_good_as_they_say() -> None:
 def test_truth_of_single_cells() -> None:
     """One cell per column: what was there, what the drives recorded, what the answer must be."""
     cases = [  # (dense before, dense after, survey, vehicles) as {role: hits} -> strict, provenance
-        ({}, {}, {}, {}, UNCHANGED, UNCHANGED),
-        ({Role.KEPT: 9}, {Role.KEPT: 9}, {Role.KEPT: 50}, {Role.KEPT: 50}, UNCHANGED, UNCHANGED),
-        ({Role.REMOVED: 9}, {}, {Role.REMOVED: 50}, {}, CHANGED_EMPTY, CHANGED_EMPTY),
-        ({}, {Role.ADDED: 9}, {}, {Role.ADDED: 50}, CHANGED_OCCUPIED, CHANGED_OCCUPIED),
-        ({Role.REMOVED: 9}, {}, {Role.REMOVED: 3}, {}, CHANGED_EMPTY, UNSCORED),
-        ({}, {Role.ADDED: 9}, {}, {Role.ADDED: 3}, CHANGED_OCCUPIED, UNSCORED),
+        ({}, {}, {}, {}, Label.UNCHANGED, Label.UNCHANGED),
+        ({Role.KEPT: 9}, {Role.KEPT: 9}, {Role.KEPT: 50}, {Role.KEPT: 50}, Label.UNCHANGED, Label.UNCHANGED),
+        ({Role.REMOVED: 9}, {}, {Role.REMOVED: 50}, {}, Label.CHANGED_EMPTY, Label.CHANGED_EMPTY),
+        ({}, {Role.ADDED: 9}, {}, {Role.ADDED: 50}, Label.CHANGED_OCCUPIED, Label.CHANGED_OCCUPIED),
+        ({Role.REMOVED: 9}, {}, {Role.REMOVED: 3}, {}, Label.CHANGED_EMPTY, Label.UNSCORED),
+        ({}, {Role.ADDED: 9}, {}, {Role.ADDED: 3}, Label.CHANGED_OCCUPIED, Label.UNSCORED),
         ({Role.REMOVED: 9, Role.KEPT: 2}, {Role.KEPT: 2}, {Role.REMOVED: 50, Role.KEPT: 9}, {Role.KEPT: 9}, 0, 0),
-        ({Role.REMOVED: 9}, {Role.ADDED: 9}, {Role.REMOVED: 50}, {Role.ADDED: 50}, UNCHANGED, UNCHANGED),
-        ({}, {}, {}, {Role.KEPT: 4}, UNSCORED, UNSCORED),
-        ({}, {}, {}, {Role.UNCLEAR: 4}, UNSCORED, UNSCORED),
-        ({}, {}, {}, {Role.PASSING: 400}, UNCHANGED, UNCHANGED),
-        ({Role.REMOVED: 9}, {}, {}, {}, UNSCORED, UNSCORED),
+        ({Role.REMOVED: 9}, {Role.ADDED: 9}, {Role.REMOVED: 50}, {Role.ADDED: 50}, Label.UNCHANGED, Label.UNCHANGED),
+        ({}, {}, {}, {Role.KEPT: 4}, Label.UNSCORED, Label.UNSCORED),
+        ({}, {}, {}, {Role.UNCLEAR: 4}, Label.UNSCORED, Label.UNSCORED),
+        ({}, {}, {}, {Role.PASSING: 400}, Label.UNCHANGED, Label.UNCHANGED),
+        ({Role.REMOVED: 9}, {}, {}, {}, Label.UNSCORED, Label.UNSCORED),
     ]
     planes = np.zeros((4, len(Role), 1, len(cases)), dtype=np.int32)
     for column, case in enumerate(cases):
@@ -154,5 +154,5 @@ def test_truth_of_single_cells() -> None:
 def test_ar1_errors_have_their_deviation_and_their_memory() -> None:
     errors = ar1(np.full(199_999, 0.1), np.array([0.1, 2.0]), np.random.default_rng(5))
     np.testing.assert_allclose(errors.std(axis=0), [0.1, 2.0], rtol=0.05)
-    later = round(PRIOR_MEMORY_S / 0.1)
+    later = round(DRIVE_PLAN.memory_s / 0.1)
     assert np.corrcoef(errors[:-later, 0], errors[later:, 0])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.05)

@@ -36,7 +36,7 @@ from mapvote_lab.evaluation.cases import Case, Progress, fuse_case, read_kept, s
 from mapvote_lab.evaluation.scene import Pass, Scene, pass_folder, passes
 from mapvote_lab.evaluation.scores import CaseResult, Cost, EvaluationResult, MapShift, PoseErrors, Scores, Timings
 from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth, error_summary, rigid_between
-from mapvote_lab.simulation.routes import RTK_SIGMA_DEG, RTK_SIGMA_M, ar1
+from mapvote_lab.simulation.routes import DRIVE_PLAN, ar1
 
 
 def map_shift(scene: Scene) -> MapShift:
@@ -76,12 +76,19 @@ def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tupl
     folder = scene.work / f"surveyed-anew-without-{without}"
     names = [name for name in scene.drive_names("v") if name != without]
     if not folder.exists():
-        drives, sigma = [], np.array([RTK_SIGMA_M] * 3 + [np.radians(RTK_SIGMA_DEG)] * 3)
+        drives, sigma = [], np.array([DRIVE_PLAN.rtk_sigma_m] * 3 + [np.radians(DRIVE_PLAN.rtk_sigma_deg)] * 3)
         for name in names:  # the error is smooth, as the first survey's: white noise averages out
             drive, rng = scene.drive(name), np.random.default_rng([scene.seed, *name.encode()])
             errors = ar1(1e-9 * np.diff(drive.stamps_ns), sigma, rng)
             T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
-            drives.append(replace(drive, T_map_lidar_prior=T, prior_sigma_m=RTK_SIGMA_M, prior_sigma_deg=RTK_SIGMA_DEG))
+            drives.append(
+                replace(
+                    drive,
+                    T_map_lidar_prior=T,
+                    prior_sigma_m=DRIVE_PLAN.rtk_sigma_m,
+                    prior_sigma_deg=DRIVE_PLAN.rtk_sigma_deg,
+                )
+            )
         point_map, report = build_map(drives, scene.settings, progress=partial(progress, "surveying anew"))
         with whole_folder(folder, sign="poses.npy") as made:
             write_map(point_map, made / "map")

@@ -1,6 +1,6 @@
 """Traffic: cars, two-wheelers and pedestrians on plausible paths (paper V: "many moving objects").
 
-Every body follows a track: (x, y, yaw) every :data:`STEP_S`, straight along a lane or a sidewalk, turning into the
+Every body follows a track: (x, y, yaw) every ``Pace.step_s``, straight along a lane or a sidewalk, turning into the
 crossing street, or braking in the queue before it. All of them move during the drive.
 """
 
@@ -10,22 +10,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import LANES, Scenario
-from mapvote_lab.simulation.world import KERB_M, Terrain
+from mapvote_lab.simulation.world import STREET, Terrain
 
-STEP_S = 0.25
-_BEYOND_M = 90.0
-"""Bodies go on beyond the ends of the street, as far as a ray reaches."""
-_STOP_M = KERB_M + 4.0
-"""Where the crossing street's stop lines are, from the axis."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How the tracks of moving bodies are laid out."""
+
+    step_s: float = 0.25
+    """Time between poses of a track, seconds."""
+    beyond_m: float = 90.0
+    """Length by which bodies go on beyond the ends of the street, metres: as far as a ray reaches."""
+
+
+PACE = Pace()
 
 
 @dataclass(frozen=True)
 class Track:
     """A body and where it is: ``triangles`` (n, 3, 3) in its own frame (x forward, foot at z = 0),
-    ``path`` (steps, 3) of x, y, yaw (continuous) every STEP_S from one step before the drive starts."""
+    ``path`` (steps, 3) of x, y, yaw (continuous) every ``Pace.step_s`` from one step before the drive starts."""
 
     triangles: F64
     path: F64
@@ -42,7 +51,7 @@ class Traffic:
 
     def poses(self, bodies: I64, time_s: F64) -> F64:
         """(n, 3) x, y, yaw of these bodies, each at its own time from the start of the drive."""
-        step = np.clip(time_s / STEP_S + 1.0, 0.0, self._paths.shape[1] - 1.001)
+        step = np.clip(time_s / PACE.step_s + 1.0, 0.0, self._paths.shape[1] - 1.001)
         whole = step.astype(np.int64)
         share = (step - whole)[:, None]
         out: F64 = (1.0 - share) * self._paths[bodies, whole] + share * self._paths[bodies, whole + 1]
@@ -84,7 +93,7 @@ def make_traffic(
     scenario: Scenario, terrain: Terrain, lane: str, duration_s: float, rng: np.random.Generator
 ) -> Traffic:
     """Traffic met by a vehicle that drives in ``lane`` from its end of the street, for ``duration_s``."""
-    clock: F64 = np.arange(-1.0, int(duration_s / STEP_S) + 4.0) * STEP_S
+    clock: F64 = np.arange(-1.0, int(duration_s / PACE.step_s) + 4.0) * PACE.step_s
     tracks = _lanes(scenario, terrain, lane, clock, rng) + _kerbsides(scenario, terrain, clock, rng)
     if scenario.crossing_m is not None:
         tracks += _queues(scenario, terrain, clock, rng)
@@ -117,14 +126,14 @@ def _kerbsides(scenario: Scenario, terrain: Terrain, clock: F64, rng: np.random.
     length, axis = scenario.length_m, terrain.axis_y
     for direction in (1, -1):
         for ahead in _spots(scenario.traffic.two_wheeler_spacing_m, 4.0, 7.0 * clock[-1], length, rng):
-            start = ((0.0 if direction > 0 else length) + direction * ahead, axis + direction * (KERB_M - 2.4))
+            start = ((0.0 if direction > 0 else length) + direction * ahead, axis + direction * (STREET.kerb_m - 2.4))
             path = _straight(start, 0.0 if direction > 0 else np.pi, rng.uniform(4.0, 7.0), 0.1, clock, rng)
             tracks.append(Track(shapes.two_wheeler(rng.uniform(1.6, 1.8)), path))
         for way in (1, -1):
             for ahead in _spots(2.0 * scenario.traffic.pedestrian_spacing_m, 1.5, 1.5 * clock[-1], length, rng):
                 start = (
                     (0.0 if way > 0 else length) + way * ahead,
-                    axis + direction * (KERB_M + rng.uniform(1.7, 2.4)),
+                    axis + direction * (STREET.kerb_m + rng.uniform(1.7, 2.4)),
                 )
                 path = _straight(start, 0.0 if way > 0 else np.pi, rng.uniform(0.9, 1.6), 0.12, clock, rng)
                 tracks.append(Track(shapes.pedestrian(rng.uniform(1.5, 1.85)), path))
@@ -137,8 +146,8 @@ def _queues(scenario: Scenario, terrain: Terrain, clock: F64, rng: np.random.Gen
     tracks = []
     for direction in (1, -1):  # northbound keeps to the west
         for offset in (1.75, 5.25):
-            stop, arrival = -_STOP_M, rng.uniform(0.0, 4.0)
-            while stop > -_BEYOND_M:
+            stop, arrival = -(STREET.kerb_m + STREET.stop_line_m), rng.uniform(0.0, 4.0)
+            while stop > -PACE.beyond_m:
                 speed, brake = rng.uniform(7.0, 10.0), 2.5
                 left = np.clip(speed - brake * np.maximum(clock - arrival, 0.0), 0.0, None)
                 along = stop - speed**2 / (2 * brake) + speed * np.minimum(clock - arrival, 0.0)
@@ -149,8 +158,11 @@ def _queues(scenario: Scenario, terrain: Terrain, clock: F64, rng: np.random.Gen
                 tracks.append(Track(_motor_vehicle(rng), path))
                 stop -= rng.uniform(12.0, 14.0)
                 arrival += rng.uniform(1.5, 5.0)
-        for ahead in _spots(2.0 * scenario.traffic.pedestrian_spacing_m, 1.5, 1.5 * clock[-1], _BEYOND_M, rng):
-            start = (scenario.crossing_m + direction * (KERB_M + 2.0), terrain.axis_y - 0.5 * _BEYOND_M + ahead)
+        for ahead in _spots(2.0 * scenario.traffic.pedestrian_spacing_m, 1.5, 1.5 * clock[-1], PACE.beyond_m, rng):
+            start = (
+                scenario.crossing_m + direction * (STREET.kerb_m + 2.0),
+                terrain.axis_y - 0.5 * PACE.beyond_m + ahead,
+            )
             path = _straight(start, direction * 0.5 * np.pi, rng.uniform(0.9, 1.6), 0.12, clock, rng)
             tracks.append(Track(shapes.pedestrian(rng.uniform(1.5, 1.85)), path))
     return tracks
@@ -183,9 +195,9 @@ def _spots(spacing: float, least: float, travel: float, length: float, rng: np.r
     """Start positions, as distance from the lane's entry, of all that will be on the street during the drive."""
     if spacing <= 0:
         return np.zeros(0)
-    count = int((travel + length + 2 * _BEYOND_M) / spacing) + 1
+    count = int((travel + length + 2 * PACE.beyond_m) / spacing) + 1
     steps = least + rng.exponential(max(spacing - least, 0.1), size=count)
-    return length + _BEYOND_M - np.cumsum(steps)
+    return length + PACE.beyond_m - np.cumsum(steps)
 
 
 def _motor_vehicle(rng: np.random.Generator) -> F64:

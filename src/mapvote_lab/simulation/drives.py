@@ -24,6 +24,7 @@ from mapvote_lab.simulation.processes import Run, mapping
 from mapvote_lab.simulation.routes import Route, make_routes
 from mapvote_lab.simulation.scenario import Scenario, load_scenario
 from mapvote_lab.simulation.truth import (
+    Recorded,
     T_map_street,
     count_hits,
     dense_survey,
@@ -34,8 +35,8 @@ from mapvote_lab.simulation.truth import (
 )
 from mapvote_lab.simulation.world import Role, World, make_world
 
-_CHUNK = 40
-"""Scans per task: small enough to keep two processes busy to the end."""
+_SCANS_A_TASK = 40
+"""Small enough to keep two processes busy to the end."""
 
 Progress = Callable[[int, int], None]
 """Called with (scans done, scans in all)."""
@@ -70,12 +71,12 @@ def simulate(
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
         with mapping(workers or _processes(stage)) as run:
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
-            survey, vehicles, densest, passed = _drive_all(stage, partial, run, progress)
+            recorded = _drive_all(stage, partial, run, progress)
             T = T_map_street(spec)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
                 writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
                 write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
-            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest, passed)
+            write_truth(partial / "truth", stage.world, spec, list(dense), recorded)
         os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -141,30 +142,28 @@ def _processes(stage: Stage) -> int:
     return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
 
 
-def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) -> tuple[I32, I32, I32, Bool]:
-    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still,
-    (rows, cols) the most of them that one scan of a vehicle had on built bodies, and (rows, cols) where a vehicle's
-    ray passed the place of a demolished surface."""
+def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) -> Recorded:
+    """Drive every route."""
     tasks = [
-        (stage.scenario, stage.seed, folder, drive, first, min(first + _CHUNK, route.scans))
+        (stage.scenario, stage.seed, folder, drive, first, min(first + _SCANS_A_TASK, route.scans))
         for drive, route in enumerate(stage.routes)
-        for first in range(0, route.scans, _CHUNK)
+        for first in range(0, route.scans, _SCANS_A_TASK)
     ]
     scans = sum(route.scans for route in stage.routes)
     totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)
     densest = np.zeros(stage.ground.shape, dtype=np.int32)
     passed = np.zeros(stage.ground.shape, dtype=np.bool_)
     done = 0
-    for task, (where, hits, most, through) in zip(tasks, run(_drive, tasks), strict=True):
+    for task, (cells, hits, most, through) in zip(tasks, run(_drive, tasks), strict=True):
         survey = stage.routes[task[3]].vehicle is None
-        totals[0 if survey else 1].ravel()[where] += hits
+        totals[0 if survey else 1].ravel()[cells] += hits
         if not survey:
             np.maximum(densest, most, out=densest)
             passed |= through
         done += task[5] - task[4]
         if progress:
             progress(done, scans)
-    return totals[0], totals[1], densest, passed
+    return Recorded(survey=totals[0], vehicles=totals[1], densest=densest, passed=passed)
 
 
 def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
@@ -219,5 +218,5 @@ def _drive(task: _Task) -> tuple[I32, I32, U8, Bool]:
             through = on_grid(passed_surfaces(gone, rays.origins, rays.directions, ranges), scenario)
             owners = np.full(len(through), removed[0], dtype=np.int32)
             count_hits(through, owners, roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, passes)
-    where = np.flatnonzero(counts).astype(np.int32)
-    return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8), passes[Role.REMOVED] > 0
+    hit_cells = np.flatnonzero(counts).astype(np.int32)
+    return hit_cells, counts.ravel()[hit_cells], most.clip(max=255).astype(np.uint8), passes[Role.REMOVED] > 0

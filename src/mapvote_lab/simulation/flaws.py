@@ -1,4 +1,4 @@
-"""What a real LiDAR gives besides the truth: mirrors, mixed pixels, surfaces that send nothing back, rain, exhaust.
+"""False and missing points of a real LiDAR: mirrors, mixed pixels, surfaces that send nothing back, rain, exhaust.
 
 * A smooth surface (a puddle, a pane, a car's paint) sends the beam on. What comes back over it is reported where the
   beam would have been without the mirror: below the road, behind the glass, inside the car.
@@ -15,21 +15,35 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, Bool
 from mapvote_lab.simulation.lidar import Caster, Sweep
 from mapvote_lab.simulation.scenario import Flaws
 
-PULSE_M = 1.5
-"""Half of a pulse of 10 ns: surfaces less far apart come back as one."""
-_EDGE_M = 0.15
-_PATCH_M = 2.0
-_PANE_M = 1.5
-_GRAZING = 0.25
-"""Cosine of incidence under which a wet road sends nothing back: 75 deg, 7 m before a car's sensor."""
-_DROPS_M = 5.0
-"""Mean range at which a drop is near enough to be seen."""
-_PLUME_M = 0.7
+
+@record()
+@dataclass(frozen=True, slots=True)
+class FlawSizes:
+    """Sizes of what spoils the points of the simulated LiDAR."""
+
+    pulse_m: float = 1.5
+    """Surfaces less far apart along a ray come back as one, metres: half of a pulse of 10 ns."""
+    edge_m: float = 0.15
+    """Neighbouring rays that differ by more than this in range straddle an edge, metres."""
+    patch_m: float = 2.0
+    """Side of the patches of road that are wet or dry, metres."""
+    pane_m: float = 1.5
+    """Side of the panes of a facade that are glass or wall, metres."""
+    grazing: float = 0.25
+    """Cosine of incidence under which a wet road sends nothing back: 75 deg, 7 m before a car's sensor."""
+    drops_m: float = 5.0
+    """Mean range at which a drop of rain returns a ray, metres."""
+    plume_m: float = 0.7
+    """Radius of an exhaust plume, metres."""
+
+
+FLAW_SIZES = FlawSizes()
 
 
 @dataclass(frozen=True)
@@ -63,7 +77,9 @@ def chance_of(cells: F64, seed: int) -> F64:
     return (h >> np.uint64(11)).astype(np.float64) / float(1 << 53)
 
 
-def surfaces(hits: Hits, points: F64, kinds: Kinds, flaws: Flaws) -> tuple[Bool, Bool, Bool, Bool]:
+def surfaces(
+    hits: Hits, points: F64, kinds: Kinds, flaws: Flaws, sizes: FlawSizes = FLAW_SIZES
+) -> tuple[Bool, Bool, Bool, Bool]:
     """(wet road, glass, paint, dark paint), each (rays,): what the rays that ended at ``points`` (rays, 3) have met."""
     met = np.isfinite(hits.ranges)
     still = met & ~hits.moving
@@ -72,16 +88,24 @@ def surfaces(hits: Hits, points: F64, kinds: Kinds, flaws: Flaws) -> tuple[Bool,
     facade = still & kinds.glazed[body]
     paint = hits.moving | (still & kinds.painted[body])
     wet, glass, dark = (np.zeros(len(met), dtype=np.bool_) for _ in range(3))
-    wet[road] = chance_of(np.floor(points[road, :2] / _PATCH_M), kinds.seed) < flaws.wet_share
-    glass[facade] = chance_of(np.floor(points[facade] / _PANE_M), kinds.seed + 1) < flaws.glass_share
+    wet[road] = chance_of(np.floor(points[road, :2] / sizes.patch_m), kinds.seed) < flaws.wet_share
+    glass[facade] = chance_of(np.floor(points[facade] / sizes.pane_m), kinds.seed + 1) < flaws.glass_share
     car = np.column_stack([hits.objects[paint], hits.moving[paint]])
     dark[paint] = chance_of(car, kinds.seed + 2) < flaws.dark_share
     return wet, glass, paint, dark
 
 
-def swallowed(wet: Bool, glass: Bool, dark: Bool, hits: Hits, sensor: Sensor, rng: np.random.Generator) -> Bool:
+def swallowed(
+    wet: Bool,
+    glass: Bool,
+    dark: Bool,
+    hits: Hits,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    sizes: FlawSizes = FLAW_SIZES,
+) -> Bool:
     """(rays,) which rays get nothing back: wet road under a flat angle, glass, dark paint the farther off it is."""
-    chance = 0.9 * (wet & (hits.cosine < _GRAZING)) + 0.8 * glass
+    chance = 0.9 * (wet & (hits.cosine < sizes.grazing)) + 0.8 * glass
     far = np.minimum(np.where(np.isfinite(hits.ranges), hits.ranges, 0.0) / (0.3 * sensor.max_range_m), 1.0)
     chance = chance + 0.9 * far * dark
     lost: Bool = rng.random(len(wet)) < chance
@@ -98,22 +122,22 @@ def reflected(
     """
     chosen = rng.permutation(np.flatnonzero(smooth))[: 4 * wanted]
     indices, ranges = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.float32)]
-    for caster, mine in zip(casters, (~hits.moving[chosen], hits.moving[chosen]), strict=True):
-        some = chosen[mine]
-        if len(some):
-            normals = caster.normals(rays.origins[some], rays.directions[some])
-            away = rays.directions[some]
+    for caster, its_rays in zip(casters, (~hits.moving[chosen], hits.moving[chosen]), strict=True):
+        met = chosen[its_rays]
+        if len(met):
+            normals = caster.normals(rays.origins[met], rays.directions[met])
+            away = rays.directions[met]
             bounced = away - 2.0 * np.einsum("ij,ij->i", away, normals)[:, None] * normals
-            mirror = rays.origins[some] + hits.ranges[some, None] * away
+            mirror = rays.origins[met] + hits.ranges[met, None] * away
             beyond, _, _ = casters[0].cast((mirror + 0.01 * bounced).astype(np.float32), bounced.astype(np.float32))
-            indices.append(some)
-            ranges.append((hits.ranges[some] + beyond).astype(np.float32))
+            indices.append(met)
+            ranges.append((hits.ranges[met] + beyond).astype(np.float32))
     index, way = np.concatenate(indices), np.concatenate(ranges)
     seen = np.flatnonzero(way < sensor.max_range_m)[:wanted]
     return index[seen], way[seen]
 
 
-def mixed(ranges: F32, beams: int, share: float, rng: np.random.Generator) -> Bool:
+def mixed(ranges: F32, beams: int, share: float, rng: np.random.Generator, sizes: FlawSizes = FLAW_SIZES) -> Bool:
     """Mix ranges (rays,) in place where the beam beside meets something else within a pulse; which were, (rays,).
 
     Rays are in firing order, ``beams`` of one azimuth together: the neighbour in azimuth is ``beams`` rays on.
@@ -121,29 +145,35 @@ def mixed(ranges: F32, beams: int, share: float, rng: np.random.Generator) -> Bo
     beside = np.roll(ranges, -beams)
     with np.errstate(invalid="ignore"):
         apart = np.abs(beside - ranges)
-    edge: Bool = (apart > _EDGE_M) & (apart < PULSE_M) & (rng.random(len(ranges)) < share)
+    edge: Bool = (apart > sizes.edge_m) & (apart < sizes.pulse_m) & (rng.random(len(ranges)) < share)
     part = rng.random(len(ranges), dtype=np.float32)[edge]
     ranges[edge] += part * (beside[edge] - ranges[edge])
     return edge
 
 
-def shortened(rays: Sweep, ranges: F32, tails: F64, flaws: Flaws, rng: np.random.Generator) -> Bool:
+def shortened(
+    rays: Sweep,
+    ranges: F32,
+    tails: F64,
+    flaws: Flaws,
+    rng: np.random.Generator,
+    sizes: FlawSizes = FLAW_SIZES,
+) -> Bool:
     """Let rays (in place) end on drops and in the exhaust behind ``tails`` (n, 3); which did, (rays,)."""
     short = np.zeros(len(ranges), dtype=np.bool_)
     if flaws.rain > 0:
-        drop = rng.exponential(_DROPS_M, len(ranges)).astype(np.float32)
+        drop = rng.exponential(sizes.drops_m, len(ranges)).astype(np.float32)
         wet = (rng.random(len(ranges)) < flaws.rain) & (drop < ranges)
         ranges[wet], short = drop[wet], short | wet
     for k in np.flatnonzero(rng.random(len(tails)) < flaws.exhaust):
         offset = tails[k] - rays.origins
         along = np.einsum("ij,ij->i", offset, rays.directions)
         miss = np.einsum("ij,ij->i", offset, offset) - along**2
-        inside = (along > 0) & (miss < _PLUME_M**2) & (rng.random(len(ranges)) < 0.3)
-        where = (along + rng.uniform(-1.0, 1.0, len(ranges)) * np.sqrt(np.maximum(_PLUME_M**2 - miss, 0.0))).astype(
-            "f4"
-        )
-        inside &= where < ranges
-        ranges[inside], short = where[inside], short | inside
+        inside = (along > 0) & (miss < sizes.plume_m**2) & (rng.random(len(ranges)) < 0.3)
+        half_way_through = np.sqrt(np.maximum(sizes.plume_m**2 - miss, 0.0))
+        ends = (along + rng.uniform(-1.0, 1.0, len(ranges)) * half_way_through).astype(np.float32)
+        inside &= ends < ranges
+        ranges[inside], short = ends[inside], short | inside
     return short
 
 

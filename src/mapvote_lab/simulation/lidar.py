@@ -14,13 +14,29 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mapvote.core.kernel import allocating
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool
 
 NOTHING = -1
 """Object id of a ray that meets nothing."""
-_BASE_DROP = 0.008
-_FAINT = 0.035
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ReturnStrength:
+    """Which rays of the simulated LiDAR give no point, by how strong their return is."""
+
+    base_drop: float = 0.008
+    """Share of all rays that are lost by chance."""
+    faint: float = 0.035
+    """Strength at which a return is lost with a chance of 1/e; 1: a surface at the greatest range, met at a right
+    angle."""
+    nearest_m: float = 5.0
+    """Returns nearer than this are no stronger than at this range, metres."""
+
+
+RETURN_STRENGTH = ReturnStrength()
 
 
 class Caster:
@@ -39,7 +55,7 @@ class Caster:
             n = len(origins)
             return np.full(n, np.inf, np.float32), np.full(n, NOTHING, np.int32), np.ones(n, np.float32)
         hit = self._scene.run(origins, directions, output=1)
-        return _told(hit["tfar"], hit["primID"], hit["Ng"], directions, self._owners)
+        return _first_hits(hit["tfar"], hit["primID"], hit["Ng"], directions, self._owners)
 
     def normals(self, origins: F32, directions: F32) -> F32:
         """(n, 3) unit normals of the surfaces that these rays hit, each of which must hit one."""
@@ -48,8 +64,8 @@ class Caster:
 
 
 @allocating
-def _told(far: F32, triangle: I32, normals: F32, directions: F32, owners: I32) -> tuple[F32, I32, F32]:
-    """What :meth:`Caster.cast` says of rays that met a ``triangle`` each (n,), or -1."""
+def _first_hits(far: F32, triangle: I32, normals: F32, directions: F32, owners: I32) -> tuple[F32, I32, F32]:
+    """Range, object and |cos of incidence| of rays that met a ``triangle`` each (n,), or -1."""
     n = len(far)
     ranges, objects, cosine = np.full(n, np.inf, np.float32), np.empty(n, np.int32), np.zeros(n, np.float32)
     for i in range(n):
@@ -99,12 +115,18 @@ def sweep(
     return Sweep(np.ascontiguousarray(origins).reshape(-1, 3), directions.reshape(-1, 3), local.reshape(-1, 3))
 
 
-def measure(sensor: Sensor, ranges: F32, cosine: F32, rng: np.random.Generator) -> tuple[F32, Bool]:
+def measure(
+    sensor: Sensor,
+    ranges: F32,
+    cosine: F32,
+    rng: np.random.Generator,
+    returns: ReturnStrength = RETURN_STRENGTH,
+) -> tuple[F32, Bool]:
     """Noisy ranges (n,) and which rays give a point: in range, not too faint, not dropped by chance."""
     n = len(ranges)
     noisy = ranges + np.float32(sensor.range_sigma_m) * rng.standard_normal(n, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        strength = cosine * (sensor.max_range_m / np.maximum(ranges, 5.0)) ** 2
-        chance = _BASE_DROP + np.exp(-strength / _FAINT)
+        strength = cosine * (sensor.max_range_m / np.maximum(ranges, returns.nearest_m)) ** 2
+        chance = returns.base_drop + np.exp(-strength / returns.faint)
     kept = rng.random(n, dtype=np.float32) >= chance
     return noisy, kept & (noisy > sensor.min_range_m) & (ranges < sensor.max_range_m)

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-_SOON_S = 0.05
-
 
 @contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
@@ -59,7 +57,8 @@ class _Pool(ProcessPoolExecutor):
 
 
 class _Ear:
-    """What a process has been told. It may end in the middle of a task only: between two of them it may hold half a
+    """State of a process that may be told to end. It may end in the middle of a task only: between two of them it may
+    hold half a
     result, which the first process would wait for for ever."""
 
     told = False
@@ -87,9 +86,9 @@ def _hear(*_: object) -> None:
 
 
 def _hear_again(lost: UnraisableHookArgs) -> None:
-    """Python drops what is raised while it takes an object away: what was told just then is told once more."""
+    """Python drops an exception raised while it takes an object away: the signal is sent once more, after 0.05 s."""
     if issubclass(lost.exc_type, SystemExit):
-        again = threading.Timer(_SOON_S, os.kill, (os.getpid(), signal.SIGUSR1))
+        again = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR1))
         again.daemon = True
         again.start()
     else:

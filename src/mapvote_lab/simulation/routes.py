@@ -7,26 +7,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64
 from mapvote_lab.simulation.scenario import LANES, Scenario
 from mapvote_lab.simulation.world import Terrain
 
-RTK_SIGMA_M = 0.02
-RTK_SIGMA_DEG = 0.05
 _SECOND_NS = 1_000_000_000
-_FIRST_DRIVE_NS = 1_756_720_800 * _SECOND_NS
-"""2025-09-01 10:00 UTC: the first survey."""
 
 
-PRIOR_MEMORY_S = 10.0
-"""Correlation time of errors of priors, long against the passing of a house."""
+@record()
+@dataclass(frozen=True, slots=True)
+class DrivePlan:
+    """When the simulated drives start, and how their poses err."""
+
+    rtk_sigma_m: float = 0.02
+    """Standard deviation of a survey's positions, metres: RTK."""
+    rtk_sigma_deg: float = 0.05
+    """Standard deviation of a survey's angles, degrees."""
+    memory_s: float = 10.0
+    """Correlation time of errors of priors, seconds: long against the passing of a house."""
+    first_s: int = 1_756_720_800
+    """Start of the first survey, seconds since 1970: 2025-09-01 10:00 UTC."""
+    surveys_apart_s: int = 1_200
+    """Time from the start of one survey to the next, seconds."""
+    votes_after_s: int = 30 * 86_400
+    """Time from the first survey to the first voting vehicle, seconds."""
+    votes_apart_s: int = 5_400
+    """Time from the start of one voting vehicle to the next, seconds."""
 
 
-def ar1(step_s: F64, sigma: F64, rng: np.random.Generator) -> F64:
+DRIVE_PLAN = DrivePlan()
+
+
+def ar1(step_s: F64, sigma: F64, rng: np.random.Generator, memory_s: float = DRIVE_PLAN.memory_s) -> F64:
     """(n, k) first-order autoregressive errors ``step_s`` (n - 1,) apart, stationary with deviations ``sigma`` (k,)."""
     kicks = rng.normal(size=(len(step_s) + 1, len(sigma))) * sigma
     out = kicks.copy()
-    for i, memory in enumerate(np.exp(-step_s / PRIOR_MEMORY_S), 1):
+    for i, memory in enumerate(np.exp(-step_s / memory_s), 1):
         out[i] = memory * out[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
     return out
 
@@ -90,19 +107,21 @@ class Route:
         return T
 
     def priors(self, rng: np.random.Generator) -> F64:
-        """What the vehicle believes at the stamps, (scans, 4, 4): the truth with a smooth AR(1) error."""
+        """(scans, 4, 4) poses that the vehicle believes at the stamps: the truth with a smooth AR(1) error."""
         tilt = self.prior_sigma_deg if self.vehicle is None else 0.3 * self.prior_sigma_deg
         sigma = np.array([*[self.prior_sigma_m] * 3, *np.radians([tilt, tilt, self.prior_sigma_deg])])
         errors = ar1(np.full(self.scans - 1, 1.0 / self.rate_hz), sigma, rng)
         return np.array([erring(T, error) for T, error in zip(self.poses(self.time_s), errors, strict=True)])
 
 
-def make_routes(scenario: Scenario, terrain: Terrain, seed: int) -> list[Route]:
+def make_routes(scenario: Scenario, terrain: Terrain, seed: int, plan: DrivePlan = DRIVE_PLAN) -> list[Route]:
     """Surveys first, then the voting vehicles, each at its own hour."""
+    # Length and number of scans are the same for all drives.
     speed = scenario.speed_kmh / 3.6
     scans = int(scenario.length_m / speed * scenario.rate_hz + 1e-6) + 1
     routes = []
     lanes = scenario.vehicle_lanes
+    # (name, number of the voting vehicle, lane)
     drives: list[tuple[str, int | None, str]] = [
         (f"survey_{i + 1}", None, lane) for i, lane in enumerate(scenario.surveys)
     ]
@@ -110,21 +129,21 @@ def make_routes(scenario: Scenario, terrain: Terrain, seed: int) -> list[Route]:
     for index, (name, vehicle, lane) in enumerate(drives):
         rng = np.random.default_rng([seed, 3, index])
         survey = vehicle is None
-        after = index * 1200 if survey else 30 * 86_400 + index * 5_400
+        after_s = index * plan.surveys_apart_s if survey else plan.votes_after_s + index * plan.votes_apart_s
         routes.append(
             Route(
                 name=name,
                 vehicle=vehicle,
                 lane=lane,
-                start_ns=_FIRST_DRIVE_NS + after * _SECOND_NS,
+                start_ns=(plan.first_s + after_s) * _SECOND_NS,
                 scans=scans,
                 rate_hz=scenario.rate_hz,
                 speed=speed,
                 length=scenario.length_m,
                 mount_height_m=scenario.mount_height_m,
                 sway=rng.uniform(0, 2 * np.pi, 5),
-                prior_sigma_m=RTK_SIGMA_M if survey else round(rng.uniform(0.3, 1.0), 2),
-                prior_sigma_deg=RTK_SIGMA_DEG if survey else 1.0,
+                prior_sigma_m=plan.rtk_sigma_m if survey else round(rng.uniform(0.3, 1.0), 2),
+                prior_sigma_deg=plan.rtk_sigma_deg if survey else 1.0,
                 terrain=terrain,
             )
         )

@@ -9,18 +9,31 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, MapvoteError
 from mapvote_lab.simulation import shapes
 from mapvote_lab.simulation.scenario import Scenario
 from mapvote_lab.simulation.shapes import FOOT_M, box, building, car, hedge, join, place, van
 
-KERB_M = 9.2
-"""From the road's axis to the kerb: two lanes of 3.5 m and a parking strip of 2.2 m."""
-SIDEWALK_M = 12.4
-"""From the road's axis to the outer edge of the sidewalk."""
-KERB_HEIGHT_M = 0.15
-MARGIN_M = 80.0
-"""The world goes on beyond the scored window: rays must not fall off its edge."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CrossSection:
+    """Measures of every simulated street."""
+
+    kerb_m: float = 9.2
+    """Distance from the road's axis to the kerb, metres: two lanes of 3.5 m and a parking strip of 2.2 m."""
+    sidewalk_m: float = 12.4
+    """Distance from the road's axis to the outer edge of the sidewalk, metres."""
+    kerb_height_m: float = 0.15
+    """Height of the kerb over the gutter, metres."""
+    margin_m: float = 80.0
+    """Length by which the world goes on beyond the scored window, metres: rays must not fall off its edge."""
+    stop_line_m: float = 4.0
+    """Distance of the crossing street's stop lines from the kerb, metres."""
+
+
+STREET = CrossSection()
 
 
 @dataclass(frozen=True)
@@ -45,17 +58,19 @@ class Terrain:
         """z of the ground at map (x, y), broadcast."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         distance = self.road_distance(x, y)
-        z = np.where(distance < KERB_M, -self.crown * distance, -self.crown * KERB_M + KERB_HEIGHT_M)
-        z = z + 0.015 * np.clip(distance - KERB_M, 0.0, 25.0)
+        z = np.where(
+            distance < STREET.kerb_m, -self.crown * distance, -self.crown * STREET.kerb_m + STREET.kerb_height_m
+        )
+        z = z + 0.015 * np.clip(distance - STREET.kerb_m, 0.0, 25.0)
         for amplitude, kx, ky, phase in self.waves:
             z = z + amplitude * np.sin(kx * x + ky * y + phase)
         return z
 
     def triangles(self) -> F64:
         """The ground as a mesh that follows :meth:`height`, kerbs included."""
-        xs = np.arange(-MARGIN_M, self.length + MARGIN_M + 1.0, 2.0)
+        xs = np.arange(-STREET.margin_m, self.length + STREET.margin_m + 1.0, 2.0)
         # The gutter is just within the kerb: on it, rounding would decide whether the road or the sidewalk is there.
-        side = np.array([3.5, KERB_M - 0.005, KERB_M + 0.005, SIDEWALK_M])
+        side = np.array([3.5, STREET.kerb_m - 0.005, STREET.kerb_m + 0.005, STREET.sidewalk_m])
         kerb = np.concatenate([-side[::-1], [0.0], side])
         plots = np.array([18.0, 25.0, 34.2, 45.0, 60.0, 80.0])
         ys = self.axis_y + np.concatenate([-plots, kerb, plots])
@@ -169,20 +184,27 @@ def make_world(scenario: Scenario, seed: int) -> World:
         bodies += _kerbside(scenario, side, terrain, rng)
     middle = Side(0.0, terrain.axis_y, 0.0, 1, ())
     for s in scenario.clutter.gantry_m:
-        bodies.append(Body("gantry", middle.put(shapes.gantry(KERB_M + 0.6), s, 0.0, terrain)))
+        bodies.append(Body("gantry", middle.put(shapes.gantry(STREET.kerb_m + 0.6), s, 0.0, terrain)))
     bodies += _parked_cars(scenario, terrain, np.random.default_rng([seed, 2]))
     return World(terrain, tuple(bodies))
 
 
 def _sides(scenario: Scenario) -> list[Side]:
     """North and south of the main street, then both sides of the one that crosses it."""
-    axis, low, high, cross = 0.5 * scenario.width_m, -MARGIN_M, scenario.length_m + MARGIN_M, scenario.crossing_m
+    axis, low, high, cross = (
+        0.5 * scenario.width_m,
+        -STREET.margin_m,
+        scenario.length_m + STREET.margin_m,
+        scenario.crossing_m,
+    )
     if cross is None:
         return [Side(0.0, axis, 0.0, sign, ((low, high),)) for sign in (1, -1)]
-    gap = SIDEWALK_M + 0.5
+    gap = STREET.sidewalk_m + 0.5
     main = [Side(0.0, axis, 0.0, sign, ((low, cross - gap), (cross + gap, high))) for sign in (1, -1)]
-    first = SIDEWALK_M + 18.0  # behind the corner buildings of the main street
-    return main + [Side(cross, axis, 0.5 * np.pi, sign, ((-MARGIN_M, -first), (first, MARGIN_M))) for sign in (1, -1)]
+    first = STREET.sidewalk_m + 18.0  # behind the corner buildings of the main street
+    return main + [
+        Side(cross, axis, 0.5 * np.pi, sign, ((-STREET.margin_m, -first), (first, STREET.margin_m))) for sign in (1, -1)
+    ]
 
 
 def _plots(scenario: Scenario, side: Side, rng: np.random.Generator) -> Iterator[tuple[float, float, str]]:
@@ -224,17 +246,19 @@ def _frontage(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     for low, high, change in _plots(scenario, side, rng):
         draw = rng if equal is None else np.random.default_rng(equal)  # the same draws make the same house
         width, height, turn = high - low, draw.uniform(4.0, 15.0), draw.normal(0.0, 0.015)
-        setback = SIDEWALK_M + draw.choice([draw.uniform(0.2, 0.9), draw.uniform(0.9, 3.0)], p=[0.65, 0.35])
+        setback = STREET.sidewalk_m + draw.choice([draw.uniform(0.2, 0.9), draw.uniform(0.9, 3.0)], p=[0.65, 0.35])
         yards = change == "kept" and equal is None
         if yards and draw.uniform() < 0.09:  # a fence or hedge in front, a shed at the back
             front = hedge(draw, width, 0.6, 1.1) if draw.uniform() < 0.5 else box(0, width, -0.08, 0.08, -0.5, 1.6)
-            bodies.append(Body("fence", side.put(front, low, SIDEWALK_M + 0.4, terrain)))
-            bodies.append(Body("shed", side.put(box(0, 0.5 * width, 0, 3, -1, 2.6), low, SIDEWALK_M + 9.0, terrain)))
+            bodies.append(Body("fence", side.put(front, low, STREET.sidewalk_m + 0.4, terrain)))
+            bodies.append(
+                Body("shed", side.put(box(0, 0.5 * width, 0, 3, -1, 2.6), low, STREET.sidewalk_m + 9.0, terrain))
+            )
             continue
         house = side.put(building(draw, width, draw.uniform(8.0, 13.0), height), low, setback, terrain, turn)
         bodies.append(Body("building", house, change != "built", (change != "demolished",) * scenario.vehicles))
-        if change == "kept" and setback > SIDEWALK_M + 1.4 and draw.uniform() < 0.5:
-            bodies.append(Body("hedge", side.put(hedge(draw, width, 0.5, 0.9), low, SIDEWALK_M + 0.5, terrain)))
+        if change == "kept" and setback > STREET.sidewalk_m + 1.4 and draw.uniform() < 0.5:
+            bodies.append(Body("hedge", side.put(hedge(draw, width, 0.5, 0.9), low, STREET.sidewalk_m + 0.5, terrain)))
     for low, high in ((a, b) for span in side.spans for a, b, _ in _fill(span[0] - 3.0, span[1], rng)):
         back = building(rng, (high - low) * rng.uniform(0.75, 0.95), 10.0, rng.uniform(5.0, 15.0))
         bodies.append(Body("building", side.put(back, low, rng.uniform(29.0, 36.0), terrain)))
@@ -246,7 +270,7 @@ def _blocks(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.Gen
     bodies = []
     for low, high, change in _plots(scenario, side, rng):
         block = box(0, high - low, 0, rng.uniform(8.0, 13.0), FOOT_M, rng.uniform(4.0, 15.0))
-        placed = side.put(block, low, SIDEWALK_M + rng.uniform(0.2, 0.9), terrain, rng.normal(0.0, 0.005))
+        placed = side.put(block, low, STREET.sidewalk_m + rng.uniform(0.2, 0.9), terrain, rng.normal(0.0, 0.005))
         bodies.append(Body("building", placed, change != "built", (change != "demolished",) * scenario.vehicles))
     return bodies
 
@@ -255,10 +279,10 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     """Trees, lamps, signs, furniture and guard rails on the sidewalk."""
     clutter = scenario.clutter
     rows = (
-        ("tree", clutter.tree_spacing_m, KERB_M + 0.9, shapes.tree),
-        ("pole", clutter.pole_spacing_m, KERB_M + 0.5, shapes.pole),
-        ("sign", clutter.sign_spacing_m, KERB_M + 0.45, shapes.sign),
-        ("furniture", clutter.furniture_spacing_m, KERB_M + 0.85, shapes.street_box),
+        ("tree", clutter.tree_spacing_m, STREET.kerb_m + 0.9, shapes.tree),
+        ("pole", clutter.pole_spacing_m, STREET.kerb_m + 0.5, shapes.pole),
+        ("sign", clutter.sign_spacing_m, STREET.kerb_m + 0.45, shapes.sign),
+        ("furniture", clutter.furniture_spacing_m, STREET.kerb_m + 0.85, shapes.street_box),
     )
     bodies: list[Body] = []
     taken: list[float] = []
@@ -274,7 +298,7 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
         while s < high - 20.0:
             length = 2.0 * rng.integers(3, 9)
             if rng.uniform() < clutter.rail_share:
-                bodies.append(Body("rail", side.put(shapes.rail(length), s, KERB_M + 0.25, terrain)))
+                bodies.append(Body("rail", side.put(shapes.rail(length), s, STREET.kerb_m + 0.25, terrain)))
             s += length + rng.uniform(1.0, 4.0)
     return bodies
 
@@ -288,7 +312,7 @@ def _parked_cars(scenario: Scenario, terrain: Terrain, rng: np.random.Generator)
             make = van if rng.uniform() < 0.12 else car
             jitter, turn, draw = rng.uniform(-0.4, 0.4), rng.normal(0, 0.02), rng.uniform()
             before, visits = bool(rng.uniform() < 0.5), tuple((rng.uniform(size=10) < 0.5).tolist())[:passes]
-            triangles = side.put(make(), s + jitter, KERB_M - 1.15, terrain, turn)
+            triangles = side.put(make(), s + jitter, STREET.kerb_m - 1.15, terrain, turn)
             if draw < scenario.clutter.parked_share:
                 bodies.append(Body("parked car", triangles))
             elif draw < scenario.clutter.parked_share + scenario.clutter.visitor_share:
