@@ -21,7 +21,6 @@ from mapvote.fusion.fuse import Decision
 from mapvote_lab.evaluation.scores import (
     PAPER_F1,
     PAPER_SCORES,
-    UNSCORED,
     MapJudge,
     ObjectRests,
     determined_share,
@@ -32,6 +31,7 @@ from mapvote_lab.evaluation.scores import (
     score_objects,
     to_json,
 )
+from mapvote_lab.simulation.truth import Label
 
 
 @pytest.mark.parametrize("case", ["1", "2", "3", "4", "5"])
@@ -42,7 +42,7 @@ def test_table_iv_follows_from_tables_ii_and_iii(case: str) -> None:
 
 
 def test_counts_by_hand() -> None:
-    truth = np.array([[1, 1, 2, 2, 0, 0, UNSCORED]], dtype=np.uint8)
+    truth = np.array([[1, 1, 2, 2, 0, 0, Label.UNSCORED]], dtype=np.uint8)
     states = np.array([[2, 4, 3, 2, 3, 255, 3]], dtype=np.uint8)
     scores = score_cells(states, truth)
     assert tuple(scores.precision) == (0.5, 0.5, 0.5)
@@ -65,14 +65,14 @@ def test_scores_are_shares_and_never_nan(states: np.ndarray, truth: np.ndarray) 
 
 @given(truths)
 def test_a_perfect_answer_scores_one_in_every_class_that_exists(truth: np.ndarray) -> None:
-    states = np.choose(np.where(truth == UNSCORED, 0, truth), [0, 2, 3]).astype(np.uint8)
+    states = np.choose(np.where(truth == Label.UNSCORED, 0, truth), [0, 2, 3]).astype(np.uint8)
     scores = score_cells(states, truth)
     for k in range(3):
         assert tuple(scores.f1)[k] == (1.0 if (truth == k).any() else 0.0)
 
 
 def test_coverage_is_of_any_vehicle_over_scored_cells() -> None:
-    truth = np.array([[0, 1, 2, 0, UNSCORED]], dtype=np.uint8)
+    truth = np.array([[0, 1, 2, 0, Label.UNSCORED]], dtype=np.uint8)
     one = np.array([[0, 4, 255, 255, 0]], dtype=np.uint8)
     two = np.array([[255, 2, 4, 255, 0]], dtype=np.uint8)
     assert determined_share([one, two], truth) == 0.5
@@ -137,7 +137,9 @@ def test_an_object_is_found_by_half_of_its_cells_and_inventions_are_measured() -
     assert scores.false_m2 == (2.25, 1.8), "largest first"
 
 
-@pytest.mark.parametrize(("gap", "beside", "false"), [(2, 1, ()), (3, 1, (1.8,)), (2, 2, (1.8,)), (2, UNSCORED, ())])
+@pytest.mark.parametrize(
+    ("gap", "beside", "false"), [(2, 1, ()), (3, 1, (1.8,)), (2, 2, (1.8,)), (2, Label.UNSCORED, ())]
+)
 def test_an_invention_is_three_cells_off_the_truth_of_its_kind_and_of_what_is_not_scored(
     gap: int, beside: int, false: tuple[float, ...]
 ) -> None:

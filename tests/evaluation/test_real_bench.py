@@ -10,12 +10,10 @@ import numpy as np
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import Bool, CellState
 from mapvote_lab.evaluation.real_bench import (
-    BUILT,
-    BUILT_IN_RAIN,
-    DEMOLISHED,
     Asked,
     Bench,
     Changed,
+    ChangedRun,
     Ground,
     precision_near,
     score,
@@ -66,7 +64,7 @@ def changed(kind: str, state: CellState, found: int) -> Changed:
 def test_what_was_found_in_rain_stands_beside_what_was_found_dry() -> None:
     dry = changed("wall built", CellState.CHANGED_OCCUPIED, 4)
     wet, gone = changed("wall built", CellState.CHANGED_OCCUPIED, 1), changed("wall gone", CellState.CHANGED_EMPTY, 2)
-    runs = {BUILT: dry, BUILT_IN_RAIN: wet, DEMOLISHED: gone}
+    runs = {ChangedRun.BUILT: dry, ChangedRun.BUILT_IN_RAIN: wet, ChangedRun.DEMOLISHED: gone}
     _, cast_into, in_rain = real_tables(Bench("street", 30, Ground(1.7, 0.0, 0.0, 0.0), changed=runs), "5")
     assert cast_into.title.endswith("1.00 (built), 1.00 (built in rain, 10 % of the rays), 1.00 (demolished)")
     assert cast_into.rows == [("wall built", "1", "1", "1", "1.00", "7"), ("wall gone", "1", "1", "1", "0.50", "7")]

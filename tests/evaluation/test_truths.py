@@ -10,8 +10,8 @@ import pytest
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote_lab.evaluation.scores import UNSCORED
-from mapvote_lab.evaluation.truths import BORDER_M, TRUTHS, Truth, border, ceiling
+from mapvote_lab.evaluation.truths import TRUTH_READING, TRUTHS, Truth, border, ceiling
+from mapvote_lab.simulation.truth import Label
 
 KEPT, ADDED, REMOVED = range(3)
 
@@ -52,7 +52,7 @@ MIDDLE = 4.5 * CELL_SIZE
         (2, {"removed": MIDDLE}, []),
         (1, {"added": RIM}, [3, 4]),
         (2, {"removed": RIM}, [3, 4]),
-        (2, {"removed": MIDDLE, "kept": 5 * CELL_SIZE + BORDER_M / 2}, [4]),
+        (2, {"removed": MIDDLE, "kept": 5 * CELL_SIZE + TRUTH_READING.border_m / 2}, [4]),
         (1, {"added": RIM, "kept": 3.5 * CELL_SIZE}, [4]),
     ],
     ids=["built", "demolished", "built at a rim", "demolished at a rim", "beside what stands", "what stands firmly"],
@@ -62,7 +62,7 @@ def test_border_scores_no_cell_whose_rim_decides(
 ) -> None:
     cells = column_of(kind, 4)
     found = border(truth_of(tmp_path, cells, **walls), cells)
-    assert np.flatnonzero((found == UNSCORED).all(axis=0)).tolist() == unscored
+    assert np.flatnonzero((found == Label.UNSCORED).all(axis=0)).tolist() == unscored
     scored = np.setdiff1d(np.arange(10), unscored)
     np.testing.assert_array_equal(found[:, scored], cells[:, scored])
 
@@ -74,7 +74,7 @@ def test_perfect_labels_lose_what_noise_carries_over_the_rim(tmp_path: Path, x: 
 
 
 GRID = Grid(Lattice(), 0, 0, 1, 6)
-PROVENANCE = [[0, 1, 1, 2, 2, UNSCORED]]
+PROVENANCE = [[0, 1, 1, 2, 2, Label.UNSCORED]]
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def first_map() -> Reference:
 
 def test_what_no_scan_and_no_map_holds_cannot_be_known(truth: Truth, first_map: Reference) -> None:
     known = TRUTHS["could be known"](truth, first_map)
-    assert known.tolist() == [[0, UNSCORED, 1, 2, UNSCORED, UNSCORED]]
+    assert known.tolist() == [[0, Label.UNSCORED, 1, 2, Label.UNSCORED, Label.UNSCORED]]
     assert truth.provenance.tolist() == PROVENANCE, "the truth it is taken from stays as it is"
 
 
@@ -108,7 +108,7 @@ def test_a_cell_that_no_ray_decided_or_where_the_map_holds_a_point_on_nothing_is
     truth: Truth, first_map: Reference
 ) -> None:
     states = TRUTHS["known"](truth, first_map)
-    assert states.tolist() == [[0, 1, UNSCORED, 2, UNSCORED, UNSCORED]]
-    assert TRUTHS["known"](replace(truth, passed=np.zeros_like(truth.passed)), first_map)[0, 3] == UNSCORED
+    assert states.tolist() == [[0, 1, Label.UNSCORED, 2, Label.UNSCORED, Label.UNSCORED]]
+    assert TRUTHS["known"](replace(truth, passed=np.zeros_like(truth.passed)), first_map)[0, 3] == Label.UNSCORED
     first_map.counts[0, 0] = 1
-    assert TRUTHS["known"](truth, first_map)[0, 0] == UNSCORED, "nothing that stood at the survey is near cell 0"
+    assert TRUTHS["known"](truth, first_map)[0, 0] == Label.UNSCORED, "nothing that stood at the survey is near cell 0"

@@ -3,8 +3,7 @@
 The latter is after Kim et al. [15]. Every 0.3 m voxel carries Dempster-Shafer masses (occupied, free, unknown). A scan
 gives evidence along its rays, a vehicle combines its scans, the server its vehicles and then the map; conflict with the
 map is change. Kim et al. cluster features by similarity and have no released code: this keeps their evidence, not their
-clustering. Masses: a ray that ends in a voxel supports "occupied" by 0.7, one that passes it "free" by 0.3; at least
-0.01 stays unknown, so that the present can outvote the past.
+clustering. :class:`Evidence` has the masses.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot, plurality
@@ -42,13 +43,40 @@ from mapvote_lab.simulation.processes import mapping
 
 LAYERS = 64
 """Voxels of a column, as in the map's column words: 19.2 m above the road."""
-HIT_MASS = 0.7
-PASS_MASS = 0.3
-LEAST_UNKNOWN = 0.01
-MAP_MASS = 0.9
-_UNCHANGED_OCCUPIED, _UNCHANGED_EMPTY, _CHANGED_OCCUPIED, _CHANGED_EMPTY, _UNDETERMINED = (int(s) for s in CellState)
-CONFLICT = 0.5
-"""Change where the mass of "map and vehicles contradict each other" exceeds this."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Dempster-Shafer masses of the yardstick "evidence"."""
+
+    hit: float = 0.7
+    """Mass of "occupied" from a ray that ends in a voxel."""
+    passed: float = 0.3
+    """Mass of "free" from a ray that passes a voxel."""
+    least_unknown: float = 0.01
+    """Mass that always stays unknown, so that the present can outvote the past."""
+    of_map: float = 0.9
+    """Mass of "occupied" or "free" from the map."""
+    conflict: float = 0.5
+    """A voxel changed where the mass of "map and vehicles contradict each other" exceeds this."""
+
+
+EVIDENCE = Evidence()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class NearestRule:
+    """Numbers of the yardstick "nearest"."""
+
+    far_m: float = 0.5
+    """A point farther than this from every point of the other cloud is new or gone, metres."""
+    merge_every: int = 16
+    """Scans between two reductions of a vehicle's cloud to one point a voxel."""
+
+
+NEAREST_RULE = NearestRule()
 
 
 @kernel
@@ -116,10 +144,12 @@ def _march(
 
 
 @kernel
-def dempster(o1: float, f1: float, o2: float, f2: float) -> tuple[float, float]:
+def dempster(
+    o1: float, f1: float, o2: float, f2: float, least_unknown: float = EVIDENCE.least_unknown
+) -> tuple[float, float]:
     """Dempster's rule for two bodies of evidence on {occupied, free}: masses (occupied, free) of the combination.
 
-    The rest of each mass is unknown; of the result at least LEAST_UNKNOWN stays so, which also keeps it defined
+    The rest of each mass is unknown; of the result at least ``least_unknown`` stays so, which also keeps it defined
     for total contradiction.
     """
     u1, u2 = 1.0 - o1 - f1, 1.0 - o2 - f2
@@ -129,31 +159,35 @@ def dempster(o1: float, f1: float, o2: float, f2: float) -> tuple[float, float]:
         return 0.0, 0.0
     o, f = o / total, f / total
     known = o + f
-    if known > 1.0 - LEAST_UNKNOWN:
-        o, f = o * (1.0 - LEAST_UNKNOWN) / known, f * (1.0 - LEAST_UNKNOWN) / known
+    if known > 1.0 - least_unknown:
+        o, f = o * (1.0 - least_unknown) / known, f * (1.0 - least_unknown) / known
     return o, f
 
 
 @kernel
-def _absorb(hits: U16, passes: U16, touched: I32, n: int, occupied: F32, free: F32) -> None:
+def _absorb(
+    hits: U16, passes: U16, touched: I32, n: int, occupied: F32, free: F32,
+    hit: float, passed: float, least_unknown: float,
+) -> None:  # fmt: skip
     """One scan's counts into a vehicle's masses; the counts are cleared again."""
     for i in range(n):
         v = touched[i]
-        o, f = dempster(1.0 - (1.0 - HIT_MASS) ** hits[v], 0.0, 0.0, 1.0 - (1.0 - PASS_MASS) ** passes[v])
-        occupied[v], free[v] = dempster(occupied[v], free[v], o, f)
+        o, f = 1.0 - (1.0 - hit) ** hits[v], 1.0 - (1.0 - passed) ** passes[v]
+        o, f = dempster(o, 0.0, 0.0, f, least_unknown)
+        occupied[v], free[v] = dempster(occupied[v], free[v], o, f, least_unknown)
         hits[v], passes[v] = 0, 0
 
 
 @kernel
-def _combine(occupied: F32, free: F32, other_occupied: F32, other_free: F32) -> None:
+def _combine(occupied: F32, free: F32, other_occupied: F32, other_free: F32, least_unknown: float) -> None:
     """Another vehicle's masses into these, voxel by voxel, in place."""
     for v in range(len(occupied)):
         if other_occupied[v] > 0.0 or other_free[v] > 0.0:
-            occupied[v], free[v] = dempster(occupied[v], free[v], other_occupied[v], other_free[v])
+            occupied[v], free[v] = dempster(occupied[v], free[v], other_occupied[v], other_free[v], least_unknown)
 
 
 @kernel
-def _cells(map_words: U64, occupied: F32, free: F32, states: U8) -> None:
+def _cells(map_words: U64, occupied: F32, free: F32, states: U8, of_map: float, conflict: float) -> None:
     """Voxels to the cell states on which everything here is scored."""
     rows, cols = map_words.shape
     for r in range(rows):
@@ -166,23 +200,24 @@ def _cells(map_words: U64, occupied: F32, free: F32, states: U8) -> None:
                 seen += known
                 if mapped:
                     in_map += known
-                    gone += MAP_MASS * free[v] > CONFLICT
+                    gone += of_map * free[v] > conflict
                 else:
-                    new += MAP_MASS * occupied[v] > CONFLICT
+                    new += of_map * occupied[v] > conflict
             if map_words[r, c] != 0 and in_map > 0:
-                states[r, c] = _CHANGED_EMPTY if 2 * gone > in_map else _UNCHANGED_OCCUPIED
+                states[r, c] = CellState.CHANGED_EMPTY if 2 * gone > in_map else CellState.UNCHANGED_OCCUPIED
             elif map_words[r, c] != 0:
-                states[r, c] = _UNDETERMINED
+                states[r, c] = CellState.UNDETERMINED
             elif seen > 0:
-                states[r, c] = _CHANGED_OCCUPIED if new > 0 else _UNCHANGED_EMPTY
+                states[r, c] = CellState.CHANGED_OCCUPIED if new > 0 else CellState.UNCHANGED_EMPTY
 
 
 class EvidenceMap:
     """One vehicle's voxel map: push every scan, then :func:`combine` the vehicles'."""
 
-    def __init__(self, reference: Reference, window_m: float = 80.0) -> None:
+    def __init__(self, reference: Reference, window_m: float = 80.0, masses: Evidence = EVIDENCE) -> None:
         """``reference``: the old map over the whole window to be scored; 8 bytes a voxel are held for it."""
         self._reference = reference
+        self._masses = masses
         self._reach = 0.5 * window_m
         voxels = reference.grid.rows * reference.grid.cols * LAYERS
         self.occupied = np.zeros(voxels, dtype=np.float32)
@@ -203,23 +238,20 @@ class EvidenceMap:
         n = _march(
             points_map, origin_map, obstacle & ~moving, self._reference.base, grid.x0, grid.y0, self._reach, *counts
         )
-        _absorb(self._hits, self._passes, self._touched, n, self.occupied, self.free)
+        masses = self._masses
+        _absorb(*counts, n, self.occupied, self.free, masses.hit, masses.passed, masses.least_unknown)
 
 
-def combine(vehicles: Sequence[EvidenceMap], reference: Reference) -> U8:
+def combine(vehicles: Sequence[EvidenceMap], reference: Reference, masses: Evidence = EVIDENCE) -> U8:
     """The server's side: (rows, cols) CellState over the reference's window from all vehicles' masses and the map's."""
     states = np.full(reference.grid.shape, NO_VOTE, dtype=np.uint8)
     if not vehicles:
         return states
     occupied, free = vehicles[0].occupied.copy(), vehicles[0].free.copy()
     for other in vehicles[1:]:
-        _combine(occupied, free, other.occupied, other.free)
-    _cells(reference.occupied, occupied, free, states)
+        _combine(occupied, free, other.occupied, other.free, masses.least_unknown)
+    _cells(reference.occupied, occupied, free, states, masses.of_map, masses.conflict)
     return states
-
-
-DISTANCE_M = 0.5
-_MERGE_EVERY = 16
 
 
 def heights_above_ground(point_map: PointMap, points: F64) -> F64:
@@ -236,9 +268,12 @@ def heights_above_ground(point_map: PointMap, points: F64) -> F64:
 class NearestNeighbour:
     """One vehicle's detector: push every scan, then ask for its states. One cloud of 0.3 m voxels is kept."""
 
-    def __init__(self, obstacles_map: F64, grid: Grid, window_m: float = 80.0) -> None:
+    def __init__(
+        self, obstacles_map: F64, grid: Grid, window_m: float = 80.0, rule: NearestRule = NEAREST_RULE
+    ) -> None:
         """``obstacles_map`` (n, 3): the old map's points above ground; states are given over ``grid``."""
         self._map = obstacles_map
+        self._rule = rule
         self._grid = grid
         self._half = 0.5 * window_m
         self._seen = np.zeros(grid.shape, dtype=np.bool_)
@@ -248,7 +283,7 @@ class NearestNeighbour:
         """One scan: points (n, 3) and sensor (3,) in map metres; which are above ground, which belong to movers."""
         near = np.abs(points_map[:, :2] - origin_map[:2]).max(axis=1) <= self._half
         self._clouds.append(points_map[near & obstacle & ~moving])
-        if len(self._clouds) > _MERGE_EVERY:
+        if len(self._clouds) > self._rule.merge_every:
             self._clouds = [self._cloud()]
         x, y = self._grid.centres()
         rows, cols = np.abs(y - origin_map[1]) <= self._half, np.abs(x - origin_map[0]) <= self._half
@@ -277,10 +312,10 @@ class NearestNeighbour:
         return states
 
     def _far_and_all(self, points: F64, other: F64) -> tuple[np.ndarray, np.ndarray]:
-        """Per cell, how many ``points`` are farther than DISTANCE_M from ``other``, and how many there are."""
+        """Per cell, how many ``points`` are farther than ``far_m`` from ``other``, and how many there are."""
         far = np.ones(len(points), dtype=np.bool_)
         if len(points) and len(other):
-            far = np.isinf(cKDTree(other).query(points, distance_upper_bound=DISTANCE_M)[0])
+            far = np.isinf(cKDTree(other).query(points, distance_upper_bound=self._rule.far_m)[0])
         rows, cols, inside = self._grid.indices_of(points)
         cell = rows * self._grid.cols + cols
         size = self._grid.rows * self._grid.cols

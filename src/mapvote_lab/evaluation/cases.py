@@ -39,7 +39,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def untold(what: str, done: int, total: int) -> None:
-    """A progress of which nobody wants to know."""
+    """A progress that is not reported."""
 
 
 OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
@@ -121,7 +121,7 @@ def fuse_case(
 
 
 def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
-    """What the vehicle itself decided, (rows, cols) over the window of its tiles, two-stage or one-stage."""
+    """(rows, cols) decisions of the vehicle itself over the window of its tiles, two-stage or one-stage."""
     window = reduce(Grid.union, (point_map.lattice.tile(tile.tile) for tile in ballot.tiles))
     out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
     for tile in ballot.tiles:
@@ -133,12 +133,8 @@ def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
     return out, window
 
 
-_FAST = 1
-"""zstd level: written once, read for every reading."""
-
-
 class KeptDrive:
-    """What the scans of one drive say of each cell of ``window``, packed scan by scan."""
+    """Sightings of the scans of one drive over the cells of ``window``, packed scan by scan."""
 
     def __init__(self, window: Grid, sensor: Sensor, n_min: int) -> None:
         self.window, self.sensor, self.n_min = window, sensor, n_min
@@ -150,7 +146,9 @@ class KeptDrive:
         for seen in observations:
             grid = seen.view.grid
             self._windows.append((grid.row0 - self.window.row0, grid.col0 - self.window.col0, *grid.shape))
-            self._packed.append(pack_plane(sightings(seen, self.sensor, self.n_min), _FAST))
+            self._packed.append(
+                pack_plane(sightings(seen, self.sensor, self.n_min), 1)
+            )  # zstd level 1: written once, read for every reading
 
     def write(self, folder: Path) -> None:
         """Into a file of ``folder``."""
@@ -160,11 +158,11 @@ class KeptDrive:
 
 
 Words = Sequence[tuple[int, int, bytes, tuple[int, int]]]
-"""Of each scan of a drive: row and column of its local grid from the truth's corner, its words packed, their shape."""
+"""For each scan of a drive: row and column of its local grid from the truth's corner, its words packed, their shape."""
 
 
 def read_kept(folder: Path) -> Words:
-    """What :meth:`KeptDrive.write` wrote."""
+    """Read the file that :meth:`KeptDrive.write` wrote."""
     with np.load(folder / "kept.npz") as file:
         ends, words = np.cumsum(file["sizes"]), file["words"].tobytes()
         packed = [words[start:end] for start, end in zip([0, *ends], ends, strict=False)]

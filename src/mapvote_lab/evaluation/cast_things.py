@@ -12,14 +12,39 @@ from scipy.spatial import cKDTree
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
 from mapvote.matching.prepare import deskew, motion_at
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.shapes import box, cylinder, hedge, join, place, sign
 
-REACH_M = 60.0
-_AGAIN_M = 0.05
-"""What a ray hit so little before its own return is the return itself."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PlacingRule:
+    """Where things are placed in a recorded street, and which rays hit them."""
+
+    reach_m: float = 60.0
+    """Things farther than this from the sensor are not cast, metres."""
+    again_m: float = 0.05
+    """Hits closer than this to the recorded return belong to the same surface, metres."""
+    apart_m: float = 5.0
+    """Least distance between the middles of two things, metres: one must not hide another, nor decide its cells."""
+    path_m: tuple[float, float] = (3.5, 15.0)
+    """Least and greatest distance of a thing from the path, metres."""
+    along_m: float = 15.0
+    """Things stand up to this far before the drive's first scan and behind its last, metres."""
+    tries: int = 4000
+    """Places that are tried for one thing."""
+    wall_side_m: float = 4.0
+    """Length of a piece of wall that is moved, metres."""
+    wall_shift_m: float = 0.5
+    """Distance by which a wall is set back or forward, metres."""
+    around_m: float = 40.0
+    """Obstacles within this of a removed car are what rays through it can meet, metres."""
+
+
+PLACING = PlacingRule()
 
 
 @dataclass
@@ -32,7 +57,7 @@ class Thing:
     goes: tuple[F64, F64] | None = None
     """(T (4, 4) from its own axes, half extents (3,)) of the box whose points are taken out of the scans."""
     behind: F64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    """(n, 3, 3) what the rays meet that go on through the box."""
+    """(n, 3, 3) triangles that the rays meet that go on through the box."""
     met: list[F64] = field(default_factory=list)
     """Where rays ended on it, (m, 3), a scan after the other."""
     left: list[F64] = field(default_factory=list)
@@ -46,7 +71,7 @@ class Thing:
         return np.asarray(self.comes.reshape(-1, 3)[:, :2].mean(axis=0))
 
 
-def with_things(drive: Drive, things: Sequence[Thing], reference: F64) -> Drive:
+def with_things(drive: Drive, things: Sequence[Thing], reference: F64, rule: PlacingRule = PLACING) -> Drive:
     """The drive as it would have been recorded among ``things``; ``reference`` (n, 4, 4): where it was.
 
     Every scan read notes in the things where its rays ended. Scans come out de-skewed.
@@ -58,12 +83,12 @@ def with_things(drive: Drive, things: Sequence[Thing], reference: F64) -> Drive:
         rng = np.random.default_rng([i, 2])
         keep, at, ends_on = np.ones(len(points), dtype=np.bool_), points.copy(), np.full(len(points), -1)
         for k, thing in enumerate(things):
-            if np.linalg.norm(thing.centre - T[:2, 3]) < REACH_M:
+            if np.linalg.norm(thing.centre - T[:2, 3]) < rule.reach_m:
                 if thing.goes is not None:
-                    inside, on = _take_out(points, keep, at, thing, T, drive.sensor.range_sigma_m, rng)
+                    inside, on = _take_out(points, keep, at, thing, T, drive.sensor.range_sigma_m, rng, rule)
                     ends_on[inside], ends_on[on] = -1, k
                 if len(thing.comes):
-                    ends_on[_put_in(points, at, thing, T, drive.sensor.range_sigma_m, rng)] = k
+                    ends_on[_put_in(points, at, thing, T, drive.sensor.range_sigma_m, rng, rule)] = k
         for k, thing in enumerate(things):
             met = keep & (ends_on == k)  # and not on what stands before it, whichever was put in first
             thing.met.append(transform(T, at[met]))
@@ -85,11 +110,13 @@ def _directions(points: F32) -> tuple[F32, F32]:
     return reach, (points / reach[:, None]).astype(np.float32)
 
 
-def _put_in(points: F32, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator) -> Bool:
+def _put_in(
+    points: F32, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator, rule: PlacingRule
+) -> Bool:
     """(n,) the rays that end on the thing now; ``points`` (n, 3) and, without noise, ``at`` (n, 3) are told where."""
     reach, directions = _directions(points)
     hit = _cast(thing.comes, T, directions)
-    nearer = hit < reach - _AGAIN_M
+    nearer = hit < reach - rule.again_m
     at[nearer] = directions[nearer] * hit[nearer, None]
     noisy = hit[nearer] + sigma_m * rng.standard_normal(np.count_nonzero(nearer), dtype=np.float32)
     points[nearer] = directions[nearer] * noisy[:, None]
@@ -97,10 +124,17 @@ def _put_in(points: F32, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.
 
 
 def _take_out(
-    points: F32, keep: Bool, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator
+    points: F32,
+    keep: Bool,
+    at: F32,
+    thing: Thing,
+    T: F64,
+    sigma_m: float,
+    rng: np.random.Generator,
+    rule: PlacingRule,
 ) -> tuple[Bool, I64]:
     """((n,) the rays that had ended in what goes, (m,) those of them that go on to the thing itself, set back); as
-    :func:`_put_in` the rest, and ``keep`` (n,) loses those that meet nothing within REACH_M."""
+    :func:`_put_in` the rest, and ``keep`` (n,) loses those that meet nothing within ``rule.reach_m``."""
     assert thing.goes is not None
     T_ref_box, half = thing.goes
     inside = keep & (np.abs(transform(inverse(T_ref_box) @ T, points)) <= half).all(axis=1)
@@ -116,8 +150,8 @@ def _take_out(
     on = rays[np.isfinite(beyond)] if len(thing.comes) else rays[:0]
     at[inside] = directions * np.where(np.isfinite(beyond), beyond, 1.0)[:, None]
     beyond += sigma_m * rng.standard_normal(len(beyond), dtype=np.float32)
-    keep[rays[~(beyond < REACH_M)]] = False
-    points[inside] = directions * np.where(beyond < REACH_M, beyond, 1.0)[:, None]
+    keep[rays[~(beyond < rule.reach_m)]] = False
+    points[inside] = directions * np.where(beyond < rule.reach_m, beyond, 1.0)[:, None]
     return inside, on
 
 
@@ -127,16 +161,6 @@ def voxel_boxes(points: F64) -> F64:
     unit = box(0, CELL_SIZE, 0, CELL_SIZE, 0, CELL_SIZE)
     return np.asarray((corners[:, None, None, :] + unit[None]).reshape(-1, 3, 3))
 
-
-APART_M = 5.0
-"""Between the middles of two things: one must not hide another, nor decide its cells."""
-_PATH_M = (3.5, 15.0)
-_ALONG_M = 15.0
-"""Before the drive's first scan and behind its last there is a street, too."""
-_TRIES = 4000
-_WALL_SIDE_M = 4.0
-_WALL_SHIFT_M = 0.5
-_AROUND_M = 40.0
 
 SHAPES: dict[str, tuple[float, Callable[[np.random.Generator], F64]]] = {
     "pole": (0.1, lambda rng: cylinder(0.08, 0.0, 5.0, 8)),
@@ -152,14 +176,15 @@ SHAPES: dict[str, tuple[float, Callable[[np.random.Generator], F64]]] = {
 
 @dataclass(frozen=True)
 class Site:
-    """What the recording shows of its street, in the frame of the reference trajectory."""
+    """The recorded street, in the frame of the reference trajectory."""
 
     obstacles: F64
     """(n, 3) points that stand above the ground, one a voxel."""
     ground: Callable[[F64], F64]
     """Height (m,) of the ground at points (m, 2); NaN where unknown."""
     path: F64
-    """(k, 3) where the sensor was."""
+    """(k, 3) positions of the sensor."""
+    rule: PlacingRule = PLACING
 
     def placed(self, seed: int, each: int) -> tuple[list[Thing], list[F64]]:
         """(``each`` things of every kind that find room, hedges (n, 3, 3) that stand before and after)."""
@@ -181,19 +206,19 @@ class Site:
         self, rng: np.random.Generator, tree: cKDTree, radius: float, taken: list[Thing]
     ) -> tuple[float, float, float, float] | None:
         """(x, y, ground, yaw) of a free place beside the path, its back turned to it; None if there is none."""
-        for _ in range(_TRIES):
+        for _ in range(self.rule.tries):
             k = int(rng.integers(1, len(self.path)))
             ahead = self.path[k, :2] - self.path[k - 1, :2]
             if np.linalg.norm(ahead) < 1e-3:
                 continue
             yaw = float(np.arctan2(ahead[1], ahead[0]))
-            side, away = rng.choice([-1.0, 1.0]), rng.uniform(*_PATH_M)
+            side, away = rng.choice([-1.0, 1.0]), rng.uniform(*self.rule.path_m)
             spot = self.path[k, :2] + side * away * np.array([-np.sin(yaw), np.cos(yaw)])
-            spot = spot + rng.uniform(-_ALONG_M, _ALONG_M) * np.array([np.cos(yaw), np.sin(yaw)])
+            spot = spot + rng.uniform(-self.rule.along_m, self.rule.along_m) * np.array([np.cos(yaw), np.sin(yaw)])
             z = float(self.ground(spot[None])[0])
             clear = tree.query(spot)[0] > radius + 0.6
             off_path = np.linalg.norm(self.path[:, :2] - spot, axis=1).min() > radius + 1.5
-            apart = all(np.linalg.norm(thing.centre - spot) > APART_M for thing in taken)
+            apart = all(np.linalg.norm(thing.centre - spot) > self.rule.apart_m for thing in taken)
             if clear and off_path and apart and np.isfinite(z):
                 return float(spot[0]), float(spot[1]), z, yaw if side > 0 else yaw + np.pi
         return None
@@ -207,13 +232,13 @@ class Site:
         tree, out = cKDTree(tall) if len(tall) else None, list[Thing]()
         for k in rng.permutation(len(tall)):
             assert tree is not None
-            near = tall[tree.query_ball_point(tall[k], 0.5 * _WALL_SIDE_M)]
+            near = tall[tree.query_ball_point(tall[k], 0.5 * self.rule.wall_side_m)]
             away = np.linalg.norm(self.path[:, :2] - tall[k], axis=1).min()
-            if len(near) < 50 or not _PATH_M[0] < away < 20.0:
+            if len(near) < 50 or not self.rule.path_m[0] < away < 20.0:
                 continue
             middle = near.mean(axis=0)
             spread, axes = np.linalg.eigh(np.cov((near - middle).T))
-            if np.sqrt(spread[0]) > 0.13 or any(np.linalg.norm(t.centre - middle) < 2 * APART_M for t in out):
+            if np.sqrt(spread[0]) > 0.13 or any(np.linalg.norm(t.centre - middle) < 2 * self.rule.apart_m for t in out):
                 continue
             thing = self._moved_wall(middle, axes[:, 0], "set back" if len(out) % 2 == 0 else "set forward")
             if thing is not None:
@@ -228,11 +253,11 @@ class Site:
         ground = float(self.ground(middle[None])[0])
         if not np.isfinite(ground):
             return None
-        shift = -_WALL_SHIFT_M if how == "set back" else _WALL_SHIFT_M
+        shift = self.rule.wall_shift_m * (-1.0 if how == "set back" else 1.0)
         yaw = float(np.arctan2(normal[1], normal[0]) - 0.5 * np.pi)  # y of the wall's own frame is its normal
-        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - middle, axis=1) < 0.5 * _WALL_SIDE_M]
+        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - middle, axis=1) < 0.5 * self.rule.wall_side_m]
         top = float(near[:, 2].max())
-        half = 0.5 * _WALL_SIDE_M
+        half = 0.5 * self.rule.wall_side_m
         plane = place(
             box(-half, half, shift - 0.02, shift + 0.02, 0.0, top - ground), middle[0], middle[1], ground, yaw
         )
@@ -250,13 +275,13 @@ class Site:
         plane = np.zeros(cells.max(axis=0) + 2, dtype=np.bool_)
         plane[cells[:, 0], cells[:, 1]] = True
         label, _ = ndimage.label(plane, np.ones((3, 3)))
-        mine = label[cells[:, 0], cells[:, 1]]
+        group = label[cells[:, 0], cells[:, 1]]
         out: list[Thing] = []
         for k, slices in enumerate(ndimage.find_objects(label), 1):
             if max(s.stop - s.start for s in slices) * CELL_SIZE > 7.0:
                 continue
-            thing = self._gone_car(low[mine == k])
-            if thing is not None and all(np.linalg.norm(t.centre - thing.centre) > APART_M for t in out):
+            thing = self._gone_car(low[group == k])
+            if thing is not None and all(np.linalg.norm(t.centre - thing.centre) > self.rule.apart_m for t in out):
                 out.append(thing)
         out.sort(key=lambda t: float(np.linalg.norm(self.path[:, :2] - t.centre, axis=1).min()))
         return out[:most]
@@ -278,9 +303,11 @@ class Site:
         yaw = float(np.arctan2(axes[1, 1], axes[0, 1]))
         T = from_xyz_rpy(centre[0], centre[1], ground + GROUND_MARGIN_M + 0.5 * tall, yaw=yaw)
         half = np.array([0.5 * length + 0.2, 0.5 * width + 0.2, 0.5 * tall + 0.1])
-        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - centre, axis=1) < _AROUND_M]
+        # Rays through the car meet the obstacles around it, or the road.
+        around_m = self.rule.around_m
+        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - centre, axis=1) < around_m]
         outside = (np.abs((near - T[:3, 3]) @ T[:3, :3]) > half).any(axis=1)
-        road = place(box(-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M, -0.05, 0.0), centre[0], centre[1], ground)
+        road = place(box(-around_m, around_m, -around_m, around_m, -0.05, 0.0), centre[0], centre[1], ground)
         return Thing("parked car gone", np.zeros((0, 3, 3)), (T, half), join([voxel_boxes(near[outside]), road]))
 
     def _heights(self, points: F64) -> F64:

@@ -26,6 +26,7 @@ from mapvote.compare.session_votes import vote_of_session
 from mapvote.config import Settings, choose_case
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.record import record
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.formats import read_map
@@ -41,21 +42,50 @@ CHANGES: dict[str, tuple[Kind, tuple[float, float, float, float]]] = {
     "structure": ("new", (16.3, -31.3, 27.1, -24.7)),
     "thing": ("new", (-6.2, 10.7, -4.4, 13.1)),
 }
-"""What all sessions agree on: x0, y0, x1, y1 in the reference's metres."""
-_WAY = ((2, 44), (2, 20), (2, 2), (10, -6), (14, -22), (22, -20), (20, 0), (18, 20), (12, 40))
-"""Over the paved middle of the court."""
-_SENSOR_M = 1.9
-_SPACING_M = 0.18
-"""Each point of a cloud is a disc so wide."""
-_BESIDE_M, _SAME_THING_M = 0.3, 0.5
-"""A ray passes a thing if one of its points is so near, a voxel, and the ray ends farther than _SAME_THING_M behind."""
-_COLUMNS = 1125
-_COLUMN_RAD = 2.0 * np.pi / _COLUMNS
-_STRIDE_M, _FAR_RANGE_M = 0.3, 70.0
-_MARGIN_M = 1.0
-_FAR_M = 0.6
-FALSE_M2 = 2.0
-_ENDED_NS = 1_700_000_000_000_000_000
+"""Changes that all sessions agree on: x0, y0, x1, y1 in the reference's metres."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CourtRule:
+    """How scans are cast from the court's clouds, and how the decided changes are judged."""
+
+    way: tuple[tuple[float, float], ...] = (
+        (2, 44), (2, 20), (2, 2), (10, -6), (14, -22), (22, -20), (20, 0), (18, 20), (12, 40),
+    )  # fmt: skip
+    """Corners (x, y) of the way over the paved middle of the court, metres."""
+    step_m: float = 1.6
+    """Distance between the cast scans along the way, metres."""
+    sensor_m: float = 1.9
+    """Height of the sensor above the ground, metres."""
+    disc_m: float = 0.18
+    """Diameter of the disc for which each point of a cloud stands, metres."""
+    beside_m: float = 0.3
+    """A ray passes a thing if one of its points is nearer than this, metres: a voxel."""
+    same_thing_m: float = 0.5
+    """A ray that ends no farther than this behind a thing it passes belongs to the thing, metres."""
+    columns: int = 1125
+    """Azimuths of a revolution."""
+    stride_m: float = 0.3
+    """Distance between the places on a ray where the survey of its cell is looked up, metres."""
+    reach_m: float = 70.0
+    """Greatest range of a cast ray, metres."""
+    margin_m: float = 1.0
+    """Points this far outside the box of a known change still belong to it, metres."""
+    far_m: float = 0.6
+    """Plain cloud-to-cloud: a point farther than this from every point of the other cloud is gone or new, metres."""
+    false_m2: float = 2.0
+    """A decided object outside the boxes counts from this area, square metres."""
+    ended_ns: int = 1_700_000_000_000_000_000
+    """Time at which the first session ended, nanoseconds since 1970."""
+
+    @property
+    def column_rad(self) -> float:
+        """Angle between neighbouring azimuths, radians."""
+        return 2.0 * np.pi / self.columns
+
+
+COURT_RULE = CourtRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,39 +124,44 @@ class Court:
         return cls(read_map(folder / "gtmap.pcd"), {name: read_map(folder / f"{name}.pcd") for name in SESSIONS})
 
 
-def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell: Progress) -> list[CourtScore]:
+def evaluate_court(
+    court: Court, settings: Settings, cases: Sequence[Case], tell: Progress, rule: CourtRule = COURT_RULE
+) -> list[CourtScore]:
     """Scores of every case on cast scans, of the sessions' clouds as ballots, of one of them alone, and of plain
     distances between clouds."""
     surfaces = choose_case(settings, "surfaces")
     as_clouds, shown = [], list[CloudChange]()
     for k, (name, cloud) in enumerate(court.sessions.items()):
         tell("voting with clouds", k, len(SESSIONS))
-        said = vote_of_session(name, name, court.reference, cloud, surfaces, end_ns=_ENDED_NS + k)
-        as_clouds.append(said.ballot)
-        shown += [change for change in said.changes if change.kind != "not seen"]
-    drives, scores = [cast_drive(name, cloud) for name, cloud in court.sessions.items()], []
+        votes = vote_of_session(name, name, court.reference, cloud, surfaces, end_ns=rule.ended_ns + k)
+        as_clouds.append(votes.ballot)
+        shown += [change for change in votes.changes if change.kind != "not seen"]
+    drives = [cast_drive(name, cloud, rule) for name, cloud in court.sessions.items()]
+    scores = []
     for k, case in enumerate(cases):
         tell("voting with cast scans", k, len(cases))
         own = settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         ballots = [vote_drive(drive, court.reference, own)[0] for drive in drives]
-        scores.append(_fused(f"cast scans, {case.name}", court, ballots, own, max(case.min_votes, 2), shown))
-    scores.append(_fused("clouds, surfaces", court, as_clouds, surfaces, 2, shown))
-    scores.append(_fused("one cloud alone", court, as_clouds[:1], surfaces, 2, shown))
-    scores.append(_by_distance(court, shown))
+        scores.append(_fused(f"cast scans, {case.name}", court, ballots, own, max(case.min_votes, 2), shown, rule))
+    scores.append(_fused("clouds, surfaces", court, as_clouds, surfaces, 2, shown, rule))
+    scores.append(_fused("one cloud alone", court, as_clouds[:1], surfaces, 2, shown, rule))
+    scores.append(_by_distance(court, shown, rule))
     return scores
 
 
-def cast_drive(name: str, cloud: PointMap, step_m: float = 1.6) -> Drive:
+def cast_drive(name: str, cloud: PointMap, rule: CourtRule = COURT_RULE) -> Drive:
     """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground; one every
-    ``step_m``."""
+    ``rule.step_m``."""
+    # Places along the way, equally far apart.
     points, standing, sensor = all_points(cloud), map_obstacles(cloud), SENSORS["hdl32e"]
     window = reduce(Grid.union, (cloud.lattice.tile(tile) for tile in cloud.tiles))
     surveyed = _surveyed(cloud, window)
-    corners = np.array(_WAY, dtype=np.float64)
+    corners = np.array(rule.way, dtype=np.float64)
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
-    at = np.arange(0.0, along[-1], step_m)
+    at = np.arange(0.0, along[-1], rule.step_m)
     xy = np.column_stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)])
     poses, scans = [], []
+    # At each place the sensor stands upright over the ground and looks along the way.
     for k, place in enumerate(xy):
         ground = points[np.hypot(*(points[:, :2] - place).T) < 2.5, 2]
         if len(ground) < 20:
@@ -135,13 +170,13 @@ def cast_drive(name: str, cloud: PointMap, step_m: float = 1.6) -> Drive:
         c, s = ahead / np.linalg.norm(ahead)
         T = np.eye(4)
         T[:2, :2] = [[c, -s], [s, c]]
-        T[:3, 3] = *place, np.percentile(ground, 10) + _SENSOR_M
-        beside = _nearest_beside((standing - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg)
-        as_far = _measured_as_far(T, window, surveyed)
-        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, beside, as_far)
+        T[:3, 3] = *place, np.percentile(ground, 10) + rule.sensor_m
+        beside = _nearest_beside((standing - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, rule)
+        as_far = _measured_as_far(T, window, surveyed, rule)
+        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, beside, as_far, rule)
         if len(taken) > 2000:
             poses.append(T)
-            scans.append(Scan(_ENDED_NS + 100_000_000 * k, taken))
+            scans.append(Scan(rule.ended_ns + 100_000_000 * k, taken))
     stamps_ns = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
     return Drive(
         Path(name), name, name, sensor, stamps_ns, scans.__getitem__, np.array(poses), 0.3, 1.0
@@ -154,61 +189,63 @@ def _surveyed(cloud: PointMap, window: Grid) -> Bool:
     return np.asarray(ndimage.maximum_filter(planes.own_ground | planes.stands, 2 * REACH_CELLS + 1, mode="constant"))
 
 
-def _measured_as_far(T: F64, window: Grid, surveyed: Bool) -> F64:
-    """(columns,) of each column of the range image from pose T: horizontal metres to the first cell that the session
+def _measured_as_far(T: F64, window: Grid, surveyed: Bool, rule: CourtRule) -> F64:
+    """(columns,) horizontal metres from pose T, in each column of the range image, to the first cell that the session
     did not survey."""
-    azimuth = (np.arange(_COLUMNS) + 0.5) * _COLUMN_RAD - np.pi
-    reach = _STRIDE_M * np.arange(1, int(_FAR_RANGE_M / _STRIDE_M) + 1)
+    azimuth = (np.arange(rule.columns) + 0.5) * rule.column_rad - np.pi
+    reach = rule.stride_m * np.arange(1, int(rule.reach_m / rule.stride_m) + 1)
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
     places = T[:2, 3] + ahead[:, None, :] * reach[None, :, None]
     known = window.value_at(surveyed, places.reshape(-1, 2))
-    return np.asarray(_STRIDE_M * (1 + np.logical_and.accumulate(known.reshape(_COLUMNS, -1), axis=1).sum(axis=1)))
+    return np.asarray(
+        rule.stride_m * (1 + np.logical_and.accumulate(known.reshape(rule.columns, -1), axis=1).sum(axis=1))
+    )
 
 
-def _nearest_beside(standing: F64, elevations_deg: Sequence[float]) -> F64:
+def _nearest_beside(standing: F64, elevations_deg: Sequence[float], rule: CourtRule) -> F64:
     """(beams, columns) range of the nearest of the ``standing`` points (n, 3), about the sensor, that a ray passes
-    within _BESIDE_M: the ray may have gone through the thing, between two of its points."""
+    within ``rule.beside_m``: the ray may have gone through the thing, between two of its points."""
     reach = np.linalg.norm(standing, axis=1)
     beams = np.sort(np.radians(elevations_deg))
     gap = float(np.median(np.diff(beams)))
     elevation = np.arcsin(standing[:, 2] / np.maximum(reach, 0.1))
     ring = np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64)
-    near = (reach > 1.5) & (reach < _FAR_RANGE_M)
-    near &= np.abs(elevation - beams[ring]) < np.maximum(gap, _BESIDE_M / np.maximum(reach, 0.1))
-    out = np.full((len(beams), _COLUMNS), np.inf)
-    for low, high in pairwise((1.5, 3.0, 6.0, 12.0, 24.0, _FAR_RANGE_M)):
-        some = near & (reach >= low) & (reach < high)
+    near = (reach > 1.5) & (reach < rule.reach_m)
+    near &= np.abs(elevation - beams[ring]) < np.maximum(gap, rule.beside_m / np.maximum(reach, 0.1))
+    out = np.full((len(beams), rule.columns), np.inf)
+    for low, high in pairwise((1.5, 3.0, 6.0, 12.0, 24.0, rule.reach_m)):
+        in_shell = near & (reach >= low) & (reach < high)
         image = np.full_like(out, np.inf)
-        np.minimum.at(image, (ring[some], _column(standing[some])), reach[some])
-        wide = [2 * int(np.ceil(_BESIDE_M / (low * step) - 0.5)) + 1 for step in (gap, _COLUMN_RAD)]
+        np.minimum.at(image, (ring[in_shell], _column(standing[in_shell], rule)), reach[in_shell])
+        wide = [2 * int(np.ceil(rule.beside_m / (low * step) - 0.5)) + 1 for step in (gap, rule.column_rad)]
         out = np.minimum(out, ndimage.minimum_filter(image, wide, mode=("nearest", "wrap")))
     return out
 
 
-def _column(points: F64) -> I64:
-    return np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _COLUMN_RAD).astype(np.int64) % _COLUMNS
+def _column(points: F64, rule: CourtRule) -> I64:
+    return np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / rule.column_rad).astype(np.int64) % rule.columns
 
 
-def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64) -> F32:
+def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64, rule: CourtRule) -> F32:
     """(m, 3) the nearest disc that each ray of a revolution meets, of points (n, 3) about the sensor; without the rays
     that pass something ``beside`` them or end farther than ``as_far``."""
     reach = np.linalg.norm(points, axis=1)
-    near = (reach > 1.5) & (reach < _FAR_RANGE_M)
+    near = (reach > 1.5) & (reach < rule.reach_m)
     points, reach = points[near], reach[near]
     beams = np.sort(np.radians(elevations_deg))
     elevation = np.arcsin(points[:, 2] / reach)
-    half = 0.5 * _SPACING_M / reach
+    half = 0.5 * rule.disc_m / reach
     ring = np.clip(np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64), 0, len(beams) - 1)
     hit = np.abs(elevation - beams[ring]) < np.maximum(half, 0.0015)
     ring, reach, half, points = ring[hit], reach[hit], half[hit], points[hit]
-    col = _column(points)
-    image = np.full((len(beams), _COLUMNS), np.inf)
-    wide = np.minimum((half / _COLUMN_RAD).astype(np.int64), 12)
+    col = _column(points, rule)
+    image = np.full((len(beams), rule.columns), np.inf)
+    wide = np.minimum((half / rule.column_rad).astype(np.int64), 12)
     for j in range(-int(wide.max(initial=0)), int(wide.max(initial=0)) + 1):
-        mine = np.abs(j) <= wide
-        np.minimum.at(image, (ring[mine], (col[mine] + j) % _COLUMNS), reach[mine])
-    r, c = np.nonzero(np.isfinite(image) & (image < beside + _SAME_THING_M))
-    azimuth, distance = (c + 0.5) * _COLUMN_RAD - np.pi, image[r, c]
+        covers = np.abs(j) <= wide
+        np.minimum.at(image, (ring[covers], (col[covers] + j) % rule.columns), reach[covers])
+    r, c = np.nonzero(np.isfinite(image) & (image < beside + rule.same_thing_m))
+    azimuth, distance = (c + 0.5) * rule.column_rad - np.pi, image[r, c]
     flat = distance * np.cos(beams[r])
     taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])
     taken = taken[flat <= as_far[c]]
@@ -216,16 +253,22 @@ def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64
 
 
 def _fused(
-    method: str, court: Court, ballots: Sequence[Ballot], settings: Settings, min_votes: int, shown: list[CloudChange]
+    method: str,
+    court: Court,
+    ballots: Sequence[Ballot],
+    settings: Settings,
+    min_votes: int,
+    shown: list[CloudChange],
+    rule: CourtRule,
 ) -> CourtScore:
     after, decisions = update_map(court.reference, ballots, settings.fuse.model_copy(update={"min_votes": min_votes}))
     states, grid = states_over(court.reference.lattice, decisions)
-    return _score(method, map_obstacles(court.reference), map_obstacles(after), states, grid, shown)
+    return _score(method, map_obstacles(court.reference), map_obstacles(after), states, grid, shown, rule)
 
 
-def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
-    """Plain cloud-to-cloud: a point more than 0.6 m from every point of the other cloud is gone or new; published where
-    two sessions say so of a cell."""
+def _by_distance(court: Court, shown: list[CloudChange], rule: CourtRule) -> CourtScore:
+    """Plain cloud-to-cloud: a point more than ``rule.far_m`` from every point of the other cloud is gone or new;
+    published where two sessions say so of a cell."""
     before, reference = map_obstacles(court.reference), all_points(court.reference)
     x, y = before[:, 0], before[:, 1]
     rows, cols = court.reference.lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]]))
@@ -235,7 +278,7 @@ def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
     offered = []
 
     def far(points: F64, others: F64) -> F64:
-        return points[KDTree(others).query(points)[0] > _FAR_M]
+        return points[KDTree(others).query(points)[0] > rule.far_m]
 
     for cloud in court.sessions.values():
         gone += cells_with(far(before, all_points(cloud)), grid)
@@ -247,7 +290,7 @@ def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
     states[new >= 2] = CellState.CHANGED_OCCUPIED
     kept = before[states[grid.indices_of(before)[:2]] != CellState.CHANGED_EMPTY]
     come = [points[states[grid.indices_of(points)[:2]] == CellState.CHANGED_OCCUPIED] for points in offered]
-    return _score("cloud to cloud", before, np.concatenate([kept, *come]), states, grid, shown)
+    return _score("cloud to cloud", before, np.concatenate([kept, *come]), states, grid, shown, rule)
 
 
 def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float = 0.0) -> np.ndarray:
@@ -256,20 +299,26 @@ def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float
     return np.asarray((x > x0 - margin_m) & (x < x1 + margin_m) & (y > y0 - margin_m) & (y < y1 + margin_m))
 
 
-def _score(method: str, before: F64, after: F64, states: U8, grid: Grid, shown: list[CloudChange]) -> CourtScore:
+def _score(
+    method: str, before: F64, after: F64, states: U8, grid: Grid, shown: list[CloudChange], rule: CourtRule
+) -> CourtScore:
+    # Points in and outside the boxes of the known changes.
     counts = {n: tuple(int(_in_box(p, box).sum()) for p in (before, after)) for n, (_, box) in CHANGES.items()}
     gone = KDTree(after).query(before)[0] > 1e-6
     come = KDTree(before).query(after)[0] > 1e-6
-    boxed = [np.logical_or.reduce([_in_box(p, box, _MARGIN_M) for _, box in CHANGES.values()]) for p in (before, after)]
+    boxed = [
+        np.logical_or.reduce([_in_box(p, box, rule.margin_m) for _, box in CHANGES.values()]) for p in (before, after)
+    ]
+    # Decided objects outside the boxes, and those that no session's cloud shows.
     others, false = [], []
     x, y = grid.centres()
     for kind, state in (("gone", CellState.CHANGED_EMPTY), ("new", CellState.CHANGED_OCCUPIED)):
         for rows, cols in pieces(states == state):
             area_m2, xy = round(len(rows) * CELL_SIZE**2, 1), np.column_stack([x[cols], y[rows]])
-            if area_m2 <= FALSE_M2 or any(_in_box(xy, box, _MARGIN_M).any() for _, box in CHANGES.values()):
+            if area_m2 <= rule.false_m2 or any(_in_box(xy, box, rule.margin_m).any() for _, box in CHANGES.values()):
                 continue
             others.append(area_m2)
-            if not any(one.kind == kind and _in_box(xy, one.box, _MARGIN_M).any() for one in shown):
+            if not any(one.kind == kind and _in_box(xy, one.box, rule.margin_m).any() for one in shown):
                 false.append(area_m2)
     added = (counts["structure"][1] - counts["structure"][0], counts["thing"][1] - counts["thing"][0])
     found = int(counts["car"][1] < 0.5 * counts["car"][0]) + sum(more >= 50 for more in added)

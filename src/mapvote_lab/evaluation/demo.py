@@ -21,6 +21,7 @@ from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.process_memory import give_back_free_pages
+from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, write_map
 from mapvote.formats.atomic import whole_file, write_whole
@@ -45,6 +46,22 @@ from mapvote_server.questions.history import changes_between, cutouts_between
 from mapvote_server.store.store import Store, url_of
 
 CASE = "surfaces"
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class DemoPlan:
+    """Size of the demonstration."""
+
+    scans: int = 120
+    """Most scans of a drive that are used: the demo is to take a minute."""
+    each: int = 2
+    """New bodies of each kind."""
+    seed: int = 2
+    """Seed of the simulated street and of the places of new bodies; the method was developed on another (1)."""
+
+
+DEMO_PLAN = DemoPlan()
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""
 Picture = tuple[Path, str]
 """A file and its caption."""
@@ -210,7 +227,7 @@ WHY_HARDER = (
 
 
 def drives_sentence(story: Story, folder: Path) -> str:
-    """What became of the drives."""
+    """Where the drives are, or that they were deleted."""
     size = f"{story.drives_bytes / 1e6:.0f} MB of drives, ballots and server data"
     return f"{size} are in {folder.parent}." if story.kept else f"{size} were written and deleted; --keep keeps them."
 
@@ -267,14 +284,6 @@ def commands(evaluation: Evaluation, out: Path, kept: bool) -> str:
     )
 
 
-SCANS = 120
-"""Of the drive, at most: the demo is to take a minute."""
-EACH = 2
-"""New bodies of each kind."""
-SEED = 2
-"""Of the simulated street, and of the places of new bodies. Not the seed that the method was developed on (1)."""
-
-
 def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path], None]) -> list[str]:
     """Map a recorded drive, vote on it, draw and report; returns the lines that sum it up.
 
@@ -286,7 +295,7 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     with processes(2) as compilers:
         compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
         length = len(open_drive(folder))
-        recording = open_drive(folder, scans=f"0:{min(SCANS, length)}")
+        recording = open_drive(folder, scans=f"0:{min(DEMO_PLAN.scans, length)}")
         scan = draw_scan(recording, out / "pictures" / "scan.png")
         show(scan)
         for done, compiled in enumerate(compiling):
@@ -300,7 +309,9 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     write_map(street.point_map, out / "map")
     progress("mapping", 2, 2)
     progress("voting", 0, 1)
-    run, asked, things = real_bench.new_things(street, real_bench.survey_site(street), cases, SEED, EACH)
+    run, asked, things = real_bench.new_things(
+        street, real_bench.survey_site(street), cases, DEMO_PLAN.seed, DEMO_PLAN.each
+    )
     progress("voting", 1, 1)
     found = real_bench.score(asked, run.states[CASE])
     pictures = [
@@ -404,7 +415,7 @@ def demo(
     that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
     """
     settings, work = Settings(), out / "work"
-    scene = Scene("street" if full else "corner", SEED, settings, work)
+    scene = Scene("street" if full else "corner", DEMO_PLAN.seed, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     with processes(2) as compilers:
         compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]

@@ -55,10 +55,6 @@ def T_map_world_of(scene: Scene) -> F64:
     return rigid_between(believed, np.concatenate([scene.true_poses(n) for n in names]))
 
 
-NEAR_M = 30.0
-"""Scans this close to a changed object count."""
-
-
 def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> F64:
     """(n, 4, 4) the pose of each of these scans by NDT in ``point_map`` from the drive's own prior, NaN where lost."""
     tracker = Tracker(MapWindow(point_map), scene.settings.ndt)
@@ -98,12 +94,13 @@ def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tupl
 
 
 def in_changed_areas(
-    scene: Scene, truth: Truth, vehicle: str, maps: Mapping[str, tuple[PointMap, F64]]
+    scene: Scene, truth: Truth, vehicle: str, maps: Mapping[str, tuple[PointMap, F64]], near_m: float = 30.0
 ) -> dict[str, PoseErrors]:
-    """Errors of one vehicle's scans near changes, by map (each with its T_map_world); empty if it came near none."""
+    """Errors of one vehicle's scans within ``near_m`` of changes, by map (each with its T_map_world); empty if it came
+    near none."""
     corners = [np.zeros((0, 2)), *(np.asarray(o["footprint"]) for o in truth.objects)]
     away_m = scene.true_poses(vehicle)[:, None, :2, 3] - np.concatenate(corners)[None]
-    drive, scans = scene.drive(vehicle), np.flatnonzero((np.linalg.norm(away_m, axis=2) <= NEAR_M).any(axis=1))
+    drive, scans = scene.drive(vehicle), np.flatnonzero((np.linalg.norm(away_m, axis=2) <= near_m).any(axis=1))
     if not len(scans):
         return {}
     T_true = scene.true_poses(vehicle)[scans]
@@ -113,12 +110,9 @@ def in_changed_areas(
     }
 
 
-_STOP_S = 20.0
-
-
 @dataclass(frozen=True, slots=True)
 class PublishedRound:
-    """What a server made of a fleet's ballots."""
+    """Results of a server's round."""
 
     updated: PointMap
     """The newest map, as a vehicle downloads it."""
@@ -146,7 +140,7 @@ def running_server(store: Path, first_map: Path, log: Path) -> Iterator[str]:
         finally:
             server.terminate()
             try:
-                server.wait(_STOP_S)
+                server.wait(20.0)
             except subprocess.TimeoutExpired:
                 server.kill()
 

@@ -21,10 +21,11 @@ from mapvote_lab.evaluation import figures
 from mapvote_lab.evaluation.baselines import heights_above_ground
 from mapvote_lab.evaluation.cases import ballot_states, paper_cases
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.scores import UNSCORED, reliability, same_rows
+from mapvote_lab.evaluation.scores import reliability, same_rows
 from mapvote_lab.evaluation.tables import case_name
 from mapvote_lab.evaluation.truths import lay_on
 from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.truth import Label
 
 MOVER = "#e07b00"
 
@@ -89,7 +90,7 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "surfaces") if n in evaluation.outcomes}
     truth = np.full(256, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
-    truth[[1, 2, UNSCORED]] = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED
+    truth[[1, 2, Label.UNSCORED]] = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED
     panels = [("Truth (strict)", truth[evaluation.truth.strict])]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     shown = {n: e for n, e in evaluation.result.cases.items() if " " not in n}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import Grid
+from mapvote.core.record import record
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
@@ -23,7 +25,7 @@ from mapvote.perception.raycast import find_obstacles
 from mapvote_lab.evaluation.cases import Case, Progress
 from mapvote_lab.evaluation.cast_things import Site, Thing, with_things
 from mapvote_lab.evaluation.real_street import (
-    RAIN_SHARE,
+    STREET_RULE,
     Edit,
     RealRun,
     Street,
@@ -45,8 +47,19 @@ from mapvote_lab.evaluation.real_street import (
 )
 from mapvote_lab.evaluation.scores import NEIGHBOURS, ratio
 
-NEAR_CELLS = 5
-"""1.5 m: precision is counted this close to the things, because over a street it depends on their number."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class BenchRule:
+    """How the bench on a recorded street is laid out."""
+
+    near_cells: int = 5
+    """Precision is counted this close to the things, cells: over a whole street it depends on their number."""
+    blocks: tuple[int, ...] = (12, 25)
+    """Lengths of the blocks that make map and votes in turn, scans."""
+
+
+BENCH_RULE = BenchRule()
 
 
 @dataclass(frozen=True)
@@ -73,9 +86,9 @@ class FoundThings:
     things: int
     """That a ray met in at least one cell."""
     half: int
-    """Of them: at least half of their cells were decided rightly."""
+    """Things at least half of whose cells were decided rightly."""
     touched: int
-    """Of them: a cell at the thing, or next to one, was."""
+    """Things at or next to which a cell was decided rightly."""
     cell_recall: float
     """Share of all their cells."""
     rays: float
@@ -83,7 +96,7 @@ class FoundThings:
 
 
 def survey_site(street: Street) -> Site:
-    """What all scans of the recording show, in the frame of the street's map."""
+    """The street as all scans of the recording show it, in the frame of the street's map."""
     drive = street.recording
     localise = GivenPoses(drive.stamps_ns, street.T_map_lidar)
     around = LocalMap(street.point_map, street.settings.voting.window_m)
@@ -136,7 +149,7 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
     left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
     asked += [_gone(street, thing, thing.left, still) for thing in left]
     yield dry, asked
-    rain = in_rain(RAIN_SHARE)  # over what was cast: drops hide the things as they hide the street
+    rain = in_rain(STREET_RULE.rain_share)  # over what was cast: drops hide the things as they hide the street
     yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), asked
 
 
@@ -195,19 +208,28 @@ def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
     return out
 
 
-def precision_near(asked: Sequence[Asked], states: U8, grid: Grid) -> float:
-    """Share of the cells decided changed within 1.5 m of the things that are, or lie next to, cells so changed."""
+def precision_near(asked: Sequence[Asked], states: U8, grid: Grid, near_cells: int = BENCH_RULE.near_cells) -> float:
+    """Share of the cells decided changed within ``near_cells`` of the things that are, or lie next to, cells so
+    changed."""
     near, right = np.zeros(grid.shape, dtype=np.bool_), np.zeros(grid.shape, dtype=np.bool_)
     for a in asked:
-        near |= ndimage.binary_dilation(a.cells, NEIGHBOURS, iterations=NEAR_CELLS)
+        near |= ndimage.binary_dilation(a.cells, NEIGHBOURS, iterations=near_cells)
         right |= ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state)
     return ratio(np.count_nonzero(right), np.count_nonzero(is_changed(states) & near))
 
 
-BLOCKS = (12, 25)
-RAIN = f"rain, {100 * RAIN_SHARE:g} % of the rays"
-BUILT, BUILT_IN_RAIN, DEMOLISHED = "built", f"built in {RAIN}", "demolished"
-CASTS = {(BUILT, BUILT_IN_RAIN): built, (DEMOLISHED,): demolished}
+RAIN = f"rain, {100 * STREET_RULE.rain_share:g} % of the rays"
+
+
+class ChangedRun(StrEnum):
+    """Runs in which something changed."""
+
+    BUILT = "built"
+    BUILT_IN_RAIN = f"built in {RAIN}"
+    DEMOLISHED = "demolished"
+
+
+CASTS = {(ChangedRun.BUILT, ChangedRun.BUILT_IN_RAIN): built, (ChangedRun.DEMOLISHED,): demolished}
 """The runs that each yields in turn."""
 PRIORS: Mapping[str, Edit] = {
     "disturbed by 0.5 m, 2 deg": disturbed(),
@@ -270,11 +292,11 @@ def bench(
     seed: int = 1,
     each: int = 4,
 ) -> Bench:
-    """Run all of it on the drive at ``folder`` (of its ``scans``), ``each`` things of a kind. What a drive is too short
-    or too bare for is skipped and named. MapvoteError if it is too short for the smallest blocks.
+    """Run all of it on the drive at ``folder`` (of its ``scans``), ``each`` things of a kind. Runs for which the drive
+    is too short or too bare are skipped and named. MapvoteError if it is too short for the smallest blocks.
     """
     recording, reference = open_recording(folder, settings, scans)
-    street = lay_street(recording, settings, reference, block=BLOCKS[0])
+    street = lay_street(recording, settings, reference, block=BENCH_RULE.blocks[0])
     result = Bench(folder.resolve().name, len(recording), ground_of(street))
     jobs = _unchanged(recording, settings, reference, street, cases)
     total = len(jobs) + sum(map(len, CASTS))
@@ -308,12 +330,12 @@ def _unchanged(
     def laid(block: int) -> Callable[[], Street]:
         return lambda: lay_street(recording, settings, reference, block=block)
 
-    jobs = {f"blocks of {BLOCKS[0]} scans": on(lambda: street)}
-    jobs |= {f"blocks of {block} scans": on(laid(block)) for block in BLOCKS[1:]}
+    jobs = {f"blocks of {BENCH_RULE.blocks[0]} scans": on(lambda: street)}
+    jobs |= {f"blocks of {block} scans": on(laid(block)) for block in BENCH_RULE.blocks[1:]}
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
     jobs["every other beam"] = on(lambda: street, every_other_beam)
     jobs["70 % of the points lost"] = on(lambda: street, with_fewer_points(0.7))
-    jobs[RAIN] = on(lambda: street, in_rain(RAIN_SHARE))
+    jobs[RAIN] = on(lambda: street, in_rain(STREET_RULE.rain_share))
     if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)
         jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in PRIORS.items()}

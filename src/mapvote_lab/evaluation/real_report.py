@@ -15,10 +15,9 @@ from mapvote.core.types import F64, CellState
 from mapvote.formats.atomic import write_whole
 from mapvote.plots import GONE, INK, NEW, STATE_COLOURS, UNSURE, save
 from mapvote_lab.evaluation.real_bench import (
-    BUILT,
-    BUILT_IN_RAIN,
     Asked,
     Bench,
+    ChangedRun,
     FoundThings,
     precision_near,
     score,
@@ -90,7 +89,7 @@ def _changed(bench: Bench, case: str) -> Sheet:
     rows, said = [], []
     for name, (run, asked) in bench.changed.items():
         said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
-        for f in [] if name == BUILT_IN_RAIN else _found(bench, case, name):
+        for f in [] if name == ChangedRun.BUILT_IN_RAIN else _found(bench, case, name):
             rows.append((f.kind, str(f.things), str(f.half), str(f.touched), f"{f.cell_recall:.2f}", f"{f.rays:.0f}"))
     title = f"{bench.name}: cast into the scans, {case}; precision within 1.5 m of them {', '.join(said)}"
     return Sheet(title, headings, rows)
@@ -99,25 +98,22 @@ def _changed(bench: Bench, case: str) -> Sheet:
 def _in_rain(bench: Bench, case: str) -> Sheet:
     """Beside the dry run, which was asked for the same cells; no rows where it did not rain."""
     headings = ("thing", "asked", "half found", "in rain", "cell recall", "in rain")
-    pairs = zip(_found(bench, case, BUILT), _found(bench, case, BUILT_IN_RAIN), strict=False)
+    pairs = zip(_found(bench, case, ChangedRun.BUILT), _found(bench, case, ChangedRun.BUILT_IN_RAIN), strict=False)
     rows = [
         (dry.kind, str(dry.things), str(dry.half), str(wet.half), f"{dry.cell_recall:.2f}", f"{wet.cell_recall:.2f}")
         for dry, wet in pairs
     ]
-    return Sheet(f"{bench.name}: {BUILT_IN_RAIN}, {case}, beside the dry run", headings, rows)
+    return Sheet(f"{bench.name}: {ChangedRun.BUILT_IN_RAIN}, {case}, beside the dry run", headings, rows)
 
 
 def _found(bench: Bench, case: str, name: str) -> list[FoundThings]:
-    """By kind; nothing of a run that was not made."""
+    """Found things by kind; empty for a run that was not made."""
     if name not in bench.changed:
         return []
     run, asked = bench.changed[name]
     return score(asked, run.states[case])
 
 
-_HALF_M = 8.0
-_MOST = 20
-"""Close-ups."""
 Spot = tuple[float, float, str]
 """x, y (map metres) and title of a close-up."""
 
@@ -151,8 +147,8 @@ def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], pa
     _draw(run, picture, f"{case}: nothing changed; red = decided new, blue = decided gone", spots, path)
 
 
-def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path) -> None:
-    """The whole street, and a close-up of each thing, the least found first: found, missed, falsely decided."""
+def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path, most: int = 20) -> None:
+    """The whole street, and close-ups of at most ``most`` things, the least found first: found, missed, false."""
     picture, states = _street(run), run.states[case]
     picture[is_changed(states)] = to_rgb(INK)
     share, spots = [], []
@@ -164,7 +160,7 @@ def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path) -> 
             rows, cols = np.nonzero(a.cells)
             share.append(float((states[a.cells] == a.state).mean()))
             spots.append((float(x[cols].mean()), float(y[rows].mean()), f"{a.kind}: {share[-1]:.0%}"))
-    worst = [spots[k] for k in np.argsort(share, kind="stable")[:_MOST]]
+    worst = [spots[k] for k in np.argsort(share, kind="stable")[:most]]
     title = f"{case}: red = new and found, blue = gone and found, yellow = missed, black = false"
     _draw(run, picture, title, worst, path)
 
@@ -178,8 +174,9 @@ def _street(run: RealRun) -> F64:
     return picture
 
 
-def _draw(run: RealRun, picture: F64, title: str, spots: Sequence[Spot], path: Path) -> None:
-    """The whole, and under it close-ups of 16 m, five to a row."""
+def _draw(run: RealRun, picture: F64, title: str, spots: Sequence[Spot], path: Path, half_m: float = 8.0) -> None:
+    """The whole, and under it close-ups of twice ``half_m``, five to a row."""
+    # The whole street above, a row for every five close-ups below.
     grid = run.street.grid
     extent = (grid.x0, grid.x0 + 0.3 * grid.cols, grid.y0, grid.y0 + 0.3 * grid.rows)
     rows = [[str(k + i) for i in range(5)] for k in range(0, len(spots), 5)]
@@ -190,6 +187,7 @@ def _draw(run: RealRun, picture: F64, title: str, spots: Sequence[Spot], path: P
     axes["all"].set_xlabel("east, m")
     axes["all"].set_ylabel("north, m")
     axes["all"].set_title(f"{run.street.recording.path.resolve().name}, {title}")
+    # Each close-up has the number of its place in the whole.
     for k in range(5 * len(rows)):
         ax = axes[str(k)]
         if k >= len(spots):
@@ -198,7 +196,7 @@ def _draw(run: RealRun, picture: F64, title: str, spots: Sequence[Spot], path: P
         x, y, name = spots[k]
         axes["all"].annotate(str(k + 1), (x, y), fontsize=12, weight="bold")
         ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest")
-        ax.set_xlim(x - _HALF_M, x + _HALF_M)
-        ax.set_ylim(y - _HALF_M, y + _HALF_M)
+        ax.set_xlim(x - half_m, x + half_m)
+        ax.set_ylim(y - half_m, y + half_m)
         ax.set_title(f"{k + 1}: {name}", fontsize=10)
     save(figure, path)

@@ -1,9 +1,9 @@
 """A real street, driven once, that did not change (paper VI asks for it).
 
 The map comes from alternating blocks of a drive's scans, three vehicles from the blocks between, every third scan
-each. All is still one pass: same viewpoints, same parked cars, minutes at most between map and vote. What is
-measured here is a lower bound of what a fleet meets. Edits give the same drive with another sensor, in other weather,
-or with worse beliefs about where it is.
+each. All is still one pass: same viewpoints, same parked cars, minutes at most between map and vote. The
+measured errors are a lower bound of those that a fleet meets. Edits give the same drive with another sensor, in other
+weather, or with worse beliefs about where it is.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy, transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
@@ -35,11 +36,25 @@ from mapvote_lab.evaluation.scene import SharedPass
 from mapvote_lab.evaluation.scores import NEIGHBOURS, cells_with, determined, pieces, ratio
 from mapvote_lab.evaluation.truths import pose_errors, rigid_between
 
-VEHICLES = 3
-WRONG_M = 0.5
-"""A pose farther off than this is wrong."""
-LEAST_SCANS = 4
-"""Of each vehicle: a place counts as found once three scans agree on it."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class StreetRule:
+    """How a recording becomes a map and voting vehicles, and what its edits do."""
+
+    vehicles: int = 3
+    """Vehicles that vote."""
+    least_scans: int = 4
+    """Least scans of each vehicle: a place counts as found once three scans agree on it."""
+    wrong_m: float = 0.5
+    """A pose farther off than this is wrong, metres."""
+    rain_share: float = 0.1
+    """Share of the rays that end on drops in the runs in rain."""
+    drops_m: float = 5.0
+    """Mean distance of the drops that end a ray, metres beyond the sensor's least range."""
+
+
+STREET_RULE = StreetRule()
 Edit = Callable[[Drive], Drive]
 """Changes a whole recording before any of it is used: what its sensor sees, or what it believes."""
 
@@ -61,18 +76,20 @@ def part_of(recording: Drive, scans: I64, vehicle: str | None = None) -> Drive:
     )
 
 
-def split(n: int, block: int) -> tuple[I64, list[I64]]:
+def split(n: int, block: int, rule: StreetRule = STREET_RULE) -> tuple[I64, list[I64]]:
     """(scans of the map, of each vehicle) of a recording of ``n``: blocks in turn, every third scan each.
 
     MapvoteError if that leaves too few to vote.
     """
     blocks = np.arange(n) // block
     mapped, rest = np.flatnonzero(blocks % 2 == 0), np.flatnonzero(blocks % 2 == 1)
-    if len(rest) < LEAST_SCANS * VEHICLES:
+    needed = rule.least_scans * rule.vehicles
+    if len(rest) < needed:
         raise MapvoteError(
-            f"of {n} scans in blocks of {block}, {len(rest)} are left to vote: {LEAST_SCANS * VEHICLES} are needed"
+            f"blocks of {block} scans leave {len(rest)} of {n} scans to vote, but {needed} are needed; "
+            "choose smaller blocks or a longer drive"
         )
-    return mapped, [rest[(rest % block) % VEHICLES == k] for k in range(VEHICLES)]
+    return mapped, [rest[(rest % block) % rule.vehicles == k] for k in range(rule.vehicles)]
 
 
 @dataclass(frozen=True)
@@ -141,7 +158,7 @@ class RealRun:
             "false_share_with_movers": self.changed_share(case, with_movers=True),
             "false_share_of_mapped": self.changed_share(case, with_movers=False, of_mapped=True),
             "lost_share": self.lost_share,
-            "wrong_share": float(np.count_nonzero(self.error_m >= WRONG_M)) / self.scans,
+            "wrong_share": float(np.count_nonzero(self.error_m >= STREET_RULE.wrong_m)) / self.scans,
             "median_error_m": float(np.median(self.error_m)) if len(self.error_m) else 0.0,
             "max_error_m": float(self.error_m.max(initial=0.0)),
         }
@@ -279,11 +296,6 @@ def largest_false_changes(run: RealRun, case: str, most: int = 10) -> list[False
     return sorted(out, key=lambda f: (-f.m2, f.x, f.y))[:most]
 
 
-RAIN_SHARE = 0.1
-"""Share of the rays that end on drops where rain is asked for."""
-_DROPS_M = 5.0
-
-
 def of_points(scan: Scan, keep: Bool) -> Scan:
     """The scan's points of ``keep`` (n,)."""
     return replace(
@@ -323,15 +335,15 @@ def with_fewer_points(share: float) -> Edit:
     return edit
 
 
-def in_rain(share: float) -> Edit:
-    """Rain: that share of the rays ends on a drop near the sensor (exponential, 5 m in the mean)."""
+def in_rain(share: float, drops_m: float = STREET_RULE.drops_m) -> Edit:
+    """Rain: that share of the rays ends on a drop near the sensor (exponential, ``drops_m`` in the mean)."""
 
     def edit(drive: Drive) -> Drive:
         def read_scan(i: int) -> Scan:
             scan = drive.read_scan(i)
             rng = np.random.default_rng([i, 1])
             reach = np.linalg.norm(scan.points, axis=1)
-            drop = drive.sensor.min_range_m + rng.exponential(_DROPS_M, len(reach)).astype(np.float32)
+            drop = drive.sensor.min_range_m + rng.exponential(drops_m, len(reach)).astype(np.float32)
             short = np.where((rng.random(len(reach)) < share) & (drop < reach), drop / np.maximum(reach, 1e-3), 1.0)
             return replace(scan, points=(scan.points * short[:, None]).astype(np.float32))
 

@@ -18,18 +18,38 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.fuse import Decision
 from mapvote.fusion.loss_budget import alike_beside, change_probability
+from mapvote_lab.simulation.truth import Label
 
-CLASSES = ("unchanged", "changed_occupied", "changed_empty")
-"""The paper's three scored classes; the position is the value in a truth grid."""
 NEIGHBOURS = np.ones((3, 3), dtype=np.bool_)
 """A cell and the eight around it."""
-UNSCORED = 255
-"""In a truth grid: this cell is not counted."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ScoreRule:
+    """What counts as an object, as found, and as visible."""
+
+    least_object_m2: float = 1.0
+    """Area from which a group of changed cells is an object, square metres."""
+    beside_cells: int = 2
+    """A decided object is no invention if a true cell of its class lies this near, cells."""
+    found_share: float = 0.5
+    """A true object is found if this share of its changed cells was decided so."""
+    visible_share: float = 0.05
+    """A demolished object has a visible rest if more than this share of its points is left."""
+    visible_points: int = 20
+    """A visible rest has more points than this."""
+    bins: int = 10
+    """Bins of equal width, from 0 to 1, in which probabilities are held against the truth."""
+
+
+SCORE_RULE = ScoreRule()
 
 
 def ratio(part: float | np.integer, whole: float | np.integer) -> float:
@@ -38,7 +58,7 @@ def ratio(part: float | np.integer, whole: float | np.integer) -> float:
 
 
 class ByClass(msgspec.Struct, frozen=True):
-    """A number for each of :data:`CLASSES`; iterates in their order."""
+    """A number for each of the paper's three scored classes; iterates in the order of ``Label``."""
 
     unchanged: float
     changed_occupied: float
@@ -85,7 +105,7 @@ def classes_of(states: U8) -> U8:
 
 def score_cells(states: U8, truth: U8) -> Scores:
     """Precision and recall of decided ``states`` (CellState or NO_VOTE) against ``truth`` (0, 1, 2 or 255)."""
-    scored = truth != UNSCORED
+    scored = truth != Label.UNSCORED
     pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
     table = np.bincount(pairs, minlength=9).reshape(3, 3)
     right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
@@ -119,7 +139,7 @@ def determined_share(vehicle_states: Sequence[U8], truth: U8) -> float:
     seen = np.zeros(truth.shape, dtype=np.bool_)
     for states in vehicle_states:
         seen |= determined(states)
-    scored = truth != UNSCORED
+    scored = truth != Label.UNSCORED
     return ratio(np.count_nonzero(seen & scored), np.count_nonzero(scored))
 
 
@@ -134,15 +154,14 @@ class ObjectScores(msgspec.Struct, frozen=True):
     """Area of each decided object that touches no truth of its class, largest first."""
 
 
-LEAST_OBJECT_M2 = 1.0
-
-
-def score_objects(states: U8, truth: U8, objects: Sequence[Mapping[str, object]]) -> ObjectScores:
+def score_objects(
+    states: U8, truth: U8, objects: Sequence[Mapping[str, object]], rule: ScoreRule = SCORE_RULE
+) -> ObjectScores:
     """``objects`` give ``cells`` (rows, cols) bool over the window and ``kind``: "built" or "demolished".
 
-    A decided object is an 8-connected group of cells of one changed class of at least LEAST_OBJECT_M2; it is false if
-    no truth cell of its class, nor an unscored one, lies within two cells of it (a wall one cell off is no invention).
-    Objects with no truth cell (never reachable by a ray) are not asked for.
+    A decided object is an 8-connected group of cells of one changed class of at least ``rule.least_object_m2``; it is
+    false if no truth cell of its class, nor an unscored one, lies within ``rule.beside_cells`` of it (a wall one cell
+    off is no invention). Objects with no truth cell (never reachable by a ray) are not asked for.
     """
     decided = classes_of(states)
     recalls = []
@@ -153,17 +172,19 @@ def score_objects(states: U8, truth: U8, objects: Sequence[Mapping[str, object]]
             recalls.append(ratio(np.count_nonzero(wanted & (decided == kind)), np.count_nonzero(wanted)))
     false = []
     for kind in (1, 2):
-        near = ndimage.binary_dilation((truth == kind) | (truth == UNSCORED), NEIGHBOURS, iterations=2)
+        near = ndimage.binary_dilation(
+            (truth == kind) | (truth == Label.UNSCORED), NEIGHBOURS, iterations=rule.beside_cells
+        )
         for cells in pieces(decided == kind):
             area = len(cells[0]) * CELL_SIZE**2
-            if area >= LEAST_OBJECT_M2 and not near[cells].any():
+            if area >= rule.least_object_m2 and not near[cells].any():
                 false.append(area)
-    found = tuple(share >= 0.5 for share in recalls)
+    found = tuple(share >= rule.found_share for share in recalls)
     return ObjectScores(found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
 
 
 class MapScores(msgspec.Struct, frozen=True, kw_only=True):
-    """What the update did to the points (shares of points, or of surface samples for ``new_added``)."""
+    """Effect of the update on the points (shares of points, or of surface samples for ``new_added``)."""
 
     stale_deleted: float
     """Old map points of removed surfaces that are gone."""
@@ -182,12 +203,8 @@ class MapScores(msgspec.Struct, frozen=True, kw_only=True):
     added_points: int
 
 
-VISIBLE_SHARE, VISIBLE_POINTS = 0.05, 20
-"""A demolished object has a visible rest if more than this share of its points, and more points than this, are left."""
-
-
 class ObjectRests(msgspec.Struct, frozen=True):
-    """What the update made of the points of each true object, in the order of the truth."""
+    """Points left and added of each true object, in the order of the truth."""
 
     left: tuple[float, ...]
     """Per demolished object of which the map held a point: share of its points left."""
@@ -198,7 +215,7 @@ class ObjectRests(msgspec.Struct, frozen=True):
 
 
 class MapJudge:
-    """Compares maps with noise-free surface samples of the two worlds; what the old map is worth is asked once.
+    """Compares maps with noise-free surface samples of the two worlds; the old map is judged once.
 
     ``old_points`` (n, 3) are the obstacle points of the map before the update. ``kept``, ``added`` and ``removed``
     (m, 3) are surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old
@@ -216,7 +233,9 @@ class MapJudge:
         scored: Callable[[F64], Bool] | None = None,
         *,
         reach_m: float = 0.3,
+        rule: ScoreRule = SCORE_RULE,
     ) -> None:
+        self._rule = rule
         self._old, self._added, self._scored, self._reach_m = old_points, added, scored, reach_m
         self._now = cKDTree(np.concatenate([kept, added]))
         to_removed = _distance(old_points, cKDTree(removed))
@@ -253,7 +272,7 @@ class MapJudge:
                 own = survived[self.stale & inside(self._old)]
                 share = ratio(np.count_nonzero(own), len(own))
                 left += [share] * bool(len(own))
-                visible += int(share > VISIBLE_SHARE and np.count_nonzero(own) > VISIBLE_POINTS)
+                visible += int(share > self._rule.visible_share and np.count_nonzero(own) > self._rule.visible_points)
             else:
                 own = reached[inside(self._added)]
                 added += [ratio(np.count_nonzero(own), len(own))] * bool(len(own))
@@ -283,20 +302,16 @@ def map_obstacles(point_map: PointMap) -> F64:
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
 
 
-BINS = 10
-"""Of equal width, from 0 to 1."""
-
-
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """Of the scored cells that were decided as one kind of change. Bins without a cell have NaN."""
+    """Probabilities of the scored cells that were decided as one kind of change. Bins without a cell have NaN."""
 
     predicted: F64
-    """(BINS,) mean probability."""
+    """(bins,) mean probability."""
     true: F64
-    """(BINS,) share of the cells that did change so."""
+    """(bins,) share of the cells that did change so."""
     cells: I64
-    """(BINS,)."""
+    """(bins,)."""
     calibration_error: float
     """Mean distance of the two over the bins, weighed by their cells (ECE)."""
     brier: float
@@ -304,39 +319,47 @@ class Reliability:
 
 
 def reliability(
-    decisions: Mapping[TileIndex, Decision], lattice: Lattice, truth: U8, window: Grid, state: CellState
+    decisions: Mapping[TileIndex, Decision],
+    lattice: Lattice,
+    truth: U8,
+    window: Grid,
+    state: CellState,
+    rule: ScoreRule = SCORE_RULE,
 ) -> Reliability:
     """Hold the probabilities of the cells decided as ``state``, a changed one, against ``truth`` over ``window``.
 
-    As the server tells them (:func:`mapvote.fusion.loss_budget.change_probability`); votes are of vehicles, so
-    ``decisions`` are two-stage ones.
+    The probabilities are the server's (:func:`mapvote.fusion.loss_budget.change_probability`); votes are of vehicles,
+    so ``decisions`` are two-stage ones.
     """
+    # Every cell decided as ``state``: its place, and the votes for and against.
     parts = [np.zeros((5, 0), dtype=np.int64)]
     for index, decision in decisions.items():
         tile = lattice.tile(index)
         r, c = np.nonzero(decision.states == state)
-        told = decision.tally[r, c].astype(np.int64) // VOTE_UNIT
-        votes = told[:, state]
-        against = told[:, : CellState.UNDETERMINED].sum(axis=1) - votes  # undetermined ones say nothing
+        counts = decision.tally[r, c].astype(np.int64) // VOTE_UNIT
+        votes = counts[:, state]
+        against = counts[:, : CellState.UNDETERMINED].sum(axis=1) - votes  # undetermined ones say nothing
         parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, against, decision.odds.at(r * TILE_CELLS + c)]))
     rows, cols, votes, against, odds = np.concatenate(parts, axis=1)
     beside = alike_beside(rows, cols, np.zeros(len(rows), dtype=np.int64))
     states = np.full(len(rows), state, dtype=np.uint8)
-    said = change_probability(states, votes, against, beside, odds.astype(np.int8))
+    # The probability of each, and whether the truth agrees, where the truth is scored.
+    probability = change_probability(states, votes, against, beside, odds.astype(np.int8))
     r, c = rows - window.row0, cols - window.col0
     inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
-    found = truth[r[inside], c[inside]]
-    scored = found != UNSCORED
-    true = found[scored] == (1 if state == CellState.CHANGED_OCCUPIED else 2)
-    said = said[inside][scored]
-    which = np.minimum((said * BINS).astype(np.int64), BINS - 1)
-    cells = np.bincount(which, minlength=BINS)
+    labels = truth[r[inside], c[inside]]
+    scored = labels != Label.UNSCORED
+    true = labels[scored] == (1 if state == CellState.CHANGED_OCCUPIED else 2)
+    probability = probability[inside][scored]
+    # Mean probability and share of true changes, bin by bin.
+    bin_of = np.minimum((probability * rule.bins).astype(np.int64), rule.bins - 1)
+    cells = np.bincount(bin_of, minlength=rule.bins)
     with np.errstate(invalid="ignore"):
-        predicted = np.bincount(which, weights=said, minlength=BINS) / cells
-        share = np.bincount(which, weights=true, minlength=BINS) / cells
+        predicted = np.bincount(bin_of, weights=probability, minlength=rule.bins) / cells
+        share = np.bincount(bin_of, weights=true, minlength=rule.bins) / cells
     apart = np.where(cells > 0, np.abs(np.nan_to_num(predicted) - np.nan_to_num(share)), 0.0)
-    off = float((apart * cells).sum()), float(((said - true) ** 2).sum())
-    return Reliability(predicted, share, cells, ratio(off[0], len(said)), ratio(off[1], len(said)))
+    off = float((apart * cells).sum()), float(((probability - true) ** 2).sum())
+    return Reliability(predicted, share, cells, ratio(off[0], len(probability)), ratio(off[1], len(probability)))
 
 
 PAPER_SCORES = {
@@ -352,7 +375,7 @@ PAPER_F1 = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
 
 
 class PoseErrors(msgspec.Struct, frozen=True, kw_only=True):
-    """Of a drive's scans: over those that were localised."""
+    """Errors of a drive's scans, over those that were localised."""
 
     scans: int
     localised: int
@@ -380,9 +403,9 @@ class CaseResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     rests: ObjectRests | None = None
     """As ``map``."""
     bytes_per_vehicle: list[int]
-    """Of each ballot; empty for a yardstick, which sends none."""
+    """Size of each ballot; empty for a yardstick, which sends none."""
     state_bytes_per_vehicle: list[int] | None = None
-    """Of the votes alone, without new points and other planes."""
+    """Size of the votes alone, without new points and other planes."""
 
 
 class MapShift(msgspec.Struct, frozen=True):
@@ -402,7 +425,7 @@ class Cost(msgspec.Struct, frozen=True):
     ms_per_scan: float
     """Median, milliseconds."""
     memory_bytes: float
-    """Of its grid."""
+    """Size of its grid."""
 
 
 class Timings(msgspec.Struct, frozen=True, kw_only=True):
@@ -429,7 +452,7 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     cells: int
     """In the truth's window."""
     coverage: float
-    """Of the case whose updated map is shown."""
+    """Coverage of the case whose updated map is shown."""
     settings: dict[str, Any]
     map_shift: MapShift
     localisation: dict[str, PoseErrors]

@@ -17,7 +17,6 @@ from rich.table import Table
 from rich.text import Text
 
 from mapvote_lab.evaluation.scores import (
-    CLASSES,
     PAPER_F1,
     PAPER_SCORES,
     ByClass,
@@ -94,9 +93,6 @@ td.dim, th.dim { color: #7a8894; }
 pre { background: #f2f5f7; border-radius: 8px; padding: .9rem 1.1rem; overflow-x: auto; font-size: .88rem; }
 """
 
-_PIXELS = 1.7
-"""Of a picture to one of the page: sharp on fine screens."""
-
 
 @dataclass(frozen=True, slots=True)
 class ReportSection:
@@ -129,7 +125,9 @@ def _section(section: ReportSection) -> str:
     parts += [section.markup] if section.markup else []
     for path, caption in section.pictures:
         raw = path.read_bytes()
-        width = round(int.from_bytes(raw[16:20], "big") / _PIXELS)  # PNG: the width stands in its first chunk
+        width = round(
+            int.from_bytes(raw[16:20], "big") / 1.7
+        )  # PNG: width in the first chunk; 1.7: sharp on fine screens
         data = base64.b64encode(raw).decode()
         parts.append(
             f'<figure><img width="{width}" alt="{escape(caption, quote=True)}" src="data:image/png;base64,{data}">'
@@ -165,11 +163,11 @@ def _class_table(title: str, scores: Mapping[str, Scores], of: Callable[[Scores]
     """A line a case, our figure and the paper's for each class; ``of``: which figures."""
     rows = []
     for case, ours in scores.items():
-        printed = of(PAPER_SCORES[case]) if case in PAPER_SCORES else (None,) * len(CLASSES)
+        printed = of(PAPER_SCORES[case]) if case in PAPER_SCORES else (None,) * len(HEADINGS)
         rows.append(
             [case_name(case), *(_share(value) for pair in zip(of(ours), printed, strict=True) for value in pair)]
         )
-    return Sheet(title, ["", *(h for name in CLASSES for h in (HEADINGS[name], PAPER))], rows)
+    return Sheet(title, ["", *(h for heading in HEADINGS.values() for h in (heading, PAPER))], rows)
 
 
 def tables(result: EvaluationResult) -> Iterator[Sheet]:

@@ -1,11 +1,11 @@
-"""What really happened, as the simulator wrote it, and the truths that decided cells are held against.
+"""The truth as the simulator wrote it, and the truths that decided cells are held against.
 
 The only module that opens a truth folder.
 
 A wall two centimetres from a cell's border fills one cell of a noise-free truth, and two of any cloud with two
 centimetres of range noise. **border** is a truth without the cells that change sides when the surfaces move by
-:data:`BORDER_M`. :func:`ceiling` is the score of a judge who knows of every point of such a cloud whether its surface
-came, went or stayed, but has to answer in cells.
+``TruthReading.border_m``. :func:`ceiling` is the score of a judge who knows of every point of such a cloud whether its
+surface came, went or stayed, but has to answer in cells.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mapvote.core.columns import column_bits
 from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I32, NO_VOTE, U8, Bool, CellState, MapvoteError, Reference
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.fusion.fuse import Decision
 from mapvote_lab.evaluation.scores import (
     NEIGHBOURS,
-    UNSCORED,
     CaseResult,
     MapJudge,
     MapScores,
@@ -44,11 +44,30 @@ from mapvote_lab.evaluation.scores import (
     score_cells,
     score_objects,
 )
+from mapvote_lab.simulation.truth import Label
+from mapvote_lab.simulation.world import Role
 
-_KEPT, _ADDED, _REMOVED = 0, 1, 2
-_AROUND_M = 0.6
-"""Walls stand on the outline of a footprint: cells this far outside it still belong to the object."""
-_ARM_M = 2.0
+
+@record()
+@dataclass(frozen=True, slots=True)
+class TruthReading:
+    """How cells are read from the simulator's truth."""
+
+    around_m: float = 0.6
+    """Cells this far outside a footprint still belong to the object, metres: walls stand on its outline."""
+    border_m: float = 0.05
+    """A cell is unsure if it changes sides when the surfaces move by this, metres."""
+    noise_m: float = 0.02
+    """Standard deviation of the range noise of the simulated sensors, metres."""
+    draws: int = 8
+    """Times that every surface sample is measured for a ceiling."""
+    least_points: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64, 128)
+    """Points that a ceiling tries as enough for a changed cell."""
+    on_surface_m: float = 0.3
+    """A map point farther than this from every surface lies on none, metres (as evaluation/scores.py has it)."""
+
+
+TRUTH_READING = TruthReading()
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +117,10 @@ class Truth:
         """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
         with np.load(self.folder / "surface.npz") as file:
             points, label = file["points"].astype(np.float64), file["label"]
-        return points[label == _KEPT], points[label == _ADDED], points[label == _REMOVED]
+        return points[label == Role.KEPT], points[label == Role.ADDED], points[label == Role.REMOVED]
 
-    def cells_of(self, footprint: list[list[float]]) -> Bool:
-        """(rows, cols) cells whose centres lie in a convex footprint or within 0.6 m of it."""
+    def cells_of(self, footprint: list[list[float]], around_m: float = TRUTH_READING.around_m) -> Bool:
+        """(rows, cols) cells whose centres lie in a convex footprint or within ``around_m`` of it."""
         corners = np.asarray(footprint)
         turn = np.roll(corners, -1, axis=0) - corners
         x1, y1 = np.roll(corners, -1, axis=0).T
@@ -110,7 +129,7 @@ class Truth:
         x, y = self.grid.centres()
         inside = np.ones(self.strict.shape, dtype=np.bool_)
         for (cx, cy), (nx, ny) in zip(corners, outward, strict=True):
-            inside &= (x[None, :] - cx) * nx + (y[:, None] - cy) * ny <= _AROUND_M
+            inside &= (x[None, :] - cx) * nx + (y[:, None] - cy) * ny <= around_m
         return inside
 
 
@@ -138,15 +157,15 @@ def lay_on(states: U8, grid: Grid, window: Grid) -> U8:
     return out
 
 
-def rigid_between(T_map_a: F64, T_world_a: F64) -> F64:
+def rigid_between(T_map_a: F64, T_world_a: F64, arm_m: float = 2.0) -> F64:
     """T_map_world (4, 4) that best carries one trajectory (n, 4, 4) onto the other, least squares (Kabsch 1976).
 
-    Each pose stands for its position and for points 2 m along its axes, so that a straight road, whose positions
+    Each pose stands for its position and for points ``arm_m`` along its axes, so that a straight road, whose positions
     leave the turn about it open, still fixes all six degrees of freedom.
     """
     to, of = T_map_a[:, :3, 3].mean(axis=0), T_world_a[:, :3, 3].mean(axis=0)
     spread = (T_map_a[:, :3, 3] - to).T @ (T_world_a[:, :3, 3] - of)
-    spread += _ARM_M**2 * np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
+    spread += arm_m**2 * np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
     u, _, vt = np.linalg.svd(spread)
     T = np.eye(4)
     T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -162,7 +181,7 @@ def pose_errors(T_found: F64, T_true: F64) -> tuple[F64, F64]:
 
 
 def error_summary(T_found: F64, T_true: F64) -> PoseErrors:
-    """Of poses (n, 4, 4), both in one frame; a scan that was not localised is a row of NaN."""
+    """Errors of poses (n, 4, 4), both in one frame; a scan that was not localised is a row of NaN."""
     there = np.isfinite(T_found).all(axis=(1, 2))
     metres, radians = pose_errors(T_found[there], T_true[there])
     if not there.any():
@@ -177,49 +196,45 @@ def error_summary(T_found: F64, T_true: F64) -> PoseErrors:
     )
 
 
-BORDER_M = 0.05
-NOISE_M = 0.02
-"""Range noise of the simulated sensors."""
-_DRAWS = 8
-_LEAST_POINTS = (1, 2, 4, 8, 16, 32, 64, 128)
-_UNCHANGED, _OCCUPIED, _EMPTY = 0, 1, 2
-
-
-def border(truth: Truth, cells: U8) -> U8:
-    """(rows, cols) ``cells``, one of the two definitions of ``truth``, with UNSCORED where :data:`BORDER_M` decide.
+def border(truth: Truth, cells: U8, reading: TruthReading = TRUTH_READING) -> U8:
+    """(rows, cols) ``cells``, one of the two definitions of ``truth``; unscored where ``reading.border_m`` decide.
 
     These are changed cells whose changed surface lies only in the rim of the cell, changed cells next to whose rim
     something stands, and unchanged cells that no standing surface fills firmly, with a changed one at their rim.
     Surfaces are the noise-free samples, .1 m apart (standing ones .25 m), of what rays could reach.
     """
     seen, added, removed = _around(truth, cells)
-    changed = np.isin(cells, (_OCCUPIED, _EMPTY))
-    moved = {kind: _rims(truth, samples) for kind, samples in ((_OCCUPIED, added), (_EMPTY, removed))}
-    stands, stands_near = _rims(truth, seen)
+    changed = np.isin(cells, (Label.CHANGED_OCCUPIED, Label.CHANGED_EMPTY))
+    moved = {
+        kind: _rims(truth, samples, reading.border_m)
+        for kind, samples in ((Label.CHANGED_OCCUPIED, added), (Label.CHANGED_EMPTY, removed))
+    }
+    stands, stands_near = _rims(truth, seen, reading.border_m)
     unsure = changed & stands_near
     for kind, (firm, near) in moved.items():
         unsure |= (cells == kind) & ~firm
         unsure |= ~changed & near & ~stands
-    return np.where(unsure, np.uint8(UNSCORED), cells)
+    return np.where(unsure, np.uint8(Label.UNSCORED), cells)
 
 
 def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
     """Surface samples (n, 3) that (stand, came, went); of the standing ones those that can be seen near a change."""
     kept, added, removed = truth.surfaces()
-    changed = np.isin(cells, (_OCCUPIED, _EMPTY))
+    changed = np.isin(cells, (Label.CHANGED_OCCUPIED, Label.CHANGED_EMPTY))
     near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), NEIGHBOURS)
     beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
     return kept[truth.grid.value_at(beside, kept)], added, removed
 
 
-def _rims(truth: Truth, samples: F64) -> tuple[Bool, Bool]:
-    """(cells with a sample farther than BORDER_M from their rim, cells with one no farther than that outside it)."""
+def _rims(truth: Truth, samples: F64, border_m: float) -> tuple[Bool, Bool]:
+    """(cells with a sample farther than ``border_m`` from their rim, cells with one no farther than that outside
+    it)."""
     x, y = (samples[:, 0] - truth.x0) % CELL_SIZE, (samples[:, 1] - truth.y0) % CELL_SIZE
-    inner = np.abs(np.column_stack([x, y]) - CELL_SIZE / 2).max(axis=1, initial=0.0) < CELL_SIZE / 2 - BORDER_M
+    inner = np.abs(np.column_stack([x, y]) - CELL_SIZE / 2).max(axis=1, initial=0.0) < CELL_SIZE / 2 - border_m
     firm = _count(truth, samples[inner]) > 0
     near = np.zeros_like(firm)
-    for dx in (-BORDER_M, BORDER_M):
-        for dy in (-BORDER_M, BORDER_M):
+    for dx in (-border_m, border_m):
+        for dy in (-border_m, border_m):
             near |= _count(truth, samples + np.array([dx, dy, 0.0])) > 0
     return firm, near
 
@@ -231,24 +246,24 @@ def _count(truth: Truth, samples: F64) -> I32:
     return np.bincount(r[inside] * cols + c[inside], minlength=rows * cols).reshape(rows, cols).astype(np.int32)
 
 
-def ceiling(truth: Truth, cells: U8) -> Scores:
+def ceiling(truth: Truth, cells: U8, reading: TruthReading = TRUTH_READING) -> Scores:
     """The best that perfect labels on a cloud with range noise score against ``cells``.
 
-    Every surface sample is measured :data:`_DRAWS` times, :data:`NOISE_M` off in the plane. A cell is changed if it
-    holds enough points of a surface that came, or went, and none of one that stands; how many are enough is chosen on
-    the truth itself, so no method that votes in cells can be expected to do better.
+    Every surface sample is measured ``reading.draws`` times, ``reading.noise_m`` off in the plane. A cell is changed if
+    it holds enough points of a surface that came, or went, and none of one that stands; how many are enough is chosen
+    on the truth itself, so no method that votes in cells can be expected to do better.
     """
     kept, added, removed = _around(truth, cells)
     rng = np.random.default_rng(0)
-    stands, came, went = (_measured(truth, samples, rng) for samples in (kept, added, removed))
-    best = [score_cells(_answer(stands, came, went, least), cells) for least in _LEAST_POINTS]
+    stands, came, went = (_measured(truth, samples, rng, reading) for samples in (kept, added, removed))
+    best = [score_cells(_answer(stands, came, went, least), cells) for least in reading.least_points]
     return max(best, key=lambda scores: scores.macro_f1)
 
 
-def _measured(truth: Truth, samples: F64, rng: np.random.Generator) -> I32:
+def _measured(truth: Truth, samples: F64, rng: np.random.Generator, reading: TruthReading) -> I32:
     out = np.zeros(truth.strict.shape, dtype=np.int32)
-    for _ in range(_DRAWS):
-        noise = rng.normal(0.0, NOISE_M, samples.shape)
+    for _ in range(reading.draws):
+        noise = rng.normal(0.0, reading.noise_m, samples.shape)
         noise[:, 2] = 0.0
         out += _count(truth, samples + noise)
     return out
@@ -261,10 +276,6 @@ def _answer(stands: I32, came: I32, went: I32, least: int) -> U8:
     return states
 
 
-ON_SURFACE_M = 0.3
-"""A map point farther than this from every surface lies on none (as evaluation/scores.py has it)."""
-
-
 def could_be_known(truth: Truth, first_map: Reference) -> U8:
     """Provenance, less what a vote by scans cannot know: (rows, cols).
 
@@ -272,25 +283,25 @@ def could_be_known(truth: Truth, first_map: Reference) -> U8:
     simulator), and a demolished one of which the map holds no point. Both are unscored.
     """
     out = truth.provenance.copy()
-    out[(out == _OCCUPIED) & (truth.densest < PaperSettings().n_min)] = UNSCORED
-    out[(out == _EMPTY) & (first_map.counts == 0)] = UNSCORED
+    out[(out == Label.CHANGED_OCCUPIED) & (truth.densest < PaperSettings().n_min)] = Label.UNSCORED
+    out[(out == Label.CHANGED_EMPTY) & (first_map.counts == 0)] = Label.UNSCORED
     return out
 
 
-def known(truth: Truth, first_map: Reference) -> U8:
+def known(truth: Truth, first_map: Reference, reading: TruthReading = TRUTH_READING) -> U8:
     """``border`` of the strict truth, less the cells of which nobody could know better: (rows, cols).
 
     Unscored besides are a built surface of which no vehicle recorded a point in the cell, a demolished one through
     whose place no vehicle's ray went, and an unchanged cell in which the first map holds points on nothing: it has
-    points, and no surface that stood at the survey comes within ON_SURFACE_M of the cell.
+    points, and no surface that stood at the survey comes within ``reading.on_surface_m`` of the cell.
     """
-    out = border(truth, truth.strict)
-    undecided = ((out == _OCCUPIED) & ~truth.hit) | ((out == _EMPTY) & ~truth.passed)
+    out = border(truth, truth.strict, reading)
+    undecided = ((out == Label.CHANGED_OCCUPIED) & ~truth.hit) | ((out == Label.CHANGED_EMPTY) & ~truth.passed)
     kept, _, removed = truth.surfaces()
     stood = cells_with(np.concatenate([kept, removed]), first_map.grid)
-    near = ndimage.binary_dilation(stood, NEIGHBOURS, iterations=round(ON_SURFACE_M / CELL_SIZE))
-    on_nothing = (out == _UNCHANGED) & (first_map.counts > 0) & ~near
-    return np.where(undecided | on_nothing, np.uint8(UNSCORED), out)
+    near = ndimage.binary_dilation(stood, NEIGHBOURS, iterations=round(reading.on_surface_m / CELL_SIZE))
+    on_nothing = (out == Label.UNCHANGED) & (first_map.counts > 0) & ~near
+    return np.where(undecided | on_nothing, np.uint8(Label.UNSCORED), out)
 
 
 TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
@@ -301,8 +312,8 @@ TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
     "border": lambda truth, first_map: border(truth, truth.strict),
     "border, provenance": lambda truth, first_map: border(truth, truth.provenance),
 }
-"""What each calls a cell, over the window of the truth: 0 unchanged, 1 changed-occupied, 2 changed-empty, 255 unscored;
-``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
+"""Label of each cell by each truth, over the window of the truth: 0 unchanged, 1 changed-occupied, 2 changed-empty, 255
+unscored; ``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
 
 SIDE_BY_SIDE = ("strict", "provenance", "could be known")
 """Those that differ in what they ask for: the readings of the paper are scored by each."""
@@ -310,7 +321,7 @@ SIDE_BY_SIDE = ("strict", "provenance", "could be known")
 
 @dataclass(frozen=True, slots=True)
 class CaseOutcome:
-    """What the server made of one case's ballots."""
+    """Result of fusing one case's ballots."""
 
     updated: PointMap
     states: U8
@@ -332,9 +343,9 @@ class Jury:
         """Over the truth's window."""
         self.truths = {name: judge(truth, self.first_map) for name, judge in TRUTHS.items()}
         """(rows, cols) of each, by name."""
-        scored = partial(truth.grid.value_at, truth.strict != UNSCORED)
+        scored = partial(truth.grid.value_at, truth.strict != Label.UNSCORED)
         self.points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth), scored)
-        """What became of the first map's points."""
+        """Judges the fate of the first map's points."""
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
     def of_states(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None = None) -> CaseResult:
@@ -351,7 +362,7 @@ class Jury:
         )
 
     def of_update(self, outcome: CaseOutcome, sizes: Sequence[int] = (), state_sizes: Sequence[int] = ()) -> CaseResult:
-        """The same, what became of the map's points, and the bytes of each ballot and of its votes alone."""
+        """The same scores, the fate of the map's points, and the bytes of each ballot and of its votes alone."""
         updated = map_obstacles(outcome.updated)
         judged = self.of_states(outcome.states, outcome.vehicle_states, self.points.score(updated))
         insides = [(one["kind"], partial(self.truth.grid.value_at, one["cells"])) for one in self._objects]
@@ -359,7 +370,7 @@ class Jury:
         return replace(judged, bytes_per_vehicle=list(sizes), state_bytes_per_vehicle=list(state_sizes))
 
     def ceilings(self) -> dict[str, Scores]:
-        """By truth: what perfect labels on every measured point would score (evaluation/truths.py)."""
+        """Scores of perfect labels on every measured point, by truth."""
         return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
 
 
