@@ -1,4 +1,4 @@
-"""Pictures of a survey and of what the doctor found, and the look of all pictures: a colour always means the same.
+"""Pictures of a survey and of the doctor's findings, and the look of all pictures: a colour always means the same.
 
 Needs matplotlib (extra ``plots``).
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,6 +19,7 @@ from matplotlib.figure import Figure
 
 from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, NO_VOTE, U8, CellState, Drive, MapvoteError
 from mapvote.formats.atomic import whole_file
 
@@ -26,14 +29,28 @@ if TYPE_CHECKING:
 
 Format = Literal["png", "svg", "pdf"]
 FORMATS: tuple[Format, ...] = "png", "svg", "pdf"
-INK, PAPER_WHITE, FAINT = "#22303c", "#ffffff", "#8795a1"
-NEW, GONE, STANDING, EMPTY, UNSURE = "#d7263d", "#1673c4", "#51687c", "#e6ecf1", "#f2c230"
+
+
+class Colour(StrEnum):
+    """Colours of all pictures, by their meaning."""
+
+    INK = "#22303c"
+    WHITE = "#ffffff"
+    FAINT = "#8795a1"
+    NEW = "#d7263d"
+    GONE = "#1673c4"
+    STANDING = "#51687c"
+    EMPTY = "#e6ecf1"
+    UNSURE = "#f2c230"
+    MOVING = "#e07b00"
+
+
 STATE_COLOURS = {
-    CellState.UNCHANGED_OCCUPIED: STANDING,
-    CellState.UNCHANGED_EMPTY: EMPTY,
-    CellState.CHANGED_OCCUPIED: NEW,
-    CellState.CHANGED_EMPTY: GONE,
-    CellState.UNDETERMINED: UNSURE,
+    CellState.UNCHANGED_OCCUPIED: Colour.STANDING,
+    CellState.UNCHANGED_EMPTY: Colour.EMPTY,
+    CellState.CHANGED_OCCUPIED: Colour.NEW,
+    CellState.CHANGED_EMPTY: Colour.GONE,
+    CellState.UNDETERMINED: Colour.UNSURE,
 }
 STATE_NAMES = {
     CellState.UNCHANGED_OCCUPIED: "unchanged (occupied)",
@@ -42,27 +59,41 @@ STATE_NAMES = {
     CellState.CHANGED_EMPTY: "changed (empty)",
     CellState.UNDETERMINED: "undetermined",
 }
-STATE_MAP = ListedColormap([*STATE_COLOURS.values(), PAPER_WHITE])
+STATE_MAP = ListedColormap([*STATE_COLOURS.values(), Colour.WHITE])
 VEHICLE_COLOURS = ("#22303c", "#e07b00", "#2a8f5b", "#8e44ad", "#7f5539", "#0b7a75", "#b5179e", "#6c757d")
 """Never red nor blue: those mean change."""
-_LEAST_M = 0.01
-"""Lower end of the logarithmic scale of prior errors; a very wrong prior then leaves the others legible."""
-_SCANS = 6
-_POINTS_OF_A_SCAN, _POINTS_OF_THE_MAP = 6_000, 200_000
-_CLOSE_M = 25.0
-"""Half the side of the doctor's lower pictures."""
-_SAID = 3
-"""Findings above the doctor's picture."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PictureSizes:
+    """How much pictures of a survey and of a diagnosis show."""
+
+    least_m: float = 0.01
+    """Lower end of the logarithmic scale of prior errors, metres: a very wrong prior leaves the others legible."""
+    scans: int = 6
+    """Scans of a drive in the doctor's picture."""
+    points_of_a_scan: int = 6_000
+    """Most points of a scan."""
+    points_of_the_map: int = 200_000
+    """Most points of the map."""
+    close_m: float = 25.0
+    """Half the side of the doctor's lower pictures, metres."""
+    findings: int = 3
+    """Most findings above the doctor's picture."""
+
+
+PICTURE_SIZES = PictureSizes()
 _FONT = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
+    "axes.edgecolor": Colour.FAINT,
+    "axes.labelcolor": Colour.INK,
+    "axes.titlecolor": Colour.INK,
     "axes.titlesize": 10.5,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "text.color": INK,
+    "xtick.color": Colour.INK,
+    "ytick.color": Colour.INK,
+    "text.color": Colour.INK,
     "axes.linewidth": 0.8,
 }
 
@@ -92,23 +123,24 @@ def save(figure: Figure, path: Path, format: Format = "png") -> None:
         figure.savefig(partial, format=format, dpi=140, metadata=undated[format])
 
 
-def draw_survey(drives: Sequence[Drive], report: BuildReport, path: Path) -> None:
+def draw_survey(drives: Sequence[Drive], report: BuildReport, path: Path, sizes: PictureSizes = PICTURE_SIZES) -> None:
     """Write a PNG: every drive from above with its priors, and their distance along the road. Crosses: scans that were
     not registered; a dashed line: where the map is broken."""
     figure, axes = new_figure(9.0, 8.0, rows=2)
+    # Each drive in its colour: its way and priors above, their distance below.
     above, along = axes[:, 0]
     for k, (drive, track) in enumerate(zip(drives, report.tracks, strict=True)):
         colour = VEHICLE_COLOURS[k % len(VEHICLE_COLOURS)]
-        found = track.T_map_lidar[:, :3, 3]
-        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(found, axis=0), axis=1)))
-        above.plot(found[:, 0], found[:, 1], color=colour, label=f"{track.vehicle}/{track.drive_id}")
-        lost = found[~track.registered]
-        above.plot(lost[:, 0], lost[:, 1], "x", color=INK)
+        positions = track.T_map_lidar[:, :3, 3]
+        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+        above.plot(positions[:, 0], positions[:, 1], color=colour, label=f"{track.vehicle}/{track.drive_id}")
+        lost = positions[~track.registered]
+        above.plot(lost[:, 0], lost[:, 1], "x", color=Colour.INK)
         if drive.T_map_lidar_prior is not None:
-            told = drive.T_map_lidar_prior[:, :3, 3]
-            above.plot(told[:, 0], told[:, 1], ".", color=colour, alpha=0.5, markersize=3)
-            off = np.linalg.norm(found[:, :2] - told[:, :2], axis=1)
-            along.plot(way, np.maximum(off, _LEAST_M), ".", color=colour, markersize=3)
+            priors = drive.T_map_lidar_prior[:, :3, 3]
+            above.plot(priors[:, 0], priors[:, 1], ".", color=colour, alpha=0.5, markersize=3)
+            off = np.linalg.norm(positions[:, :2] - priors[:, :2], axis=1)
+            along.plot(way, np.maximum(off, sizes.least_m), ".", color=colour, markersize=3)
             along.axhline(drive.prior_sigma_m, color=colour, linestyle=":")
         for i in track.broken:
             along.axvline(way[i], color=colour, linestyle="--")
@@ -120,14 +152,18 @@ def draw_survey(drives: Sequence[Drive], report: BuildReport, path: Path) -> Non
     save(figure, path)
 
 
-def draw_diagnosis(diagnosis: Diagnosis, point_map: PointMap | None, path: Path) -> None:
+def draw_diagnosis(
+    diagnosis: Diagnosis, point_map: PointMap | None, path: Path, sizes: PictureSizes = PICTURE_SIZES
+) -> None:
     """Write a PNG: scans from above, coloured by time, over the map (grey): left as read, right as mended; below a
     part of it from near. Where the doctor knows no way to mend, the right side says so."""
     figure, axes = new_figure(11.0, 11.5, rows=2, cols=2)
-    ground = None if point_map is None else _thinned(all_points(point_map), _POINTS_OF_THE_MAP)
+    # The drive as it was read and as it was mended; a few of its scans.
+    ground = None if point_map is None else _thinned(all_points(point_map), sizes.points_of_the_map)
     drive, mended = diagnosis.drive, diagnosis.T_mended
     read = None if drive is None else drive.T_map_lidar_prior
-    scans = {} if drive is None else _some_scans(drive)
+    scans = {} if drive is None else _some_scans(drive, sizes)
+    # Left as read, right as mended: the whole above, a part of it from near below.
     for column, (title, T) in enumerate((("as read", read), ("as mended", mended))):
         wide, near = axes[:, column]
         wide.set_title(title)
@@ -139,32 +175,32 @@ def draw_diagnosis(diagnosis: Diagnosis, point_map: PointMap | None, path: Path)
             continue
         for axis in (wide, near):
             if ground is not None:
-                axis.plot(ground[:, 0], ground[:, 1], ",", color=FAINT, alpha=0.4)
+                axis.plot(ground[:, 0], ground[:, 1], ",", color=Colour.FAINT, alpha=0.4)
             _draw_scans(axis, scans, T, len(drive))
-            axis.plot(T[:, 0, 3], T[:, 1, 3], "-", color=INK, linewidth=1.0)
+            axis.plot(T[:, 0, 3], T[:, 1, 3], "-", color=Colour.INK, linewidth=1.0)
             axis.set(xlabel="x, m", ylabel="y, m")
             axis.set_aspect("equal", adjustable="box" if axis is near else "datalim")
         x, y = T[len(T) // 2, :2, 3]
-        near.set_xlim(x - _CLOSE_M, x + _CLOSE_M)
-        near.set_ylim(y - _CLOSE_M, y + _CLOSE_M)
-    figure.suptitle(_headline(diagnosis), ha="left", x=0.01, fontsize=9.5)
+        near.set_xlim(x - sizes.close_m, x + sizes.close_m)
+        near.set_ylim(y - sizes.close_m, y + sizes.close_m)
+    figure.suptitle(_headline(diagnosis, sizes.findings), ha="left", x=0.01, fontsize=9.5)
     save(figure, path)
 
 
-def _headline(diagnosis: Diagnosis) -> str:
-    serious = [f"{f.severity}: {f.what}" for f in diagnosis.findings if f.severity != "note"][:_SAID] or ["sound"]
+def _headline(diagnosis: Diagnosis, most: int) -> str:
+    serious = [f"{f.severity}: {f.what}" for f in diagnosis.findings if f.severity != "note"][:most] or ["sound"]
     return "\n".join(textwrap.fill(line, 120, subsequent_indent="    ") for line in serious)
 
 
-def _some_scans(drive: Drive) -> dict[int, F32]:
-    """A few scans along the drive, without the road below and what is far."""
+def _some_scans(drive: Drive, sizes: PictureSizes) -> dict[int, F32]:
+    """A few scans along the drive, thinned; broken ones left out."""
     scans = {}
-    for i in np.unique(np.linspace(0, len(drive) - 1, _SCANS).astype(np.int64)):
+    for i in np.unique(np.linspace(0, len(drive) - 1, sizes.scans).astype(np.int64)):
         try:
             points = drive.read_scan(int(i)).points
         except MapvoteError:
             continue
-        scans[int(i)] = _thinned(points, _POINTS_OF_A_SCAN)
+        scans[int(i)] = _thinned(points, sizes.points_of_a_scan)
     return scans
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.process_memory import seldom_collecting
+from mapvote.core.record import record
 from mapvote.core.rule import RULES
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan, read_only
@@ -35,9 +36,21 @@ from mapvote.rules.packed_tiles import PackedTiles
 from mapvote.survey.build import build_map
 from mapvote.vehicle import vote_drive
 
-_SCANS = 14
-_STEP_M = 0.8
-_SPACING_M = 0.35
+
+@record()
+@dataclass(frozen=True, slots=True)
+class WarmupStreet:
+    """Size of the street on which every kernel is compiled."""
+
+    scans: int = 14
+    """Scans of the drive."""
+    step_m: float = 0.8
+    """Distance between two scans, metres."""
+    spacing_m: float = 0.35
+    """Distance between points of the street, metres."""
+
+
+WARMUP_STREET = WarmupStreet()
 
 
 def warm_vehicle(settings: Settings) -> None:
@@ -101,11 +114,11 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 
 def _go_far(drive: Drive) -> None:
-    """What verbs look at before they use drive and map; points that bring no times; a tile left
-    and come back to; more voxels than a table takes."""
+    """Compile the checks of drive and map; points without times; a tile left and come back to; more voxels than a table
+    takes."""
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
-    for columns in _COLUMNS:
+    for columns in _FIELDS_OF_TABLES:
         spinning_time_s(xyz_view("warmup", _table(np.zeros((2, 3), np.float32), columns)), drive.sensor.rate_hz)
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
@@ -121,7 +134,7 @@ def _street(demolished: bool) -> F64:
 
     def surface(low: tuple[float, ...], high: tuple[float, ...]) -> F64:
         sides = np.subtract(high, low)
-        n = int(np.prod(sides[sides > 0]) / _SPACING_M**2)
+        n = int(np.prod(sides[sides > 0]) / WARMUP_STREET.spacing_m**2)
         return np.asarray(rng.uniform(low, high, (n, 3)) + rng.normal(0.0, 0.01, (n, 3)))
 
     pieces = [surface((-25, -11, 0), (25, 11, 0)), surface((-25, 18, 0), (25, 18, 6))]
@@ -137,9 +150,9 @@ def _street(demolished: bool) -> F64:
     return np.concatenate(pieces)
 
 
-_COLUMNS = ("x", "y", "z"), ("x", "y", "z", "intensity")
-"""Of tables of points. Numba compiles the kernels of a scan once for a contiguous array, and once for a read-only view
-of rows, as readers of files pass them."""
+_FIELDS_OF_TABLES = ("x", "y", "z"), ("x", "y", "z", "intensity")
+"""Fields of tables of points. Numba compiles the kernels of a scan once for a contiguous array, and once for a
+read-only view of rows, as readers of files pass them."""
 
 
 def _table(points: F32, columns: tuple[str, ...]) -> NDArray[np.void]:
@@ -151,15 +164,17 @@ def _table(points: F32, columns: tuple[str, ...]) -> NDArray[np.void]:
 
 def _drive(street_map: F64, turning: bool) -> Drive:
     """A drive along the street's middle; ``turning``: its points bring the times at which they were measured."""
-    poses = np.array([from_xyz_rpy(_STEP_M * (i - _SCANS / 2), 0.3, 1.8, 0.0, 0.0, 0.01 * i) for i in range(_SCANS)])
-    stamps_ns = 10**9 + np.arange(_SCANS, dtype=np.int64) * 10**8
+    scans = WARMUP_STREET.scans
+    x_m = WARMUP_STREET.step_m * (np.arange(scans) - scans / 2)
+    poses = np.array([from_xyz_rpy(x, 0.3, 1.8, 0.0, 0.0, 0.01 * i) for i, x in enumerate(x_m)])
+    stamps_ns = 10**9 + np.arange(scans, dtype=np.int64) * 10**8
 
     sensor = SENSORS["vlp16"]
 
     def read_scan(i: int) -> Scan:
         points = transform(inverse(poses[i]), street_map).astype(np.float32)
         points = points[np.hypot(points[:, 0], points[:, 1]) > 1.5]
-        table = _table(points, _COLUMNS[i % 2])
+        table = _table(points, _FIELDS_OF_TABLES[i % 2])
         scan = PointReader("warmup").scan("warmup", i, int(stamps_ns[i]), table, sensor)
         return replace(scan, time_s=np.zeros(len(scan.points), dtype=np.float32)) if turning else scan
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
+from mapvote.cli.options import Config, Panel, Scenario, Seed
 from mapvote.cli.terminal import progress, stages
 
 if TYPE_CHECKING:
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add demo, simulate and evaluate."""
-    app.command(rich_help_panel=EVALUATE)(demo)
-    app.command(rich_help_panel=EVALUATE)(simulate)
-    app.command(rich_help_panel=EVALUATE)(evaluate)
+    app.command(rich_help_panel=Panel.EVALUATE)(demo)
+    app.command(rich_help_panel=Panel.EVALUATE)(simulate)
+    app.command(rich_help_panel=Panel.EVALUATE)(evaluate)
 
 
 def _need_lab(verb: str) -> None:

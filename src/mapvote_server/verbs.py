@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapvote.cli.door import api_at, check_ending, is_url, sound_map, when
-from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreOrUrl
+from mapvote.cli.options import Config, KeyFile, Panel, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
 from mapvote.core.types import MapvoteError
 
@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
     for verb in verbs:
         # Half of every local map is negative: -12.5 is a coordinate there, no option.
         negative = {"ignore_unknown_options": True} if verb is explain else None
-        app.command(rich_help_panel=SERVER, context_settings=negative)(verb)
+        app.command(rich_help_panel=Panel.SERVER, context_settings=negative)(verb)
 
 
 def serve(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,11 @@ import pytest
 from made_courts import made_court
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError
-from mapvote_lab.evaluation.court import Court, cast_drive
+from mapvote_lab.evaluation.court import COURT_RULE, Court, cast_drive
 
 
 def test_cast_scans_end_on_the_first_surface_and_see_nothing_behind_it() -> None:
-    drive = cast_drive("robot", map_from_points(made_court(())), 12.0)
+    drive = cast_drive("robot", map_from_points(made_court(())), replace(COURT_RULE, step_m=12.0))
     assert len(drive) > 5
     assert drive.T_map_lidar_prior is not None
     T = drive.T_map_lidar_prior[0]
@@ -42,7 +43,8 @@ def test_cast_rays_cross_no_porous_crown_and_no_ground_that_the_session_did_not_
     ground, low, high = made_court(()), middle - 0.6 * wide, middle + 0.6 * wide
     with_crown = np.concatenate([ground, crown])
     unsurveyed = ground[np.hypot(ground[:, 0] - 4.0, ground[:, 1] + 12.0) > 3.0]
-    crossed = [_crosses(cast_drive("r", map_from_points(p), 8.0), low, high) for p in (ground, with_crown, unsurveyed)]
+    rule = replace(COURT_RULE, step_m=8.0)
+    crossed = [_crosses(cast_drive("r", map_from_points(p), rule), low, high) for p in (ground, with_crown, unsurveyed)]
     assert crossed[0] > 200
     assert crossed[1] < 0.03 * crossed[0]
     assert crossed[2] == 0

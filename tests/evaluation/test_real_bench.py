@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def changed(kind: str, state: CellState, found: int) -> Changed:
 def test_what_was_found_in_rain_stands_beside_what_was_found_dry() -> None:
     dry = changed("wall built", CellState.CHANGED_OCCUPIED, 4)
     wet, gone = changed("wall built", CellState.CHANGED_OCCUPIED, 1), changed("wall gone", CellState.CHANGED_EMPTY, 2)
-    runs = {ChangedRun.BUILT: dry, ChangedRun.BUILT_IN_RAIN: wet, ChangedRun.DEMOLISHED: gone}
+    runs: dict[str, Any] = {ChangedRun.BUILT: dry, ChangedRun.BUILT_IN_RAIN: wet, ChangedRun.DEMOLISHED: gone}
     _, cast_into, in_rain = real_tables(Bench("street", 30, Ground(1.7, 0.0, 0.0, 0.0), changed=runs), "5")
     assert cast_into.title.endswith("1.00 (built), 1.00 (built in rain, 10 % of the rays), 1.00 (demolished)")
     assert cast_into.rows == [("wall built", "1", "1", "1", "1.00", "7"), ("wall gone", "1", "1", "1", "0.50", "7")]

@@ -44,7 +44,7 @@ def test_every_scan_is_mapped_or_voted_with_once() -> None:
     mapped, voting = split(50, 12)
     assert sorted(np.concatenate([mapped, *voting]).tolist()) == list(range(50))
     assert mapped.tolist() == [*range(12), *range(24, 36), *range(48, 50)]
-    with pytest.raises(MapvoteError, match=r"of 30 scans in blocks of 25, 5 are left to vote: 12 are needed"):
+    with pytest.raises(MapvoteError, match=r"blocks of 25 scans leave 5 of 30 scans to vote, but 12 are needed"):
         split(30, 25)
 
 

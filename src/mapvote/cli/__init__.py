@@ -19,7 +19,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 from mapvote.cli import drives, files, live, setup  # noqa: E402
-from mapvote.cli.options import DRIVE, MAP, SETUP  # noqa: E402
+from mapvote.cli.options import Panel  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
 
@@ -33,12 +33,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 VERBS = {
-    DRIVE: (
+    Panel.DRIVE: (
         drives.build, drives.vote, live.send, live.topics, live.play, live.drive, live.autoware, drives.diff,
         drives.merge, files.doctor,
     ),
-    MAP: (files.import_map, files.export, files.info, files.update),
-    SETUP: (setup.config, setup.warmup),
+    Panel.MAP: (files.import_map, files.export, files.info, files.update),
+    Panel.SETUP: (setup.config, setup.warmup),
 }  # fmt: skip
 """The verbs as ``mapvote --help`` lists them."""
 for panel, verbs in VERBS.items():

@@ -358,9 +358,6 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
     return lay_version(folder, cloud, client.version, keep=keep, map_id=manifest.map_id)
 
 
-_MOST_WAYPOINTS = 10
-
-
 def update(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")],
     ballot_files: Annotated[list[Path], typer.Argument(metavar="BALLOT...", help="ballots of one round")],
@@ -467,7 +464,7 @@ def _report_pending(decisions: dict[TileIndex, Decision], lattice: Lattice, budg
     cells = sum(point.cells for point in waiting)
     keep = "1 cell keeps its" if cells == 1 else f"{cells} cells keep their"
     print(f"{keep} points: that something there still stands is likelier than {budget:g}. Drive by:")
-    rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:_MOST_WAYPOINTS]]
+    rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:10]]
     print_table(("x, y (map metres)", "cells", "likeliest"), rows)
-    if len(waiting) > _MOST_WAYPOINTS:
-        print(f"and {len(waiting) - _MOST_WAYPOINTS} smaller ones")
+    if len(waiting) > 10:
+        print(f"and {len(waiting) - 10} smaller ones")

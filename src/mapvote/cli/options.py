@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -12,8 +13,16 @@ import typer
 
 from mapvote.core.process_memory import seldom_collecting
 
-DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and evaluate", "Set up"
-"""Headings of ``mapvote --help``."""
+
+class Panel(StrEnum):
+    """Headings of ``mapvote --help``."""
+
+    DRIVE = "Drive"
+    MAP = "Map"
+    SERVER = "Server"
+    EVALUATE = "Simulate and evaluate"
+    SETUP = "Set up"
+
 
 Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings file; `mapvote config` lists all settings")]
 Scenario = Annotated[

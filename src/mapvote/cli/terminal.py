@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
     from rich.text import Text
 
-_ANY_WIDTH = 10_000
-
 
 def complain(message: str) -> None:
     """One line on stderr; the words of the message unchanged."""
@@ -49,7 +47,7 @@ def print_table(headings: Sequence[str], rows: Iterable[Iterable[str | Text] | N
             table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = _ANY_WIDTH
+        console.width = 10_000
         console.width = console.measure(table).maximum
     console.print(table)
 

@@ -14,8 +14,6 @@ from mapvote.core.types import MapvoteError
 
 _PASSING = {429, 500, 502, 503, 504}
 """Answers that may be better next time."""
-_LONGEST_WAIT_S = 60.0
-"""Beyond this the request is given up for now."""
 
 
 class Unreachable(MapvoteError):
@@ -40,15 +38,18 @@ class Connection:
         key: str | None = None,
         name: str | None = None,
         attempts: int = 4,
+        longest_wait_s: float = 60.0,
         timeout_s: float | None = 30.0,
         sleep: Callable[[float], object] = time.sleep,
         transport: httpx2.BaseTransport | None = None,
     ) -> None:
-        """``name``: what errors call the server (default: its URL). ``transport``: other than over the network."""
+        """``name``: name of the server in errors (default: its URL). ``attempts``: tries of a request; it is given up
+        where the server asks to wait longer than ``longest_wait_s``. ``transport``: other than over the network."""
         headers = {"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {key}"} if key else {})
         self._http = httpx2.Client(base_url=url.rstrip("/"), headers=headers, timeout=timeout_s, transport=transport)
         self.url = name or url
         self._attempts = attempts
+        self._longest_wait_s = longest_wait_s
         self._sleep = sleep
 
     def close(self) -> None:
@@ -79,7 +80,7 @@ class Connection:
                 raise MapvoteError(f"{self.url}: is no address of a server ({error})") from error
             if answer.status_code in _PASSING:
                 trouble, wait_s = detail_of(answer), _asked_to_wait_s(answer)
-                if wait_s > _LONGEST_WAIT_S:
+                if wait_s > self._longest_wait_s:
                     raise Unreachable(f"{self.url}: {trouble}; ask again in {wait_s:.0f} s")
                 continue
             if answer.status_code >= 400:
@@ -92,7 +93,7 @@ class Connection:
         """The lines of an answer that goes on, as they come; a minute without one ends it. Unreachable if there is no
         connection, Refused for 4xx."""
         try:
-            with self._http.stream("GET", path, timeout=_LONGEST_WAIT_S) as answer:
+            with self._http.stream("GET", path, timeout=self._longest_wait_s) as answer:
                 if answer.status_code >= 400:
                     answer.read()
                     why = f"{self.url}: refused: {detail_of(answer)}{_mend(answer)}"

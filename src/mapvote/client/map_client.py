@@ -37,7 +37,7 @@ _KEEP_WAITING = {401, 403}
 """Refusals that a new key mends."""
 
 
-_MANIFEST = msgspec.json.Decoder(Manifest)  # made when the module is loaded: see codec/ballot.py
+_DECODER = msgspec.json.Decoder(Manifest)  # made when the module is loaded: see codec/ballot.py
 
 
 class MapClient:
@@ -205,14 +205,14 @@ class MapClient:
 
     def _decoded(self, content: bytes) -> Manifest:
         try:
-            return _MANIFEST.decode(content)
+            return _DECODER.decode(content)
         except msgspec.DecodeError as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
     def kept_manifest(self) -> Manifest | None:
         """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
         try:
-            return _MANIFEST.decode(self._kept_manifest.read_bytes())
+            return _DECODER.decode(self._kept_manifest.read_bytes())
         except (OSError, msgspec.DecodeError):
             return None
 
@@ -268,13 +268,13 @@ _WAITING, _REFUSED = ".ballot", ".refused"
 
 
 def _server_folder(home: Path, url: str) -> Path:
-    """Where what belongs to one server lies: its name to read, and a hash of its address."""
+    """Folder of the files of one server: its name to read, and a hash of its address."""
     name = re.sub(r"[^A-Za-z0-9.]+", "_", url.partition("://")[2].strip("/"))[:60]
     return home / "servers" / f"{name}-{hashlib.sha256(url.rstrip('/').encode()).hexdigest()[:8]}"
 
 
 class _Spool:
-    """What waits for one server. Files are their owner's alone, and appear whole."""
+    """Ballots that wait for one server. Files are their owner's alone, and appear whole."""
 
     def __init__(self, home: Path, url: str) -> None:
         self._folder = _server_folder(home, url) / "spool"

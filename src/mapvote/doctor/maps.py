@@ -23,7 +23,7 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor import Finding, any_error, in_order
 from mapvote.doctor.which_way_up import which_way_up
 from mapvote.formats import read_map, stream_cloud
-from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
+from mapvote.formats.drives.point_fields import POINT_RULE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.las import beside_its_box
@@ -231,7 +231,7 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
     if bad:
         what = f"{bad} of {n} points are not finite"
         mend = "export the file again; of a LAS the header's scales and offsets may be broken"
-        if bad > MAX_BAD_SHARE * n:
+        if bad > POINT_RULE.most_bad_share * n:
             return [Finding("error", what, mend)], None
         found.append(Finding("note", f"{what}: import leaves them out"))
     fields = {name: column[finite] for name, column in cloud.fields.items()}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
-from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
+from mapvote.formats.drives.point_fields import POINT_RULE
 from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.geo.frame import (
@@ -32,8 +32,9 @@ from mapvote.formats.geo.frame import (
     utm_of,
 )
 from mapvote.formats.geo.units import Convert, settle_out
-from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, CloudPieces
+from mapvote.formats.maps.cloud import READ_SIZES, Cloud, CloudPieces, ReadSizes
 from mapvote.formats.maps.field_names import kept_fields
+from mapvote.formats.maps.laz_subprocess import LasClass
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.marked_points import DROPPED, MarkedPoints, without_marked
 from mapvote.formats.maps.pcd import write_pcd
@@ -129,13 +130,14 @@ def import_cloud(
     drop: Collection[str] = DROPPED,
     *,
     unchecked: bool = False,
+    sizes: ReadSizes = READ_SIZES,
 ) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
     ``wanted``: the frame to project to. ``from_crs``: the file's coordinate system, where the file states none or a
     wrong one. ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of
-    them. ``drop``: of ``MARKS`` those whose points are left out. ``unchecked``: the points are right whatever they look
-    like; the map says so to every verb that checks maps.
+    them. ``drop``: the ``MARKS`` whose points are left out. ``unchecked``: the points are right whatever they look
+    like; the map says so to every verb that checks maps. ``sizes``: points held in memory.
     """
     if is_map_folder(path):
         if wanted is not None or from_crs is not None or not unchecked:
@@ -156,7 +158,7 @@ def import_cloud(
             dropped.update(dict.fromkeys(piece.dropped))
             yield piece
 
-    point_map = map_of(str(path), kept(), folder, look, 1.0 if unchecked else MAX_BAD_SHARE)
+    point_map = map_of(str(path), kept(), folder, look, 1.0 if unchecked else POINT_RULE.most_bad_share, sizes)
     if unchecked:
         point_map = replace(point_map, georeference={**point_map.georeference, UNCHECKED: "import"})
     told = [f"coordinates: {frame_of(point_map.georeference).told()}", *sieve.told()]
@@ -239,7 +241,7 @@ def _pieces(
             fields: dict[str, NDArray[Any]] = {n: tile.fields[n] for n in kept_fields() if n in tile.fields}
             if classes and "classification" not in fields:
                 on_ground = tile.has_ground & ~tile.columns[1]
-                fields["classification"] = np.where(on_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
+                fields["classification"] = np.where(on_ground, LasClass.GROUND, LasClass.UNCLASSIFIED).astype(np.uint8)
             points = convert(tile.points_map)
             shifted = points - np.array(offset) if any(offset) else points
             yield Cloud(shifted, frame=frame, fields=fields, gps_times=point_map.georeference.get(GPS_TIMES, ""))

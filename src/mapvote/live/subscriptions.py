@@ -17,7 +17,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
-from mapvote.formats.drives.sensor_estimate import MEASURED_SCANS, UNKNOWN, estimate_sensor, rate_of_first
+from mapvote.formats.drives.sensor_estimate import RING_RULE, UNKNOWN_SENSOR, estimate_sensor, rate_of_first
 from mapvote.live.choice import Chosen
 from mapvote.live.dds import Network
 from mapvote.live.drive import WaitingScan
@@ -243,10 +243,10 @@ class Subscriptions:
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
         firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
-        if self.sensor is None and len(firsts) >= MEASURED_SCANS:
-            del firsts[MEASURED_SCANS:]  # how many arrive together does not matter
+        if self.sensor is None and len(firsts) >= RING_RULE.scans:
+            del firsts[RING_RULE.scans :]  # how many arrive together does not matter
             rate_hz = rate_of_first(np.array([cloud.stamp_ns for cloud in firsts]))
-            model = replace(UNKNOWN, rate_hz=rate_hz)
+            model = replace(UNKNOWN_SENSOR, rate_hz=rate_hz)
             read = [self._scan_of(cloud, model) for cloud in firsts]
             found = estimate_sensor(read, rate_hz)
             self.sensor, self.sensor_told = found.sensor, found.told

@@ -28,14 +28,14 @@ from mapvote.formats.atomic import whole_file, write_whole
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.matching.localiser import GivenPoses
-from mapvote.plots import NEW, UNSURE, save
+from mapvote.plots import Colour, save
 from mapvote.shapes.cutout import Cutout, fragment
 from mapvote.survey.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation import figures, real_bench
 from mapvote_lab.evaluation.cases import Progress, choose_cases, untold
 from mapvote_lab.evaluation.evaluate import Evaluation, PublishedRound, evaluate, vote_by_http
-from mapvote_lab.evaluation.gallery import MOVER, ChangedArea, areas_of, gallery
+from mapvote_lab.evaluation.gallery import ChangedArea, areas_of, gallery
 from mapvote_lab.evaluation.real_report import draw_things
 from mapvote_lab.evaluation.real_street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.scene import Scene
@@ -238,11 +238,11 @@ def draw_scans(scene: Scene, path: Path) -> Picture:
     for name, title in ((scene.drive_names("survey_")[0], "(a) The survey"), (scene.drive_names("v")[0], "(b) Later")):
         points, moving, ground_z = _measured(scene, name)
         colours = figures.shades(points[:, 2] - ground_z)
-        colours[moving] = to_rgb(MOVER)
+        colours[moving] = to_rgb(Colour.MOVING)
         panels.append((f"{title}: {len(points):,} returns", points, colours))
     middle = scene.true_poses(scene.drive_names("v")[0])[:, :3, 3].mean(axis=0)
     camera = figures.Camera((float(middle[0]), float(middle[1]), 0.0), 62.0, 205.0, 40.0)
-    save(figures.draw(panels, camera, legend=[("moving", MOVER)], size_m=0.12), path)
+    save(figures.draw(panels, camera, legend=[("moving", Colour.MOVING)], size_m=0.12), path)
     return path, "What the LiDARs measured before and after the change, at the true poses; bodies that move in orange."
 
 
@@ -368,11 +368,11 @@ def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
     for returns in cast:
         found = street.grid.value_at(run.states[CASE] == CellState.CHANGED_OCCUPIED, returns)
         clouds.append(returns)
-        colours.append(np.where(found[:, None], to_rgb(NEW), to_rgb(UNSURE)).astype(np.float32))
+        colours.append(np.where(found[:, None], to_rgb(Colour.NEW), to_rgb(Colour.UNSURE)).astype(np.float32))
     behind = float(np.degrees(np.arctan2(-along[1], -along[0]))) + 25.0
     camera = figures.Camera((float(middle[0]), float(middle[1]), road_z), 75.0, behind, 38.0)
     panel = (f"{len(points):,} map points", np.concatenate(clouds), np.concatenate(colours))
-    save(figures.draw([panel], camera, legend=[("new, found", NEW), ("new, missed", UNSURE)]), path)
+    save(figures.draw([panel], camera, legend=[("new, found", Colour.NEW), ("new, missed", Colour.UNSURE)]), path)
 
 
 def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tuple[Path, str]]) -> list[ReportSection]:

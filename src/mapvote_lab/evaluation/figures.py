@@ -172,7 +172,7 @@ def _panel(axis: Any, image: np.ndarray, grid: Grid, title: str, **how: Any) -> 
 
 def _outline(axis: Any, outlines: Sequence[Outline]) -> None:
     for kind, corners in outlines:
-        colour = style.NEW if kind == "built" else style.GONE
+        colour = style.Colour.NEW if kind == "built" else style.Colour.GONE
         away = corners - corners.mean(axis=0)
         corners = corners + 1.5 * np.sign(away)  # beside the walls, not over them
         axis.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=colour, lw=1.2, ls=(0, (4, 2))))
@@ -205,25 +205,25 @@ def street(
     figure, axes = _stack(grid, 2)
     axes = axes.ravel()
     for axis, (points, height), marked, colour, title in (
-        (axes[0], old, deleted, style.GONE, "(a) First map, deleted points in blue"),
-        (axes[1], updated, added, style.NEW, "(b) Updated map, added points in red"),
+        (axes[0], old, deleted, style.Colour.GONE, "(a) First map, deleted points in blue"),
+        (axes[1], updated, added, style.Colour.NEW, "(b) Updated map, added points in red"),
     ):
         image = _from_above(points, height, grid)
         image[_thicken(cells_with(marked, grid))] = to_rgb(colour)
         _panel(axis, image, grid, title)
         _outline(axis, outlines)
         for name, box in areas:
-            axis.text(*box[1], f" {name}", va="top", ha="right", fontsize=8.5, color=style.INK)
+            axis.text(*box[1], f" {name}", va="top", ha="right", fontsize=8.5, color=style.Colour.INK)
             corners = [box[0], (box[1][0], box[0][1]), box[1], (box[0][0], box[1][1])]
-            axis.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=style.FAINT, lw=0.9))
+            axis.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=style.Colour.FAINT, lw=0.9))
     for i, (_, path) in enumerate(paths):
         axes[1].plot(path[:, 0], path[:, 1], color=style.VEHICLE_COLOURS[i % 8], lw=1.0)
     axes[-1].set_xlabel("x (m)")
     handles: list[Any] = [
-        Patch(facecolor=style.GONE, label="deleted"),
-        Patch(facecolor=style.NEW, label="added"),
-        Line2D([], [], color=style.GONE, ls="--", label="truth: demolished"),
-        Line2D([], [], color=style.NEW, ls="--", label="truth: built"),
+        Patch(facecolor=style.Colour.GONE, label="deleted"),
+        Patch(facecolor=style.Colour.NEW, label="added"),
+        Line2D([], [], color=style.Colour.GONE, ls="--", label="truth: demolished"),
+        Line2D([], [], color=style.Colour.NEW, ls="--", label="truth: built"),
     ]
     handles += [Line2D([], [], color=style.VEHICLE_COLOURS[i % 8], label=name) for i, (name, _) in enumerate(paths)]
     figure.legend(handles=handles, loc="outside lower center", ncols=7, frameon=False)
@@ -242,9 +242,10 @@ def cell_states(panels: Sequence[tuple[str, U8]], grid: Grid, *, outlines: Seque
     for axis in axes[-1]:
         axis.set_xlabel("x (m)")
     handles = [
-        Patch(facecolor=style.STATE_COLOURS[s], edgecolor=style.FAINT, label=style.STATE_NAMES[s]) for s in CellState
+        Patch(facecolor=style.STATE_COLOURS[s], edgecolor=style.Colour.FAINT, label=style.STATE_NAMES[s])
+        for s in CellState
     ]
-    handles.append(Patch(facecolor=style.PAPER_WHITE, edgecolor=style.FAINT, label="never seen"))
+    handles.append(Patch(facecolor=style.Colour.WHITE, edgecolor=style.Colour.FAINT, label="never seen"))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
@@ -254,11 +255,11 @@ def vote_curve(a: float, b: float, k: float, n_min: int) -> Figure:
     figure, axes = style.new_figure(6.2, 3.4)
     axis = axes[0, 0]
     n = np.arange(n_min, 31)
-    axis.plot(n, vote_weight(n, a, b, k, n_min), color=style.STANDING, lw=1.8, marker="o", ms=3.5)
-    axis.hlines(0, 0, n_min - 1, color=style.UNSURE, lw=3)
+    axis.plot(n, vote_weight(n, a, b, k, n_min), color=style.Colour.STANDING, lw=1.8, marker="o", ms=3.5)
+    axis.hlines(0, 0, n_min - 1, color=style.Colour.UNSURE, lw=3)
     axis.annotate(f"fewer than {n_min} points:\nnot occupied", (n_min - 1, 0), (8, 0.45), fontsize=9,
-                  arrowprops={"arrowstyle": "-", "color": style.FAINT})  # fmt: skip
-    axis.axhline(b, color=style.FAINT, lw=0.8, ls=":")
+                  arrowprops={"arrowstyle": "-", "color": style.Colour.FAINT})  # fmt: skip
+    axis.axhline(b, color=style.Colour.FAINT, lw=0.8, ls=":")
     axis.set_xlim(0, 30)
     axis.set_ylim(-0.1, 1.1 * b)
     axis.set_xlabel("measurement points n in the cell")
@@ -274,14 +275,14 @@ def score_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Fig
     figure, axes = style.new_figure(max(7.5, 0.95 * len(shown) + 1.5), 4.0)
     axis = axes[0, 0]
     series: list[tuple[str, str, list[float | None]]] = [
-        ("paper, Table IV", style.EMPTY, [PAPER_F1.get(case) for case in shown]),
-        ("ours, strict truth", style.STANDING, [cases[case].strict.macro_f1 for case in shown]),
+        ("paper, Table IV", style.Colour.EMPTY, [PAPER_F1.get(case) for case in shown]),
+        ("ours, strict truth", style.Colour.STANDING, [cases[case].strict.macro_f1 for case in shown]),
         ("ours, provenance truth", "#a3b6c6", [cases[case].provenance.macro_f1 for case in shown]),
     ]
     for k, (label, colour, values) in enumerate(series):
         x = np.array([i + 0.27 * (k - 1) for i, v in enumerate(values) if v is not None])
         y = np.array([v for v in values if v is not None])
-        axis.bar(x, y, width=0.25, color=colour, edgecolor=style.FAINT if k == 0 else "none", label=label)
+        axis.bar(x, y, width=0.25, color=colour, edgecolor=style.Colour.FAINT if k == 0 else "none", label=label)
         for xi, yi in zip(x, y, strict=True):
             axis.text(xi, yi + 0.01, f"{yi:.2f}".lstrip("0") if yi < 1 else "1.00", ha="center", fontsize=7.5)
     axis.set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
@@ -296,9 +297,9 @@ def reliability_diagram(found: Mapping[CellState, Reliability]) -> Figure:
     """Predicted probability against the share that did change, a panel for each kind; below, how many cells."""
     figure, axes = style.new_figure(8.2, 4.9, 2, len(found), height_ratios=(3, 1), sharex=True, sharey="row")
     for column, (state, one) in zip(axes.T, found.items(), strict=True):
-        colour, marker = (style.NEW, "D") if state == CellState.CHANGED_OCCUPIED else (style.GONE, "X")
+        colour, marker = (style.Colour.NEW, "D") if state == CellState.CHANGED_OCCUPIED else (style.Colour.GONE, "X")
         there = one.cells > 0
-        column[0].plot([0, 1], [0, 1], color=style.FAINT, lw=0.9, ls="--")
+        column[0].plot([0, 1], [0, 1], color=style.Colour.FAINT, lw=0.9, ls="--")
         column[0].vlines(one.predicted[there], one.predicted[there], one.true[there], color=colour, lw=0.9)
         column[0].plot(one.predicted[there], one.true[there], marker, color=colour, ms=7)
         title = f"{style.STATE_NAMES[state]}, {int(one.cells.sum()):,} cells\n"

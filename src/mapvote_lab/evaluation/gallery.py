@@ -27,8 +27,6 @@ from mapvote_lab.evaluation.truths import lay_on
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.truth import Label
 
-MOVER = "#e07b00"
-
 
 @dataclass(frozen=True, slots=True)
 class ChangedArea:
@@ -148,10 +146,12 @@ def _area(
     camera = figures.Camera(target, 30.0 + 0.85 * width, -72.0 if north else 72.0, 34.0)
     shown = [(name, path[inside(path)]) for name, path in paths]
     panels = [
-        ("(a) First map", *coloured(old, ~survived, style.GONE)),
-        ("(b) Updated map", *coloured(kept_first, fresh, style.NEW)),
+        ("(a) First map", *coloured(old, ~survived, style.Colour.GONE)),
+        ("(b) Updated map", *coloured(kept_first, fresh, style.Colour.NEW)),
     ]
-    return figures.draw(panels, camera, paths=shown, legend=[("deleted", style.GONE), ("added", style.NEW)])
+    return figures.draw(
+        panels, camera, paths=shown, legend=[("deleted", style.Colour.GONE), ("added", style.Colour.NEW)]
+    )
 
 
 def _scan_near(evaluation: Evaluation, areas: list[ChangedArea]) -> int:
@@ -172,11 +172,13 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
     ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
     colours = figures.shades(heights_above_ground(evaluation.first_map, points))
     if len(moving) == len(points):
-        colours[moving] = to_rgb(MOVER)
+        colours[moving] = to_rgb(style.Colour.MOVING)
     near = np.linalg.norm(points[:, :2] - T_map_lidar[:2, 3], axis=1) < 45.0
     camera = figures.Camera((*T_map_lidar[:2, 3], ground_z), 62.0, 205.0, 38.0)
     title = f"{drive.vehicle}, scan {index}: {len(points):,} points, {100 * moving.mean():.0f} % on moving bodies"
-    return figures.draw([(title, points[near], colours[near])], camera, size_m=0.1, legend=[("moving", MOVER)])
+    return figures.draw(
+        [(title, points[near], colours[near])], camera, size_m=0.1, legend=[("moving", style.Colour.MOVING)]
+    )
 
 
 def _local_grid(evaluation: Evaluation, index: int) -> Figure:

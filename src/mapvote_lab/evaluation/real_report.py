@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, CellState
 from mapvote.formats.atomic import write_whole
-from mapvote.plots import GONE, INK, NEW, STATE_COLOURS, UNSURE, save
+from mapvote.plots import STATE_COLOURS, Colour, save
 from mapvote_lab.evaluation.real_bench import (
     Asked,
     Bench,
@@ -150,12 +150,14 @@ def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], pa
 def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path, most: int = 20) -> None:
     """The whole street, and close-ups of at most ``most`` things, the least found first: found, missed, false."""
     picture, states = _street(run), run.states[case]
-    picture[is_changed(states)] = to_rgb(INK)
+    picture[is_changed(states)] = to_rgb(Colour.INK)
     share, spots = [], []
     x, y = run.street.grid.centres()
     for a in asked:
-        picture[a.cells] = to_rgb(UNSURE)
-        picture[a.cells & (states == a.state)] = to_rgb(NEW if a.state == CellState.CHANGED_OCCUPIED else GONE)
+        picture[a.cells] = to_rgb(Colour.UNSURE)
+        picture[a.cells & (states == a.state)] = to_rgb(
+            Colour.NEW if a.state == CellState.CHANGED_OCCUPIED else Colour.GONE
+        )
         if a.cells.any():
             rows, cols = np.nonzero(a.cells)
             share.append(float((states[a.cells] == a.state).mean()))

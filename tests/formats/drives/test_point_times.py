@@ -24,11 +24,9 @@ from mapvote.doctor.scans import Looking, cheap_checks
 from mapvote.formats import open_drive
 from mapvote.formats.drives.point_fields import PointReader
 from mapvote.formats.drives.point_times import (
-    ANOTHER,
-    AS_STAMP,
-    SINCE_STAMP,
     FieldTimes,
     Refusal,
+    TimeOrigin,
     TimeRules,
     read_times,
 )
@@ -133,7 +131,7 @@ def test_values_of_a_few_points_change_no_other_time(
     values[: len(wrong)] = wrong
     times = read_times("t", values, POINTS, STAMP, RATE_HZ)
     assert isinstance(times, FieldTimes)
-    assert times.origin == (AS_STAMP if absolute else SINCE_STAMP)
+    assert times.origin == (TimeOrigin.AS_STAMP if absolute else TimeOrigin.SINCE_STAMP)
     assert np.allclose(times.after_stamp[len(wrong) :], TIMES[len(wrong) :] + off_s, atol=1e-6)
     kept = times.after_stamp[: len(wrong)]
     assert (np.abs(kept[np.isfinite(kept)]) < 0.3).all()
@@ -261,7 +259,7 @@ def test_another_clock_is_told_and_must_keep_its_distance() -> None:
         reader.scan("scan", 2, STAMP + 2 * 10**8, table(points, timestamp=1005.0 + t), SENSORS["hdl32e"])
     times = read_times("t", 1000.0 + t, points, STAMP, RATE_HZ)
     assert isinstance(times, FieldTimes)
-    assert times.origin == ANOTHER
+    assert times.origin == TimeOrigin.ANOTHER
 
 
 @pytest.mark.parametrize(("every", "rate_hz"), [(2, 5.0), (3, 10.0 / 3), (10, 1.0), (47, 10.0 / 47)])

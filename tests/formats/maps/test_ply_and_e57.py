@@ -11,7 +11,8 @@ import pytest
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats import stream_cloud
-from mapvote.formats.maps.cloud import Cloud, joined
+from mapvote.formats.maps.cloud import Cloud, ReadSizes, joined
+from mapvote.formats.maps.e57 import stream_e57
 
 XYZ = [[1.5, 2.0, 3.0], [4.0, 5.0, 6.25]]
 HEAD = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -131,14 +132,11 @@ def write_e57(file: Path, colours: np.ndarray[Any, Any], limit: int, intensity: 
 
 @pytest.mark.parametrize(("limit", "kind"), [(255, np.uint8), (65535, np.uint16)])
 @pytest.mark.parametrize("block", [7, 1000])
-def test_e57_colours_have_the_bits_that_the_scan_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, kind: type, block: int
-) -> None:
+def test_e57_colours_have_the_bits_that_the_scan_names(tmp_path: Path, limit: int, kind: type, block: int) -> None:
     pytest.importorskip("pye57")
-    monkeypatch.setattr("mapvote.formats.maps.e57._BLOCK", block)
     colours = np.random.default_rng(0).integers(0, limit + 1, (40, 3))
     write_e57(tmp_path / "a.e57", colours, limit, (-100.0, 100.0))
-    cloud = joined(stream_cloud(tmp_path / "a.e57"))
+    cloud = joined(stream_e57(tmp_path / "a.e57", ReadSizes(block=block)))
     valid = np.arange(40) % 5 < 4
     assert np.array_equal(cloud.points[:, 0], (np.arange(40) + 0.5)[valid])
     for k, name in enumerate(("red", "green", "blue")):

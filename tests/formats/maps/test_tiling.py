@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,13 +19,13 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import LazyTiles, PointMap, lattice_of, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, import_cloud, read_map, write_map
-from mapvote.formats.maps import pcd, ply, tiling
-from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.cloud import Cloud, ReadSizes
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.mapvote_folder import read_manifest
-from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.ply import write_ply
+from mapvote.formats.maps.pcd import stream_pcd, write_pcd
+from mapvote.formats.maps.ply import stream_ply, write_ply
 from mapvote.formats.maps.tiling import map_of
+from mapvote.formats.registry import MAPS
 from mapvote.fusion.fuse import update_map
 
 
@@ -76,13 +78,15 @@ def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPat
     assert sum(map(len, seen)) == 2 * len(points)
 
 
+SMALL = ReadSizes(block=700, in_memory_bytes=1)
+
+
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything counts as larger than memory."""
     monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
-    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
-    monkeypatch.setattr(pcd, "_BLOCK", 700)
-    monkeypatch.setattr(ply, "_BLOCK", 700)
+    for name, stream in (("PCD file", stream_pcd), ("PLY file", stream_ply)):
+        monkeypatch.setitem(MAPS, name, replace(MAPS[name], stream=partial(stream, sizes=SMALL)))
 
 
 @pytest.mark.usefixtures("large")
@@ -99,7 +103,7 @@ def test_a_map_larger_than_memory_is_the_same_map_and_leaves_as_the_same_file(
         save_pcd(file, points, "ascii" if "ascii" in suffix else "binary", **fields)
     else:
         (write_ply if suffix == ".ply" else write_las)(file, cloud)
-    made, _ = import_cloud(file, folder=tmp_path)
+    made, _ = import_cloud(file, folder=tmp_path, sizes=SMALL)
     assert isinstance(made.tiles, LazyTiles)
     assert (len(made.tiles), made.n_points) == (4, 4000)
     lazy = files(made, tmp_path / "lazy")
@@ -118,7 +122,7 @@ def test_a_map_larger_than_memory_is_the_same_map_and_leaves_as_the_same_file(
 @pytest.mark.usefixtures("large")
 def test_a_tile_that_somebody_holds_is_not_made_again(tmp_path: Path) -> None:
     points, fields = street(4)
-    made = map_of("it", [Cloud(points, fields=fields)])
+    made = map_of("it", [Cloud(points, fields=fields)], sizes=SMALL)
     held = made.tiles[0, 0]
     for _ in range(2):
         assert sum(len(tile.points) for tile in made.tiles.values()) == 4000
@@ -153,7 +157,7 @@ def test_a_large_map_with_a_damaged_tile_is_refused_when_it_is_opened(tmp_path: 
 
 
 def test_a_file_that_is_cut_off_late_leaves_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pcd, "_BLOCK", 700)
+    monkeypatch.setitem(MAPS, "PCD file", replace(MAPS["PCD file"], stream=partial(stream_pcd, sizes=SMALL)))
     points, _ = street(5)
     write_pcd(tmp_path / "a.pcd", Cloud(points))
     (tmp_path / "a.pcd").write_bytes((tmp_path / "a.pcd").read_bytes()[:-100])
@@ -162,12 +166,10 @@ def test_a_file_that_is_cut_off_late_leaves_no_map(tmp_path: Path, monkeypatch: 
 
 
 def test_a_full_disk_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
-
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("tempfile.TemporaryFile", full)
     points, _ = street(6)
     with pytest.raises(MapvoteError, match="no room for temporary files"):
-        map_of("it", [Cloud(points)])
+        map_of("it", [Cloud(points)], sizes=SMALL)

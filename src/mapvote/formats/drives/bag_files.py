@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -25,23 +26,17 @@ UNFINISHED = ".active"
 _COMPRESSED = (".zstd", ".zst")
 _METADATA = "metadata.yaml"
 _MAGIC = b"\x89MCAP0\r\n"
-_HEAD = struct.Struct("<BQ")
-"""Of a record: opcode, length of its content."""
+_RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode of a record, length of its content."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
-"""Of a chunk: times of its first and last message, uncompressed size, checksum."""
-_FOOTER = 0x02
-_CHUNK = 0x06
-_MESSAGE_INDEX = 0x07
-_CHUNK_INDEX = 0x08
-_STATISTICS = 0x0B
-_DATA_END = 0x0F
+"""Times of the first and last message of a chunk, its uncompressed size, its checksum."""
 _MENDS = {
     ".mcap": "mcap recover {0} -o recovered.mcap",
     ".db3": 'sqlite3 {0} ".recover" | sqlite3 recovered.db3',
     ".bag": "rosbag reindex {0}",
     UNFINISHED: "rosbag reindex {0}",
 }
-"""What repairs a file, by its suffix."""
+"""Command that repairs a file, by its suffix."""
 
 
 def is_bag(path: Path) -> bool:
@@ -54,9 +49,20 @@ def is_bag_without_metadata(path: Path) -> bool:
     return path.is_dir() and not (path / _METADATA).is_file() and bool(_beside(path))
 
 
+class Opcode(IntEnum):
+    """Kinds of records in an MCAP file."""
+
+    FOOTER = 0x02
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    STATISTICS = 0x0B
+    DATA_END = 0x0F
+
+
 @dataclass(frozen=True, slots=True)
 class BagFiles:
-    """What a reader of bags is given, and what was mended to make that possible."""
+    """Files given to a reader of bags, and their mends."""
 
     paths: list[Any]
     """Of the reader's path protocol."""
@@ -242,15 +248,15 @@ def _whole_records(file: Path) -> StorageFile:
         size = file.stat().st_size
         for opcode, start, stop in _records(stream, size):
             # The indexes of a chunk's messages follow it, one a channel.
-            if opcode == _MESSAGE_INDEX and stop <= size:
+            if opcode == Opcode.MESSAGE_INDEX and stop <= size:
                 offsets += stream.read(2) + struct.pack("<Q", start)
             # Another record, even one that is cut off: they are complete.
-            elif opcode != _MESSAGE_INDEX:
+            elif opcode != Opcode.MESSAGE_INDEX:
                 index += _chunk_index(chunk, offsets, start - chunk_end)
                 chunk, offsets = b"", b""
             if stop > size:
                 break
-            if opcode == _CHUNK:
+            if opcode == Opcode.CHUNK:
                 chunk = _chunk_head(stream, start, stop)
                 chunk_start, chunk_end = start, stop
             end = stop
@@ -258,10 +264,10 @@ def _whole_records(file: Path) -> StorageFile:
         raise MapvoteError(f"{file}: cut off before its first whole record; nothing of it can be read")
     if index and chunk:  # an index that may be incomplete would hide messages
         end = chunk_start
-    counted = _record(_STATISTICS, struct.pack("<QHIIIIQQI", 0, 0, 0, 0, 0, 0, 0, 0, 0))
+    counted = _record(Opcode.STATISTICS, struct.pack("<QHIIIIQQI", 0, 0, 0, 0, 0, 0, 0, 0, 0))
     summary = index + counted if index else b""
-    data_end = _record(_DATA_END, struct.pack("<I", 0))
-    footer = _record(_FOOTER, struct.pack("<QQI", end + len(data_end) if summary else 0, 0, 0))
+    data_end = _record(Opcode.DATA_END, struct.pack("<I", 0))
+    footer = _record(Opcode.FOOTER, struct.pack("<QQI", end + len(data_end) if summary else 0, 0, 0))
     return StorageFile(file, end, data_end + summary + footer + _MAGIC)
 
 
@@ -269,18 +275,18 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
     """(opcode, start, end) of the records of the data section, of which only the last may end beyond ``size``;
     ``stream`` stands at the record's content."""
     start = stream.tell()
-    while start < size and len(head := stream.read(_HEAD.size)) == _HEAD.size:
-        opcode, length = _HEAD.unpack(head)
-        if opcode in (_DATA_END, _FOOTER) or not 0 < opcode < 0x80:
+    while start < size and len(head := stream.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
+        opcode, length = _RECORD_HEAD.unpack(head)
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER) or not 0 < opcode < 0x80:
             return
-        end = start + _HEAD.size + length
+        end = start + _RECORD_HEAD.size + length
         yield opcode, start, end
         stream.seek(end)
         start = end
 
 
 def _record(opcode: int, body: bytes) -> bytes:
-    return _HEAD.pack(opcode, len(body)) + body
+    return _RECORD_HEAD.pack(opcode, len(body)) + body
 
 
 def _chunk_head(stream: BinaryIO, start: int, end: int) -> bytes:
@@ -298,4 +304,4 @@ def _chunk_index(chunk: bytes, offsets: bytes, index_length: int) -> bytes:
     if not chunk or not offsets:
         return b""
     places = struct.pack("<I", len(offsets)) + offsets + struct.pack("<Q", index_length)
-    return _record(_CHUNK_INDEX, chunk[:32] + places + chunk[32:])
+    return _record(Opcode.CHUNK_INDEX, chunk[:32] + places + chunk[32:])

@@ -21,8 +21,8 @@ from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
 from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
 from mapvote.formats.drives.sensor_estimate import (
-    MEASURED_SCANS,
-    UNKNOWN,
+    RING_RULE,
+    UNKNOWN_SENSOR,
     estimate_sensor,
     rate_of_first,
     turning_about,
@@ -300,11 +300,11 @@ def _sensor_of(
         return read_sensor(said, where), "drive.toml"
     some = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
     if options.as_live and rate_hz is None and len(chosen) > 1:
-        some = chosen[:MEASURED_SCANS]
+        some = chosen[: RING_RULE.scans]
         rate_hz = rate_of_first(stamps_ns[some])
     elif rate_hz is None and len(stamps_ns) > 1:
         rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
-    read = (read_scan(int(i), replace(UNKNOWN, rate_hz=rate_hz or 10.0)) for i in np.unique(some))
+    read = (read_scan(int(i), replace(UNKNOWN_SENSOR, rate_hz=rate_hz or 10.0)) for i in np.unique(some))
     scans = [scan.by_lidar()[0][1] for scan in read]  # the first LiDAR's own
     found = estimate_sensor(scans, rate_hz or 10.0)
     if isinstance(said, dict):

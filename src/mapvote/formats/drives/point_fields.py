@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from mapvote.core.geometry import azimuth
 from mapvote.core.kernel import kernel
 from mapvote.core.points import Values, point_fields
+from mapvote.core.record import record
 from mapvote.core.sensors import UPRIGHT, Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
 from mapvote.formats.drives.point_times import (
-    ANOTHER,
     ClockDifference,
     FieldTimes,
     FoundTimes,
+    TimeOrigin,
     TimeRules,
     find_times,
     known_time_field,
@@ -33,17 +34,28 @@ from mapvote.formats.maps.field_names import known_fields, plain
 
 log = logging.getLogger("mapvote.formats")
 
-MAX_BAD_SHARE = 0.05
-"""A scan with more broken points than this is refused: it is damaged, or not the format it claims to be."""
-FAR_M = 2000.0
-"""No LiDAR of ours measures farther; float64 or integers read as float32 do."""
-_BLOCK = 512
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PointRule:
+    """Bounds by which points and rates of scans are told to be right."""
+
+    most_bad_share: float = 0.05
+    """A scan or map with a larger share of broken points is refused: it is damaged, or of another format."""
+    far_m: float = 2000.0
+    """Points farther than this are broken, metres: no LiDAR measures farther, float64 read as float32 does."""
+    least_rate_hz: float = 8.0
+    """Scans that come less often than this may have been left out, hertz."""
+    greatest_rate_hz: float = 34.0
+    """Scans that come more often than this are parts of a revolution, hertz."""
+
+
+POINT_RULE = PointRule()
+_AZIMUTHS_AT_ONCE = 512
 _RINGS = ("ring", "channel", "laserid", "lasernumber", "line")
 """Names of the number of a beam, plainly spelled."""
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
-_USUAL_RATES_HZ = 8.0, 34.0
-"""Scans that come so often are one revolution each; where they come less often some may have been left out."""
 
 
 @dataclass(slots=True)
@@ -51,7 +63,7 @@ class BadPoints:
     """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: noticed, without a flood."""
 
     where: str
-    what: str = f"are not finite or beyond {FAR_M:.0f} m"
+    what: str = f"are not finite or beyond {POINT_RULE.far_m:.0f} m"
     points: int = 0
     seen: set[int] = field(default_factory=set)
 
@@ -99,11 +111,11 @@ class PointReader:
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
         usable = np.empty(len(points), np.int32)
         copied = np.empty((len(points), 3), np.float32)
-        n, measured, bad = _sort_out(points, self.zero_is_no_return, near_m, FAR_M, usable, copied)
-        if bad > MAX_BAD_SHARE * max(measured, 1):
+        n, measured, bad = _sort_out(points, self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied)
+        if bad > POINT_RULE.most_bad_share * max(measured, 1):
             raise MapvoteError(
-                f"{where}: {bad} of {measured} points are not finite or beyond {FAR_M:.0f} m, more than "
-                f"{MAX_BAD_SHARE:.0%}: {_likely_cause(points)}"
+                f"{where}: {bad} of {measured} points are not finite or beyond {POINT_RULE.far_m:.0f} m, more than "
+                f"{POINT_RULE.most_bad_share:.0%}: {_likely_cause(points)}"
             )
         self.bad_points.count(index, bad)
         if n == 0:
@@ -162,16 +174,16 @@ class PointReader:
 
     def _from_field(self, where: str, index: int, times: FieldTimes, surprising: bool) -> tuple[F32, TimesTold]:
         lost = int(np.isnan(times.after_stamp).sum())
-        if lost > MAX_BAD_SHARE * len(times.after_stamp):
+        if lost > POINT_RULE.most_bad_share * len(times.after_stamp):
             raise MapvoteError(
                 f"{where}: {lost} of {len(times.after_stamp)} points hold no time of this scan in the field "
-                f"{times.name}, more than {MAX_BAD_SHARE:.0%}; record it again, leave the scan out with --scans, or "
-                f'drop the field (time_field = "none" in drive.toml)'
+                f"{times.name}, more than {POINT_RULE.most_bad_share:.0%}; record it again, leave the scan out "
+                f'with --scans, or drop the field (time_field = "none" in drive.toml)'
             )
         self.clocks.check(where, index, times)
         self.bad_times.count(index, lost)
         doubtful = surprising and self.rules.time_field is None
-        told = TimesTold("field", times.told, doubtful, (times.name,), other_clock=times.origin == ANOTHER)
+        told = TimesTold("field", times.told, doubtful, (times.name,), other_clock=times.origin == TimeOrigin.ANOTHER)
         return times.after_stamp.astype(np.float32), told
 
     def _refuse_known(self, where: str, found: FoundTimes) -> None:
@@ -198,7 +210,7 @@ class PointReader:
                 f"{where}: motion_compensated = false, but no field tells the times of the points, and azimuths do "
                 f"not: the points lie on no rings. Record the times, or describe the sensor in drive.toml"
             )
-        if not self.rules.rate_stated and not _USUAL_RATES_HZ[0] <= rate_hz <= _USUAL_RATES_HZ[1]:
+        if not self.rules.rate_stated and not POINT_RULE.least_rate_hz <= rate_hz <= POINT_RULE.greatest_rate_hz:
             raise MapvoteError(
                 f"{where}: motion_compensated = false, and scans come every {1.0 / rate_hz:.3g} s: state how often the "
                 f"sensor turns (rate_hz in drive.toml), for scans may have been left out"
@@ -257,7 +269,7 @@ def _unit_of_near(points: F32) -> str:
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(points.astype(np.float64), axis=1)
     distance = distance[np.isfinite(distance) & (distance > 0.0)]
-    if len(distance) and float(np.median(distance)) > 0.001 and float(distance.max()) < FAR_M / 1000.0:
+    if len(distance) and float(np.median(distance)) > 0.001 and float(distance.max()) < POINT_RULE.far_m / 1000.0:
         return f"they look like kilometres (the farthest {distance.max():.3f}); multiply x, y, z by 1000"
     return "are they metres? Else leave this scan out with --scans"
 
@@ -267,7 +279,7 @@ def _likely_cause(points: F32) -> str:
         distance = np.linalg.norm(points.astype(np.float64), axis=1)
     finite = distance[np.isfinite(distance)]
     farthest = float(np.quantile(finite, 0.99)) if len(finite) else 0.0
-    if len(finite) > 0.9 * len(distance) and FAR_M < farthest < 300_000.0:
+    if len(finite) > 0.9 * len(distance) and POINT_RULE.far_m < farthest < 300_000.0:
         unit, factor = ("millimetres", 1000) if farthest > 15_000.0 else ("centimetres", 100)
         return f"they look like {unit} (the farthest {farthest:.0f}); divide x, y, z by {factor}"
     return "the file is damaged, or not float32 x, y, z, intensity"
@@ -278,7 +290,7 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
 
     The sensor faces forward at the stamp: -azimuth / (2 pi rate) if it turns clockwise seen from above.
     """
-    out, (x, y) = np.empty(len(points), np.float32), np.empty((2, _BLOCK), np.float32)
+    out, (x, y) = np.empty(len(points), np.float32), np.empty((2, _AZIMUTHS_AT_ONCE), np.float32)
     _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz), x, y, out)
     return out
 
@@ -286,9 +298,9 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
 @kernel
 def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F32) -> None:
     """:func:`spinning_time_s` into ``out`` (n,), block by block: x and y, which lie three numbers apart in ``points``,
-    are copied into ``x`` and ``y`` (_BLOCK,) first, so that the loop vectorises."""
-    for start in range(0, len(points), _BLOCK):
-        n = min(_BLOCK, len(points) - start)
+    are copied into ``x`` and ``y`` (_AZIMUTHS_AT_ONCE,) first, so that the loop vectorises."""
+    for start in range(0, len(points), _AZIMUTHS_AT_ONCE):
+        n = min(_AZIMUTHS_AT_ONCE, len(points) - start)
         for i in range(n):
             x[i], y[i] = points[start + i, 0], points[start + i, 1]
         for i in range(n):
@@ -335,7 +347,7 @@ _LIVOX_FIELDS = {
     "tag": ("u1", 17),
     "line": ("u1", 18),
 }
-"""Of a CustomPoint: type and place in its 19 bytes."""
+"""Type of each field of a CustomPoint, and its place in the 19 bytes."""
 
 
 def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:

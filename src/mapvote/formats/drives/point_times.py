@@ -19,11 +19,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
 from mapvote.formats.maps.field_names import plain
 
@@ -41,44 +43,54 @@ _OTHER_FIELDS = re.compile(
 _SPLIT = re.compile(r"(.*?)(n|nano|u|micro)(s|sec|secs|seconds?)")
 """Names of the part of a time below a second; the other part has the same name without n or u."""
 UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-SINCE_STAMP = "since the stamp"
-AS_STAMP = "as the stamp counts"
-ANOTHER = "by another clock"
 
 
+class TimeOrigin(StrEnum):
+    """From where the times of points count."""
+
+    SINCE_STAMP = "since the stamp"
+    AS_STAMP = "as the stamp counts"
+    ANOTHER = "by another clock"
+
+
+@record()
 @dataclass(frozen=True, slots=True)
 class TimeJudgement:
-    """What makes a field the time of points."""
+    """Bounds by which a field is told to be the time of points."""
 
     least_values: int = 16
     """Different values a scan has at least."""
     shared: float = 0.01
     """A value that a larger share of the points has, and ``shared_ratio`` times as many as any other, is no time."""
     shared_ratio: float = 5.0
+    """Ratio of the points with the most frequent value to those with the next one, see ``shared``."""
     sample: int = 4096
-    """Points whose values and azimuths are looked at."""
+    """Points whose values and azimuths are read."""
     shortest_turn_s: float = 0.03
-    """Of a spinning LiDAR, seconds."""
+    """Shortest revolution of a spinning LiDAR, seconds."""
     longest_turn_s: float = 0.4
+    """Longest revolution of a spinning LiDAR, seconds."""
     off_rate: float = 0.15
-    """By what share a revolution may differ from the time between two scans."""
+    """Share by which a revolution may differ from the time between two scans."""
     off_multiple: float = 0.12
-    """The same where scans were left out: from a whole number of revolutions, up to four."""
+    """Where scans were left out: share by which that time may differ from a whole number of revolutions, up to four."""
     goes_round: float = 0.8
     """Mean resultant length of the azimuths about a steady turn, from which the sensor is said to spin."""
     least_turn_rad: float = 5.0
-    """Azimuth that a scan must cover for that; and the most, else a scan is no revolution."""
+    """Least azimuth that a spinning scan covers, radians."""
     longest_turn_rad: float = 7.6
+    """Greatest azimuth that a spinning scan covers, radians."""
     shortest: float = 0.05
-    """Revolutions that a scan lasts, where azimuths do not tell."""
+    """Least length of a scan where azimuths do not tell, revolutions."""
     longest: float = 2.2
+    """Greatest length of a scan where azimuths do not tell, revolutions."""
     reach: float = 1.5
-    """Revolutions, or twice the interquartile range if that is longer, from the median to an outlier."""
+    """Distance from the median to an outlier, revolutions, or twice the interquartile range if that is longer."""
     near_stamp: float = 0.6
-    """Revolutions from 0 to the median of times that count from the stamp."""
+    """Greatest median of times that count from the stamp, revolutions."""
     apart_s: float = 1.0
-    """Seconds from the stamp to the median of times that count as the stamp does; and by which the difference of two
-    clocks may change during a drive."""
+    """Greatest time from the stamp to the median of times that count as the stamp does, and greatest change of the
+    difference of two clocks during a drive, seconds."""
 
 
 JUDGEMENT = TimeJudgement()
@@ -109,7 +121,7 @@ class ClockDifference:
 
     def check(self, where: str, index: int, times: FieldTimes) -> None:
         """MapvoteError if scan ``index`` tells another difference than the first scan that told one."""
-        if times.origin == SINCE_STAMP:
+        if times.origin == TimeOrigin.SINCE_STAMP:
             return
         off_ns = times.clock_off_ns
         if self.off_ns is None:
@@ -135,7 +147,7 @@ class FieldTimes:
     after_stamp: F64
     """(n,) seconds after the scan's stamp; NaN where the value is no time of this scan."""
     origin: str
-    """One of ``SINCE_STAMP``, ``AS_STAMP``, ``ANOTHER``."""
+    """From where they count."""
     clock_off_ns: int
     """Of another clock: its time at the first point, less the stamp; else 0."""
     wraps_ns: int
@@ -253,7 +265,7 @@ def read_times(
     after = steps * to_s
     after += off_ns * 1e-9
     after[~good] = np.nan
-    clock_off_ns = value_ns + starts_ns - stamp_ns if origin == ANOTHER else 0
+    clock_off_ns = value_ns + starts_ns - stamp_ns if origin == TimeOrigin.ANOTHER else 0
     return FieldTimes(name, chosen, after, origin, clock_off_ns, wraps_ns, turn is not None, turns)
 
 
@@ -345,7 +357,7 @@ def _origin(
     reference to the median and to the first of the values."""
     value_ns, wraps_ns = reference
     revolution_ns = 1e9 / rate_hz
-    readings = [(value_ns, SINCE_STAMP), (value_ns - stamp_ns, AS_STAMP)]
+    readings = [(value_ns, TimeOrigin.SINCE_STAMP), (value_ns - stamp_ns, TimeOrigin.AS_STAMP)]
     if wraps_ns:
         readings = [((off + wraps_ns // 2) % wraps_ns - wraps_ns // 2, origin) for off, origin in readings]
     since_stamp = readings[0]
@@ -354,12 +366,12 @@ def _origin(
     nearest = min(readings, key=lambda reading: abs(reading[0] + middle_ns))
     if abs(nearest[0] + middle_ns) <= JUDGEMENT.apart_s * 1e9:
         return nearest
-    return -start_ns, ANOTHER
+    return -start_ns, TimeOrigin.ANOTHER
 
 
 @dataclass(frozen=True, slots=True)
 class FoundTimes:
-    """What the fields of a scan say of times."""
+    """Fields of a scan that hold times, or might."""
 
     times: FieldTimes | None
     refused: Mapping[str, Refusal] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What the header of a table of poses says: which column is which, and in which unit.
+"""The header of a table of poses: roles and units of its columns.
 
 Headers of EuRoC (``#timestamp [ns], p_RS_R_x [m], .., q_RS_w [], q_RS_x []``), of ``rostopic echo -p``
 (``%time,field.pose.pose.position.x``), of TUM files with a comment, of CSV. Whatever order they name is obeyed.
@@ -27,18 +27,16 @@ _ROLES = [
     ("stamp", "header_stamp(?:_secs?|_seconds)?"),
     ("time", "(?:ros|gps|unix)?_?(?:timestamp|time|stamp)|t|secs?|seconds"),
 ]  # fmt: skip
-"""Roles and what names them, in the order in which they are tried."""
+"""Roles and patterns of their names, in the order in which they are tried."""
 _NOT_A_POSE = re.compile(
     r"(?:^|_)(?:v|vel|velocity|twist|linear|angular|acc|acceleration|bias|b|cov|covariance)(?:_|\d|$)"
 )
-_UNITS = {
+_UNITS_OF_POSES = {
     "m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048,
     "rad": 1.0, "radian": 1.0, "radians": 1.0, "deg": 0.017453292519943295, "degree": 0.017453292519943295,
     "degrees": 0.017453292519943295, "s": 1e9, "sec": 1e9, "seconds": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0,
 }  # fmt: skip
 """Metres, radians or nanoseconds in one."""
-_LEAST_NAMED = 3
-"""Roles that make a line a header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,7 @@ class Column:
     @property
     def scale(self) -> float | None:
         """Metres, radians or nanoseconds in one; None if the header names no unit."""
-        return _UNITS.get(self.unit)
+        return _UNITS_OF_POSES.get(self.unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +88,7 @@ def find_header(lines: Sequence[str]) -> Header | None:
         if not line.strip():
             continue
         words = split_row(line)
-        if words and _is_number(words[0]):
+        if words and is_number(words[0]):
             break
         header = _header_of(number, line)
         found = header or found
@@ -109,7 +107,7 @@ def _header_of(number: int, line: str) -> Header | None:
             columns[role] = Column(index, name, unit)
     if "stamp" in columns:  # of the header: when it was measured, not when it was received
         columns["time"] = columns.pop("stamp")
-    return Header(number, tuple(names), columns) if len(columns) >= _LEAST_NAMED else None
+    return Header(number, tuple(names), columns) if len(columns) >= 3 else None
 
 
 def _role(name: str) -> tuple[str, str]:
@@ -118,14 +116,17 @@ def _role(name: str) -> tuple[str, str]:
     unit = bracket.group(1).strip().lower() if bracket else ""
     word = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name).lower()).strip("_").removeprefix("field_")
     last = word.rpartition("_")
-    if (not unit and last[0] and last[2] in _UNITS and last[2] not in ("s", "m")) or re.fullmatch(r".+_[ms]", word):
+    if (not unit and last[0] and last[2] in _UNITS_OF_POSES and last[2] not in ("s", "m")) or re.fullmatch(
+        r".+_[ms]", word
+    ):
         word, unit = last[0], last[2]
     if _NOT_A_POSE.search(word):
         return "", ""
     return next((role for role, pattern in _ROLES if re.fullmatch(pattern, word)), ""), unit
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a word of a table is a number."""
     try:
         float(text)
     except ValueError:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError
 
 _TOKEN = re.compile(r"(?:(?:^|(?<=[_=\s]))-)?\d+(?:\.\d+)*|\D")
@@ -26,20 +27,21 @@ _DATE = ((1990, 2100), (1, 12), (1, 31), (0, 23), (0, 59), (0, 59))
 _HEX = re.compile(r"(?:0x)?[0-9a-f]+")
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class NameRule:
     """Bounds by which a number in a name is told to be a time."""
 
     since_1970_s: float = 1e8
-    """Seconds: from here on a number is a time since 1970, 1973 and later."""
+    """Least number that is a time since 1970, seconds: a day of 1973."""
     latest_s: float = 1e11
-    """Seconds: larger numbers count milli-, micro- or nanoseconds."""
+    """Numbers larger than this count milli-, micro- or nanoseconds, seconds."""
     fraction_digits: int = 9
     """Digits of nanoseconds, the most that a time is written to."""
     fastest_step_s: float = 0.005
-    """Seconds between scans: a time that is not since 1970 must step at least so far ..."""
+    """Least step from scan to scan of a time that is not since 1970, seconds."""
     slowest_step_s: float = 5.0
-    """... and, in the median, at most so far."""
+    """Greatest median step of such a time, seconds."""
 
 
 NAME_RULE = NameRule()

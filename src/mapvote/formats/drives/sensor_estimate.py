@@ -1,4 +1,4 @@
-"""What LiDAR took these scans? Measured in them: elevations of its rings, azimuth step, spin, blind sectors."""
+"""The LiDAR that took some scans, measured in them: elevations of its rings, azimuth step, spin, blind sectors."""
 
 from __future__ import annotations
 
@@ -8,21 +8,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.core.mount import mount_of_prior
+from mapvote.core.record import record
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Scan
 
-UNKNOWN = Sensor("unknown", (0.0,), 0.2, min_range_m=0.5)
+UNKNOWN_SENSOR = Sensor("unknown", (0.0,), 0.2, min_range_m=0.5)
 """Reads the scans that are used."""
-_FAR_M = 8.0
-"""Nearer points are left out: the beams of large sensors do not start in one point."""
-_SURE = 0.7
-"""Share of points that must lie on a ring for the rings to be believed."""
-_EDGE_DEG, _MORE = 1.5, 1.3
-"""A stated sensor is another one if scans show beams so far beyond its own, or so many times as many."""
-_UPRIGHT_DEG = 30.0
-"""Up to so much a sensor may lean, and its beams still have about one elevation each."""
-_SECTOR_DEG = 2.0
-_BLIND_DEG = 10.0
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class RingRule:
+    """How a sensor is measured in its scans, and when a stated one is contradicted."""
+
+    scans: int = 10
+    """Scans at the beginning of a live drive in which its sensor is measured."""
+    far_m: float = 8.0
+    """Points nearer than this are left out, metres: the beams of large sensors do not start in one point."""
+    sure: float = 0.7
+    """Share of points that must lie on a ring for the rings to be believed."""
+    edge_deg: float = 1.5
+    """A stated sensor is another one if scans show beams this far beyond its own, degrees."""
+    more: float = 1.3
+    """A stated sensor is another one if scans show this many times as many beams."""
+    upright_deg: float = 30.0
+    """A sensor that leans less than this has beams of about one elevation each, degrees."""
+    sector_deg: float = 2.0
+    """Width of the sectors in which points are counted to find blind ones, degrees."""
+    blind_deg: float = 10.0
+    """Least width of a blind sector, degrees."""
+
+
+RING_RULE = RingRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,29 +52,30 @@ class Estimate:
     told: str
 
 
-MEASURED_SCANS = 10
-"""Scans at the beginning of a live drive in which its sensor is measured."""
-
-
 def rate_of_first(stamps_ns: I64) -> float:
     """Revolutions per second by the stamps (n,), n > 1, of the first scans of a live drive, to a tenth."""
     return round(1e9 / float(np.median(np.diff(stamps_ns))), 1)
 
 
-def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
-    """The sensor of some scans (one or more). A known model where the rings fit one, else a model of what is seen.
+def estimate_sensor(scans: Sequence[Scan], rate_hz: float, rule: RingRule = RING_RULE) -> Estimate:
+    """The sensor of some scans (one or more): a known model where the rings fit one, else a model of the seen rings.
 
     Rings come from the ring field, else from the order of the points (ring by ring), else from clusters of
     elevations. Where there are none (solid-state, non-repeating) the model is an even grid over the field of view.
     """
+    # Elevation, azimuth, range and ring of every point.
     angles = [_angles(scan) for scan in scans]
     elevation, azimuth = (np.concatenate([a[k] for a in angles]) for k in (0, 1))
     rings = [_rings(scan, *pair) for scan, pair in zip(scans, angles, strict=True)]
-    blind = _blind_sectors(azimuth)
-    found = None if any(r is None for r in rings) else _ring_model(angles, [r for r in rings if r is not None])
-    if found is None or found[2] < _SURE:
-        return _ringless(elevation, azimuth, rate_hz, blind, 0.0 if found is None else found[2])
-    elevations, step, share = found
+    blind = _blind_sectors(azimuth, rule)
+    # Without rings on which most points lie: a model of the field of view.
+    on_rings = [ring for ring in rings if ring is not None]
+    model_of_rings = _ring_model(angles, on_rings, rule.far_m) if len(on_rings) == len(rings) else None
+    if model_of_rings is None or model_of_rings[2] < rule.sure:
+        share = 0.0 if model_of_rings is None else model_of_rings[2]
+        return _ringless(elevation, azimuth, rate_hz, blind, share)
+    # With rings: a known model whose beams they are, else one of these rings.
+    elevations, step, share = model_of_rings
     spin = _clockwise(scans, angles)
     name, model = _known(elevations)
     seen = f"{len(elevations)} rings, {elevations[0]:.1f} to {elevations[-1]:.1f} deg, {share:.0%} of points on them"
@@ -75,47 +93,47 @@ def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
     return Estimate(sensor, share, f"measured: {seen}, azimuth step {step:.3f} deg")
 
 
-def contradiction(stated: Sensor, scan: Scan) -> str:
+def contradiction(stated: Sensor, scan: Scan, rule: RingRule = RING_RULE) -> str:
     """How the rings that a scan surely shows contradict the ``stated`` sensor; "" if they do not, or are not sure.
 
     Beams that see nothing are missed in a scan, so fewer rings than stated are no contradiction.
     """
     if not stated.rings or stated.beams < 2:
         return ""
-    found = estimate_sensor([scan], stated.rate_hz)
-    if not found.sensor.rings or found.on_rings < _SURE:
+    shown = estimate_sensor([scan], stated.rate_hz, rule)
+    if not shown.sensor.rings or shown.on_rings < rule.sure:
         return ""
-    seen, beams = (np.sort(np.array(s.elevations_deg))[::-1] for s in (found.sensor, stated))
+    seen, beams = (np.sort(np.array(s.elevations_deg))[::-1] for s in (shown.sensor, stated))
     spacing = float(np.median(np.abs(np.diff(beams))))
-    outside = seen[0] > beams[0] + _EDGE_DEG or seen[-1] < beams[-1] - _EDGE_DEG
+    outside = seen[0] > beams[0] + rule.edge_deg or seen[-1] < beams[-1] - rule.edge_deg
     off_deg = float(np.median(np.abs(seen - _nearest(beams, seen))))
-    if not outside and len(seen) <= _MORE * len(beams) and off_deg <= max(0.3 * spacing, 0.15):
+    if not outside and len(seen) <= rule.more * len(beams) and off_deg <= max(0.3 * spacing, 0.15):
         return ""
-    name = f", as a {found.sensor.name} has" if found.sensor.name in SENSORS else ""
+    name = f", as a {shown.sensor.name} has" if shown.sensor.name in SENSORS else ""
     return (
         f"the scans show {len(seen)} beams from {seen[-1]:.1f} to {seen[0]:.1f} deg{name}, but a {stated.name} has "
         f"{len(beams)} from {beams[-1]:.1f} to {beams[0]:.1f} deg"
     )
 
 
-def sensor_upright(sensor: Sensor, measured: bool, scan: Scan, lean_deg: float) -> Sensor:
+def sensor_upright(sensor: Sensor, measured: bool, scan: Scan, lean_deg: float, rule: RingRule = RING_RULE) -> Sensor:
     """The sensor of a drive that was turned to z up, from that of the drive before. ``scan`` is of the turned drive.
 
     Its rings may go round the vertical, whatever axes its points were recorded in (clouds in the axes of the vehicle),
-    or round its own axis. Upside down the lowest beam is the highest. Of rings that lean no beam has one elevation.
+    or round its own axis. Upside down the lowest beam is the highest. Beams of leaning rings have no elevation.
     """
-    found = estimate_sensor([scan], sensor.rate_hz)
-    if found.sensor.rings and found.on_rings >= _SURE:
+    shown = estimate_sensor([scan], sensor.rate_hz, rule)
+    if shown.sensor.rings and shown.on_rings >= rule.sure:
         if measured:
-            return found.sensor
-        if not contradiction(sensor, scan):
+            return shown.sensor
+        if not contradiction(sensor, scan, rule):
             return sensor
-    if lean_deg > 180.0 - _UPRIGHT_DEG:
+    if lean_deg > 180.0 - rule.upright_deg:
         return replace(sensor, elevations_deg=tuple(-e for e in reversed(sensor.elevations_deg)))
-    return sensor if lean_deg < _UPRIGHT_DEG else replace(sensor, rings=False)
+    return sensor if lean_deg < rule.upright_deg else replace(sensor, rings=False)
 
 
-def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan) -> Sensor:
+def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan, rule: RingRule = RING_RULE) -> Sensor:
     """The sensor with the axes in which azimuths tell times, by the mount that poses (n, 4, 4) state and one ``scan``.
 
     A sensor that leans turns about its own z if its rings lie about that, else its points were turned, and it turns
@@ -124,13 +142,13 @@ def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan) -> Sensor:
     mount = mount_of_prior(T_map_lidar)
     if mount is None:
         return sensor
-    if mount.lean_deg > _UPRIGHT_DEG:
+    if mount.lean_deg > rule.upright_deg:
         first = scan.by_lidar()[0][1]
-        found = estimate_sensor([first], sensor.rate_hz)
-        level = estimate_sensor([mount.in_steps().scan(first)], sensor.rate_hz)
-        known = level.sensor.name in SENSORS and found.sensor.name not in SENSORS
-        rings = found.sensor.rings and found.on_rings >= _SURE and not contradiction(sensor, first)
-        if rings and not known:
+        own = estimate_sensor([first], sensor.rate_hz, rule)
+        level = estimate_sensor([mount.in_steps().scan(first)], sensor.rate_hz, rule)
+        only_level_is_known = level.sensor.name in SENSORS and own.sensor.name not in SENSORS
+        rings = own.sensor.rings and own.on_rings >= rule.sure and not contradiction(sensor, first, rule)
+        if rings and not only_level_is_known:
             return sensor
     forward, left, up = mount.in_steps().C[:3, :3].tolist()
     return replace(sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
@@ -144,7 +162,7 @@ def _angles(scan: Scan) -> tuple[F64, F64, F64]:
 
 
 def _rings(scan: Scan, elevation: F64, azimuth: F64, _: F64) -> I64 | None:
-    """Which ring each point belongs to, or None."""
+    """Ring of each point, or None."""
     if scan.ring is not None and 3 < len(np.unique(scan.ring)) <= 256:
         return scan.ring.astype(np.int64)
     turns = np.cumsum(np.abs(np.diff(azimuth, prepend=azimuth[:1])) > 180.0)
@@ -166,31 +184,36 @@ def _clusters(elevation: F64) -> I64 | None:
     return None
 
 
-def _ring_model(angles: Sequence[tuple[F64, F64, F64]], rings: Sequence[I64]) -> tuple[F64, float, float] | None:
+def _ring_model(
+    angles: Sequence[tuple[F64, F64, F64]], rings: Sequence[I64], far_m: float
+) -> tuple[F64, float, float] | None:
     """(elevations from the top down, azimuth step in degrees, share of far points on their ring), or None."""
+    # Elevation and azimuth step of each ring of each scan.
     elevations: list[float] = []
     steps: list[float] = []
     ring_of = []
     for (elevation, azimuth, reach), ring in zip(angles, rings, strict=True):
         for number in np.unique(ring):
-            mine = ring == number
-            far = mine & (reach > _FAR_M)
-            if mine.sum() < 20:
+            on_ring = ring == number
+            far = on_ring & (reach > far_m)
+            if on_ring.sum() < 20:
                 continue
-            elevations.append(float(np.median(elevation[far] if far.sum() >= 10 else elevation[mine])))
-            gaps = np.diff(np.sort(azimuth[mine]))
+            elevations.append(float(np.median(elevation[far] if far.sum() >= 10 else elevation[on_ring])))
+            gaps = np.diff(np.sort(azimuth[on_ring]))
             gaps = gaps[gaps > 1e-3]
             if len(gaps):
                 steps.append(float(np.median(gaps)))
             ring_of.append(int(number))
     if len(set(ring_of)) < 4 or not steps:
         return None
+    # The same ring in several scans is one level.
     every = np.sort(elevations)[::-1]
-    same = np.cumsum(np.abs(np.diff(every, prepend=every[:1])) > 0.08)  # the same ring in several scans is one
+    same = np.cumsum(np.abs(np.diff(every, prepend=every[:1])) > 0.08)
     levels = np.array([np.median(every[same == k]) for k in range(int(same[-1]) + 1)])
+    # The share of far points near a level.
     elevation, reach = (np.concatenate([a[k] for a in angles]) for k in (0, 2))
     spacing = np.median(np.abs(np.diff(levels))) if len(levels) > 1 else 1.0
-    off = np.abs(elevation - _nearest(levels, elevation))[reach > _FAR_M]
+    off = np.abs(elevation - _nearest(levels, elevation))[reach > far_m]
     share = float((off < max(spacing / 3.0, 0.05)).mean()) if len(off) else 0.0
     return levels, float(np.median(steps)), share
 
@@ -236,9 +259,10 @@ def _ringless(
     return Estimate(sensor, share, told)
 
 
-def _blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
-    """Azimuths (from, to) in degrees, at least 10 wide, without a point; past 180 where a sector spans +-180."""
-    turns = round(360.0 / _SECTOR_DEG)
+def _blind_sectors(azimuth: F64, rule: RingRule) -> tuple[tuple[float, float], ...]:
+    """Azimuths (from, to) in degrees, at least ``rule.blind_deg`` wide, without a point; past 180 where a sector spans
+    +-180."""
+    turns = round(360.0 / rule.sector_deg)
     empty = np.histogram(azimuth, turns, (-180.0, 180.0))[0] == 0
     if empty.all() or not empty.any():
         return ()
@@ -247,9 +271,9 @@ def _blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], rolled, [False]]).astype(np.int8)))
     sectors = []
     for start, stop in edges.reshape(-1, 2):
-        if (stop - start) * _SECTOR_DEG >= _BLIND_DEG:
-            begin = (start + first) * _SECTOR_DEG - 180.0
-            sectors.append((float(begin), float(begin + (stop - start) * _SECTOR_DEG)))
+        if (stop - start) * rule.sector_deg >= rule.blind_deg:
+            begin = (start + first) * rule.sector_deg - 180.0
+            sectors.append((float(begin), float(begin + (stop - start) * rule.sector_deg)))
     return tuple(sectors)
 
 

@@ -10,27 +10,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.types import I64
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class StampRules:
-    """What stamps of one sensor on one drive may be."""
+    """Bounds on the stamps of one sensor on one drive."""
 
     day_ns: int = 86_400 * 10**9
-    """No stamp is farther than this from the median stamp: before a clock is set, stamps are 0 or count from the boot
-    of the computer."""
+    """No stamp is farther than this from the median stamp, nanoseconds: before a clock is set, stamps are 0 or count
+    from the boot of the computer."""
     set_back_ns: int = 10**9
-    """A stamp so much smaller than the one received before it begins another part of the recording."""
+    """A stamp smaller by this than the one received before it begins another part of the recording, nanoseconds."""
     part: int = 10
-    """Messages: parts of fewer in the mean are disorder, and are sorted; longer ones may be passes."""
+    """Parts of fewer messages in the mean are disorder, and are sorted; longer ones may be passes."""
     dense: float = 0.75
     """A step between sorted stamps of less than this share of the recorded one lies between two passes."""
     overlap: float = 0.1
     """Share of such steps from which on there are two passes."""
 
 
-RULES = StampRules()
+STAMP_RULES = StampRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +47,7 @@ class StampOrder:
     """What was mended or left out, in words, after "the topic"."""
 
 
-def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = RULES) -> StampOrder:
+def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STAMP_RULES) -> StampOrder:
     """The order of messages by the stamps of their headers (n,), given in the order of their receipt (n,)."""
     told: list[str] = []
     chosen = np.arange(len(stamps_ns))

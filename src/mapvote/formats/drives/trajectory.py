@@ -18,19 +18,35 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
 from mapvote.formats.drives.point_fields import log
-from mapvote.formats.drives.pose_header import Column, find_header, split_row
+from mapvote.formats.drives.pose_header import Column, find_header, is_number, split_row
 from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 from mapvote.formats.listing import entry
 from mapvote.formats.reading import read_text
 
-_FACES_Z = 0.9
-"""Cosine between the way a camera looks and the z axis of its own world, somewhere on a drive."""
-MAX_GAP_NS = 500_000_000
-"""A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class TrajectoryRule:
+    """How files of poses are read, and how far between them."""
+
+    faces_z: float = 0.9
+    """Cosine between the axis of a camera and the z axis of its own world, somewhere on a drive."""
+    beyond_ns: int = 500_000_000
+    """A pose is not extrapolated farther than this beyond the ends, nanoseconds."""
+    hole_ns: int = 2_000_000_000
+    """A pose is not interpolated over a longer hole, nanoseconds."""
+    steady: float = 0.97
+    """Least length of the mean direction of travel, in the axes of poses that are read right."""
+    unsteady: float = 0.9
+    """Greatest such length where quaternions are read in the wrong order."""
+
+
+TRAJECTORY_RULE = TrajectoryRule()
 
 
 def read_numbers(file: Path, columns: int) -> F64:
@@ -149,7 +165,7 @@ def read_T_map_lidar(file: Path, folder: Path) -> F64:
     calib = entry(folder, "calib.txt")
     axis = _travels_along(poses)
     # A sensor that is mounted with its z axis ahead moves along z, too, but its z axis is level in the map.
-    camera = axis == "+z" and bool(np.abs(poses[:, 2, 2]).max() > _FACES_Z)
+    camera = axis == "+z" and bool(np.abs(poses[:, 2, 2]).max() > TRAJECTORY_RULE.faces_z)
     if camera or (calib.is_file() and axis == "" and file.name.lower() != "prior.txt"):
         if not calib.is_file():
             raise MapvoteError(
@@ -173,17 +189,17 @@ class Trajectory:
     frame: MapFrame
     """Where its map lies; local unless it came from latitudes and longitudes."""
 
-    def at(self, stamps_ns: I64, where: str) -> F64:
+    def at(self, stamps_ns: I64, where: str, rule: TrajectoryRule = TRAJECTORY_RULE) -> F64:
         """(m, 4, 4) at constant twist between two poses. MapvoteError if it does not cover the stamps without holes."""
         t = self.times_ns
         after = np.clip(np.searchsorted(t, stamps_ns), 1, max(len(t) - 1, 1))
-        beyond = len(t) < 2 or stamps_ns[0] < t[0] - MAX_GAP_NS or stamps_ns[-1] > t[-1] + MAX_GAP_NS
-        gap = np.array([MAX_GAP_NS + 1]) if beyond else np.maximum(t[after] - t[after - 1], 1)
-        if beyond or gap.max() > 4 * MAX_GAP_NS:
+        beyond = len(t) < 2 or stamps_ns[0] < t[0] - rule.beyond_ns or stamps_ns[-1] > t[-1] + rule.beyond_ns
+        gap = np.ones(1) if beyond else np.maximum(t[after] - t[after - 1], 1)
+        if beyond or gap.max() > rule.hole_ns:
             span = f"{t[0] / 1e9:.3f} to {t[-1] / 1e9:.3f} s" if len(t) else "none"
             raise MapvoteError(
                 f"{where}: {len(t)} poses ({span}) do not cover the scans ({stamps_ns[0] / 1e9:.3f} to "
-                f"{stamps_ns[-1] / 1e9:.3f} s) without holes of {4 * MAX_GAP_NS / 1e9:g} s; choose scans that they "
+                f"{stamps_ns[-1] / 1e9:.3f} s) without holes of {rule.hole_ns / 1e9:g} s; choose scans that they "
                 f"cover, or --prior none"
             )
         share = np.clip((stamps_ns - t[after - 1]) / gap, -0.5, 1.5)
@@ -201,7 +217,7 @@ def has_times(file: Path) -> bool:
     """Whether a text file of poses carries times: TUM's eight numbers a row, or a header of names."""
     lines = read_text(file).splitlines()
     words = split_row(next((line for line in lines if _holds(line)), ""))
-    return len(words) == 8 or (bool(words) and not _is_number(words[0])) or find_header(lines) is not None
+    return len(words) == 8 or (bool(words) and not is_number(words[0])) or find_header(lines) is not None
 
 
 def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
@@ -213,7 +229,7 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
     lines = read_text(file).splitlines()
     if find_header(lines) is None:
         first = next((line for line in lines if _holds(line)), "")
-        if first and not _is_number(split_row(first)[0]):
+        if first and not is_number(split_row(first)[0]):
             raise MapvoteError(
                 f"{file}:{lines.index(first) + 1}: no known header: {first.strip()[:80]!r}; name a time, x, y, z and "
                 "qx, qy, qz, qw (or roll, pitch, yaw), or latitude, longitude"
@@ -255,15 +271,12 @@ def _motions_of_quaternions(file: Path, rows: F64) -> F64:
     return geometry.poses_at(rows[:, :3], scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix())
 
 
-_STEADY, _UNSTEADY = 0.97, 0.9
-"""Length of the mean direction of travel in the sensor's axes: of poses that are read right, of others."""
-
-
 def _in_tum_order(file: Path, rows: F64) -> F64:
     """Rows x, y, z, qx, qy, qz, qw of rows without a header, whose quaternions may have w first: only then a vehicle
     always drives to the same side of itself, and the order is told."""
     w_first = rows[:, [0, 1, 2, 4, 5, 6, 3]]
-    if len(rows) < 3 or _of_quaternions(rows) > _UNSTEADY or _of_quaternions(w_first) < _STEADY:
+    rule = TRAJECTORY_RULE
+    if len(rows) < 3 or _of_quaternions(rows) > rule.unsteady or _of_quaternions(w_first) < rule.steady:
         return rows
     log.warning("%s: no header; read as time, x, y, z, qw, qx, qy, qz: so the vehicle drives straight ahead", file)
     return w_first
@@ -349,7 +362,7 @@ def _in_degrees(file: Path, columns: Mapping[str, F64], unstated: Sequence[str])
         rows = np.column_stack([columns["x"], columns["y"], columns.get("z", zero), *angles, yaw])
         steady.append(_steadiness(motions_of_rpy(rows)) if np.isfinite(rows).all() else 1.0)
     unsteady = 1.0 - np.array(steady)
-    degrees = bool(unsteady[0] > 1.0 - _STEADY and unsteady[1] < 0.2 * unsteady[0])
+    degrees = bool(unsteady[0] > 1.0 - TRAJECTORY_RULE.steady and unsteady[1] < 0.2 * unsteady[0])
     if degrees:
         log.warning("%s: angles without a unit; read as degrees: so the vehicle drives straight ahead", file)
     return degrees
@@ -389,7 +402,7 @@ def exact_ns(file: Path, texts: Sequence[str], unit_ns: float | None = None) -> 
     time. Whole numbers are exact: float64 holds no nanoseconds since 1970. ``unit_ns``: the unit, where it is known."""
     if texts and all(":" in text for text in texts):
         return np.array([date_ns(text, str(file)) for text in texts], dtype=np.int64)
-    if unit_ns is not None and all(_is_number(text) for text in texts):
+    if unit_ns is not None and all(is_number(text) for text in texts):
         return np.array([round(Fraction(text) * int(unit_ns)) for text in texts], dtype=np.int64)
     if not all(text.strip().lstrip("-").isdigit() for text in texts):
         return _ns(file, np.array([_number(text) for text in texts]))
@@ -417,19 +430,11 @@ def _ns(file: Path, seconds: F64) -> I64:
 
 def _number(text: str) -> float:
     """NaN if it is none."""
-    return float(text) if _is_number(text) else np.nan
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return float(text) if is_number(text) else np.nan
 
 
 def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any]:
-    """Of the lines (m, ..) of ``table`` one for each scan: in order, or by the number in the scan's name.
+    """One of the lines (m, ..) of ``table`` for each scan: in order, or by the number in the scan's name.
 
     KITTI's recordings lack some scans but no line. MapvoteError if the counts cannot be matched.
     """
@@ -466,10 +471,10 @@ def prior_of(
         raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")
     if file is not None and not has_times(file):
         return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
-    found = own() if file is None else read_trajectory(file, map_frame(options))
-    if found is None:
+    poses = own() if file is None else read_trajectory(file, map_frame(options))
+    if poses is None:
         return None, MapFrame()
-    if not isinstance(found, Trajectory):
-        return of_scans(found, files, path), MapFrame()
-    T = found.at(stamps_ns, str(file or path))
-    return (T @ mount_of(options, T_base_lidar, str(path)) if found.of_vehicle else T), found.frame
+    if not isinstance(poses, Trajectory):
+        return of_scans(poses, files, path), MapFrame()
+    T = poses.at(stamps_ns, str(file or path))
+    return (T @ mount_of(options, T_base_lidar, str(path)) if poses.of_vehicle else T), poses.frame

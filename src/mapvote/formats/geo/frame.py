@@ -30,7 +30,6 @@ LOCAL = "local"
 """Metres from an unknown place on Earth."""
 ENU = "ENU "
 """``crs`` of a plane that touches the Earth: "ENU latitude longitude height" of its origin, x east, y north, z up."""
-_CHUNK = 1_000_000
 PROJECTOR = "map_projector_info.yaml"
 TYPES = ("Local", "MGRS", "LocalCartesianUTM", "LocalCartesian", "TransverseMercator")
 _SQUARE_M = 100_000.0
@@ -164,8 +163,8 @@ def _through(how: Any, points: NDArray[np.floating], *, inverse: bool) -> F64:
     """Points (n, 3) through a transformer, in pieces. MapvoteError if one lies where the projection has no answer."""
     flat = "topocentric" not in how.definition
     out = np.array(points, dtype=np.float64)
-    for start in range(0, len(out), _CHUNK):
-        piece = out[start : start + _CHUNK]
+    for start in range(0, len(out), 1_000_000):
+        piece = out[start : start + 1_000_000]
         columns = piece[:, :2].T if flat else piece.T
         moved = how.transform(*columns, direction="INVERSE" if inverse else "FORWARD")
         for column, values in enumerate(moved):

@@ -35,7 +35,7 @@ log = logging.getLogger("mapvote.formats")
 METADATA = "pointcloud_map_metadata.yaml"
 TILES = "pointcloud_map.pcd"
 """The folder of tiles really is called so, by Autoware's convention."""
-_SIDE_M = 20
+_TILE_SIDE_M = 20
 HISTORY = ".mapvote_versions.json"
 """Beside tiles that ``mapvote export --follow`` wrote: which version has which."""
 FOLLOWED = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
@@ -144,7 +144,7 @@ def _squares(where: str, cloud: Cloud | CloudPieces) -> Iterator[tuple[tuple[int
     for piece in clouds:
         stored = piece.points.astype(np.float32)
         columns = {"points": stored} | {n: c for n, c in piece.fields.items() if n == "intensity"}
-        corner = np.floor(stored[:, :2].astype(np.float64) / _SIDE_M).astype(np.int64) * _SIDE_M
+        corner = np.floor(stored[:, :2].astype(np.float64) / _TILE_SIDE_M).astype(np.int64) * _TILE_SIDE_M
         order = np.lexsort((corner[:, 1], corner[:, 0]))
         seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
         for rows in np.split(order, seams) if len(order) else ():
@@ -163,7 +163,7 @@ def _corners(names: Sequence[str]) -> dict[str, tuple[int, int]]:
 
 def _metadata(corners: Mapping[str, tuple[int, int]]) -> str:
     """The text of pointcloud_map_metadata.yaml: the size of tiles, and the corner of each file."""
-    lines = [f"x_resolution: {_SIDE_M:.1f}", f"y_resolution: {_SIDE_M:.1f}"]
+    lines = [f"x_resolution: {_TILE_SIDE_M:.1f}", f"y_resolution: {_TILE_SIDE_M:.1f}"]
     return "\n".join([*lines, *(f"{name}: [{x}, {y}]" for name, (x, y) in corners.items())]) + "\n"
 
 

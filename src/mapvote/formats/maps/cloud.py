@@ -11,14 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import Brightness
+from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.field_names import COLOURS, kept_fields, known_fields, other_fields
 
-log = logging.getLogger("mapvote.formats")
 
-GROUND, UNCLASSIFIED = 2, 1
-"""ASPRS classes."""
+@record()
+@dataclass(frozen=True, slots=True)
+class ReadSizes:
+    """How much of a map file is held in memory at a time."""
+
+    block: int = 500_000
+    """Points read from a PCD, PLY or E57 file at a time."""
+    piece: int = 1_000_000
+    """Points by which degrees are told from metres, and points in a block of a temporary file."""
+    in_memory_bytes: int = 64 << 20
+    """Bytes up to which a temporary file stays in memory."""
+
+
+READ_SIZES = ReadSizes()
+log = logging.getLogger("mapvote.formats")
 SCALED = {"intensity": "intensity"} | dict.fromkeys(COLOURS, "colour")
 """Fields that count from nothing to a full scale, and what shares it."""
 _SHORT = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)

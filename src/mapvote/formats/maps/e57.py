@@ -16,18 +16,16 @@ from numpy.typing import NDArray
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.cloud import READ_SIZES, Cloud, ReadSizes
 from mapvote.formats.reading import reading
 
-_BLOCK = 500_000
-"""Points read at a time."""
 MAX_POINTS_PER_BYTE = 16
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_FIELDS = {"intensity": "intensity", "colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
+_E57_FIELDS = {"intensity": "intensity", "colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
 
 
-def stream_e57(path: Path) -> Iterator[Cloud]:
+def stream_e57(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
     """The points of a file, scan by scan, in the coordinate system that it names; rays without return are left out.
 
     MapvoteError if it is damaged, or holds no scan of cartesian or spherical points.
@@ -47,25 +45,27 @@ def stream_e57(path: Path) -> Iterator[Cloud]:
         frame = MapFrame(wkt) if wkt else MapFrame()
         for i in range(file.scan_count):
             if counts[i]:
-                yield from _scan(library, file, file.get_header(i), frame)
+                yield from _scan(library, file, file.get_header(i), frame, sizes.block)
 
 
-def _scan(library: Any, file: Any, header: Any, frame: MapFrame) -> Iterator[Cloud]:
+def _scan(library: Any, file: Any, header: Any, frame: MapFrame, block: int) -> Iterator[Cloud]:
     """One scan, block by block."""
+    # The fields that are read: places, kept fields, and whether a ray returned.
     names = list(header.point_fields)
     axes = next((kind for kind in (_CARTESIAN, _SPHERICAL) if set(kind) <= set(names)), None)
     if axes is None:
         raise ValueError(f"a scan has neither cartesian nor spherical points, but {', '.join(names)}")
     state = f"{axes[0][:-1] if axes is _CARTESIAN else 'spherical'}InvalidState"
-    kept = [name for name in _FIELDS if name in names]
+    kept = [name for name in _E57_FIELDS if name in names]
     others = tuple(n for n in names if n not in (*_CARTESIAN, *_SPHERICAL, *kept) and not n.endswith("InvalidState"))
     wanted = [*axes, *kept, *([state] if state in names else [])]
     # One buffer for each field, filled again and again.
-    columns = {name: np.empty(min(header.point_count, _BLOCK)) for name in wanted}
+    columns = {name: np.empty(min(header.point_count, block)) for name in wanted}
     buffers = library.libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         buffers.append(library.libe57.SourceDestBuffer(file.image_file, name, column, len(column), True, True))
     reader = header.points.reader(buffers)
+    # Block by block: rays without return left out, points in the frame of the file.
     scales = {name: _limits(header, name) for name in kept}
     while n := reader.read():
         valid = columns[state][:n] == 0 if state in columns else np.ones(n, np.bool_)
@@ -74,7 +74,7 @@ def _scan(library: Any, file: Any, header: Any, frame: MapFrame) -> Iterator[Clo
             xyz = library.utils.convert_spherical_to_cartesian(xyz)
         if header.has_pose():
             xyz = library.E57.to_global(xyz, header.rotation, header.translation)
-        fields = {_FIELDS[name]: _column(columns[name][:n][valid], *scales[name]) for name in kept}
+        fields = {_E57_FIELDS[name]: _column(columns[name][:n][valid], *scales[name]) for name in kept}
         yield Cloud(xyz, others, frame, fields)
 
 

@@ -22,9 +22,7 @@ KEPT = (
     "las_flags",
 )
 """Fields of points that a map keeps, by LAS's names; :func:`kept_fields` has the attributes of other distributions too.
-``las_flags`` holds the bits of ``LAS_FLAGS``."""
-LAS_FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
-"""Bits of the flags of a point, as LAS 1.4 numbers them."""
+``las_flags`` holds the bits of ``laz_subprocess.FLAGS``."""
 COLOURS = ("red", "green", "blue")
 
 _SPELLINGS: Mapping[str, tuple[str, ...]] = {

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,18 @@ from mapvote.formats.reading import reading
 
 log = logging.getLogger("mapvote.formats")
 
-_MODEL, _GEODETIC, _PROJECTED, _UNIT, _VERTICAL, _VERTICAL_UNIT = 1024, 2048, 3072, 3076, 4096, 4099
+
+class GeoKey(IntEnum):
+    """Keys of GeoTIFF."""
+
+    MODEL = 1024
+    GEODETIC = 2048
+    PROJECTED = 3072
+    UNIT = 3076
+    VERTICAL = 4096
+    VERTICAL_UNIT = 4099
+
+
 _USER_DEFINED = 32767
 _MODEL_GEOGRAPHIC = 2
 
@@ -45,30 +57,30 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
 
     MapvoteError if a code is none that pyproj knows.
     """
-    code = keys.get(_PROJECTED) or 0
-    if code in (0, _USER_DEFINED) and keys.get(_MODEL) == _MODEL_GEOGRAPHIC:
-        code = keys.get(_GEODETIC) or 0
-    if code == _USER_DEFINED or (keys.get(_PROJECTED) == _USER_DEFINED):
+    code = keys.get(GeoKey.PROJECTED) or 0
+    if code in (0, _USER_DEFINED) and keys.get(GeoKey.MODEL) == _MODEL_GEOGRAPHIC:
+        code = keys.get(GeoKey.GEODETIC) or 0
+    if code == _USER_DEFINED or (keys.get(GeoKey.PROJECTED) == _USER_DEFINED):
         raise MapvoteError(
             f"{where}: describes a coordinate system of its own in GeoTIFF keys, without a code; name the one it "
             f"means with --from-crs EPSG:n, or --from-crs local for metres from somewhere"
         )
     if not code:
         return MapFrame()
-    vertical, text = keys.get(_VERTICAL, 0), f"EPSG:{code}"
+    vertical, text = keys.get(GeoKey.VERTICAL, 0), f"EPSG:{code}"
     if 0 < vertical < _USER_DEFINED:
         try:  # files often hold a code of a vertical datum, or of an ellipsoid, where that of a vertical CRS belongs
             text += f"+{vertical}" if read_crs(f"EPSG:{vertical}").is_vertical else ""
         except MapvoteError:
             log.warning("heights: EPSG:%d is no vertical coordinate system; ignored", vertical)
-    plane, up = (METRES.get(keys.get(key, 0)) for key in (_UNIT, _VERTICAL_UNIT))
+    plane, up = (METRES.get(keys.get(key, 0)) for key in (GeoKey.UNIT, GeoKey.VERTICAL_UNIT))
     return MapFrame(with_units(_known(where, text), plane, up))
 
 
 MAX_POINTS_PER_BYTE = 16
 """Real LAZ files need a byte or more for a point."""
 
-_HEAD = msgspec.json.Decoder(Head)
+_DECODER = msgspec.json.Decoder(Head)
 
 
 def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
@@ -182,7 +194,7 @@ def _apart(path: Path, *, extra: bool) -> Iterator[Cloud]:
 def _decoded(line: bytes) -> Head:
     if not line:
         raise ValueError("the LAZ reader crashed on it")
-    head = _HEAD.decode(line)
+    head = _DECODER.decode(line)
     if head.refusal:
         raise ValueError(head.refusal)
     return head
@@ -289,14 +301,14 @@ class LasSteps:
     """Resolution of coordinates in LAS files, which are whole multiples of a step from the file's offset."""
 
     length: float = 1e-4
-    """Metres, or feet: exact to 0.05 mm over 400 km."""
+    """Step of metres or feet: exact to 0.05 mm over 400 km."""
     degree: float = 1e-13
-    """Degrees, at least; else the finest that 32 bits hold, for a longitude is no short decimal."""
+    """Least step of degrees; else the finest that 32 bits hold, for a longitude is no short decimal."""
     largest: int = 2**31 - 1
-    """Steps from the offset that 32 bits hold."""
+    """Greatest number of steps from the offset: 32 bits."""
 
 
-STEPS = LasSteps()
+LAS_STEPS = LasSteps()
 
 
 def steps_and_offsets(corners: F64, *, degrees: bool) -> tuple[F64, F64]:
@@ -305,10 +317,10 @@ def steps_and_offsets(corners: F64, *, degrees: bool) -> tuple[F64, F64]:
     decimals = [6, 6, 0] if degrees else [0, 0, 0]
     middle = 0.5 * (corners[0] + corners[1])
     offsets = np.array([np.round(value, digits) for value, digits in zip(middle, decimals, strict=True)])
-    needed = np.maximum(np.abs(corners - offsets).max(axis=0), 1e-9) / STEPS.largest
+    needed = np.maximum(np.abs(corners - offsets).max(axis=0), 1e-9) / LAS_STEPS.largest
     digit = 10.0 ** (np.floor(np.log10(needed)) - 1)
     held = (np.floor(needed / digit) + 1.0) * digit
-    wanted = np.array([STEPS.degree if degrees else STEPS.length] * 2 + [STEPS.length])
+    wanted = np.array([LAS_STEPS.degree if degrees else LAS_STEPS.length] * 2 + [LAS_STEPS.length])
     return np.where(held > wanted, held, wanted), offsets
 
 

@@ -13,13 +13,13 @@ import struct
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from enum import IntEnum
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-CHUNK = 1_000_000
 FIELDS = {
     "intensity": "<u2",
     "classification": "|u1",
@@ -31,17 +31,26 @@ FIELDS = {
     "blue": "<u2",
     "las_flags": "|u1",
 }
-"""What a map keeps of a point besides x, y, z."""
+"""Fields of a point that a map keeps besides x, y, z."""
 FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
 """Bits of ``las_flags``."""
 LAYERED = 3
 """LASzip's compressor of the point formats from 6 on."""
-OVERLAP_CLASS, UNCLASSIFIED = 12, 1
-"""Up to LAS 1.3, and in point formats 0 to 5, class 12 says what the flag "overlap" says later."""
+
+
+class LasClass(IntEnum):
+    """Classes of points of the ASPRS."""
+
+    UNCLASSIFIED = 1
+    GROUND = 2
+    LOW_NOISE = 7
+    OVERLAP = 12
+    """Up to LAS 1.3, and in point formats 0 to 5; later a flag."""
+    HIGH_NOISE = 18
 
 
 class Head(msgspec.Struct):
-    """What there is besides points, or why they cannot be read."""
+    """Facts of a file besides its points, or why these cannot be read."""
 
     promised: int = 0
     """Points that the file's header counts."""
@@ -96,10 +105,10 @@ def read_head(file: Any, *, extra: bool = False) -> Head:
     )
 
 
-def read_pieces(file: Any, head: Head) -> Iterator[Piece]:
+def read_pieces(file: Any, head: Head, points_a_piece: int = 1_000_000) -> Iterator[Piece]:
     """The points of an opened LAS file and their fields; whatever laspy and lazrs raise, panics included."""
     stored = [name for name in head.fields if name != "las_flags"]
-    for chunk in file.chunk_iterator(CHUNK):
+    for chunk in file.chunk_iterator(points_a_piece):
         points = np.column_stack([np.asarray(chunk.x), np.asarray(chunk.y), np.asarray(chunk.z)])
         fields = {name: np.array(chunk[name], dtype=head.fields[name]) for name in stored}
         flags = np.zeros(len(points), np.uint8)
@@ -107,15 +116,16 @@ def read_pieces(file: Any, head: Head) -> Iterator[Piece]:
             if name in head.dimensions:
                 flags |= np.asarray(chunk[name]).astype(np.uint8) * np.uint8(bit)
         if head.point_format < 6:
-            overlapping = fields["classification"] == OVERLAP_CLASS
+            overlapping = fields["classification"] == LasClass.OVERLAP
             flags[overlapping] |= FLAGS["overlap"]
-            fields["classification"][overlapping] = UNCLASSIFIED
+            fields["classification"][overlapping] = LasClass.UNCLASSIFIED
         yield points, {**fields, "las_flags": flags}
 
 
 def points_in_chunks(path: str, start: int) -> int | None:
-    """Points that a LAZ file holds; None if its chunks do not tell. Chunks of varying size say how many points each
-    holds. Of equal chunks all but the last are full, and in the point formats from 6 on the last one counts its own.
+    """Points that a LAZ file holds; None if its chunks do not tell, or LASzip's record is damaged. Chunks of varying
+    size say how many points each holds. Of equal chunks all but the last are full, and in the point formats from 6 on
+    the last one counts its own.
 
     ``start``: where the point data begin. LASzip's VLR: 12 chunk size, 32 number of items, from 34 on type and size of
     each (2 + 2 + 2 bytes).
@@ -124,8 +134,8 @@ def points_in_chunks(path: str, start: int) -> int | None:
     import lazrs
 
     with open(path, "rb") as stream:
-        vlrs = [v for v in laspy.LasHeader.read_from(stream).vlrs if type(v).__name__ == "LasZipVlr"]
-        record = vlrs[0].record_data
+        header = laspy.LasHeader.read_from(stream)
+        record = next(v for v in header.vlrs if type(v).__name__ == "LasZipVlr").record_data
         stream.seek(start)
         chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(record))
         size = struct.unpack_from("<I", record, 12)[0]
@@ -134,6 +144,8 @@ def points_in_chunks(path: str, start: int) -> int | None:
         if struct.unpack_from("<H", record, 0)[0] != LAYERED or not chunks:
             return None
         point_bytes = sum(struct.unpack_from("<H", record, 36 + 6 * i)[0] for i in range(record[32]))
+        if point_bytes != header.point_format.size:
+            return None  # the items are damaged: what would be read as a number of points is none
         stream.seek(start + 8 + sum(n for _, n in chunks[:-1]) + point_bytes)
         return (len(chunks) - 1) * int(size) + int(struct.unpack("<I", stream.read(4))[0])
 

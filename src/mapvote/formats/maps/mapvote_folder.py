@@ -28,7 +28,7 @@ FORMAT = "mapvote-map"
 FORMAT_VERSION = 1
 MAX_PATH_BYTES = 240_000_000
 """Ten million scans: eleven days at 10 Hz."""
-_SIDE_M = np.float32(TILE_CELLS * CELL_SIZE)
+_TILE_M = np.float32(TILE_CELLS * CELL_SIZE)
 
 
 class FolderManifest(Manifest, kw_only=True):
@@ -44,7 +44,7 @@ class FolderManifest(Manifest, kw_only=True):
     """When the last drive that it was made of ended."""
 
 
-_MANIFEST = msgspec.json.Decoder(FolderManifest)
+_DECODER = msgspec.json.Decoder(FolderManifest)
 
 
 def is_map_folder(path: Path) -> bool:
@@ -85,7 +85,7 @@ def read_manifest(path: Path) -> FolderManifest:
     """The manifest of a map folder, checked; no tile is opened. MapvoteError if it is not one we can read."""
     file = path / MANIFEST
     try:
-        manifest = _MANIFEST.decode(file.read_bytes())
+        manifest = _DECODER.decode(file.read_bytes())
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a readable map manifest ({error}); copy the map again") from error
     if manifest.format != FORMAT or not 1 <= manifest.format_version <= FORMAT_VERSION:
@@ -117,7 +117,7 @@ def read_map_folder(path: Path) -> PointMap:
     def load(index: TileIndex) -> Tile:
         with _whole(path, index):
             tile = unpack_tile(manifest.lattice.tile(index), named[index], _planes(path, named[index]))
-        if not (np.isfinite(tile.points).all() and ((tile.points[:, :2] >= 0) & (tile.points[:, :2] < _SIDE_M)).all()):
+        if not (np.isfinite(tile.points).all() and ((tile.points[:, :2] >= 0) & (tile.points[:, :2] < _TILE_M)).all()):
             raise MapvoteError(f"{path}: tile {tile_key(index)} holds a point outside it or not finite; copy it again")
         return tile
 

@@ -15,12 +15,10 @@ import numpy as np
 
 from mapvote.core.types import Bool, MapvoteError
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.field_names import LAS_FLAGS
+from mapvote.formats.maps.laz_subprocess import FLAGS, LasClass
 
 log = logging.getLogger("mapvote.formats")
 
-NOISE_CLASSES = (7, 18)
-"""ASPRS classes: low noise, high noise."""
 MARKS = {
     "withheld": "withheld",
     "noise": "noise (classes 7 and 18)",
@@ -45,11 +43,15 @@ def marked(cloud: Cloud, mark: str) -> Bool:
     """Which points (n,) of a cloud bear a mark."""
     if mark == "noise":
         classes = cloud.fields.get("classification")
-        return np.zeros(len(cloud.points), np.bool_) if classes is None else np.isin(classes, NOISE_CLASSES)
+        return (
+            np.zeros(len(cloud.points), np.bool_)
+            if classes is None
+            else np.isin(classes, (LasClass.LOW_NOISE, LasClass.HIGH_NOISE))
+        )
     flags = cloud.fields.get("las_flags")
     if flags is None:
         return np.zeros(len(cloud.points), np.bool_)
-    return np.asarray(flags.astype(np.uint8) & LAS_FLAGS[mark] > 0)
+    return np.asarray(flags.astype(np.uint8) & FLAGS[mark] > 0)
 
 
 @dataclass(slots=True)

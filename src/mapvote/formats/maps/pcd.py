@@ -6,6 +6,7 @@ import os
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
@@ -14,15 +15,23 @@ import lzf
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.listing import entry, files_like
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, log, table_of, warn_of_float32
+from mapvote.formats.maps.cloud import (
+    READ_SIZES,
+    Cloud,
+    CloudPieces,
+    ReadSizes,
+    cloud_of_table,
+    log,
+    table_of,
+    warn_of_float32,
+)
 from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
 from mapvote.formats.reading import reading
 
-_BLOCK = 500_000
-"""Points read at a time."""
 _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
 _MOST_EXPANDED = 300
@@ -32,10 +41,22 @@ _GRID_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}")
 _PLACE_TILE = re.compile(r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?", re.IGNORECASE)
 """By metres of UTM or Gauss-Krueger (412340_5423980), or with a word before them (map_0_0): scans may be named so, too,
 which their points tell."""
-_COMPARED, _COMPARED_POINTS = 6, 20_000
-"""Tiles whose boxes are compared with the next one's, and the points of each that are read."""
-_MOST_COMMON = 0.2
-"""Share of the smaller box of two tiles in turn that may lie in the other one's. Scans of a drive share most."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class TileRule:
+    """When files that may be tiles or scans lie side by side, and so are tiles."""
+
+    tiles: int = 6
+    """Tiles whose boxes are compared with the next one's."""
+    points: int = 20_000
+    """Points of each tile that are read."""
+    most_common: float = 0.2
+    """Share of the smaller box of two tiles in turn that may lie in the other one's; scans of a drive share most."""
+
+
+TILE_RULE = TileRule()
 
 
 def is_pcd_tiles(path: Path) -> bool:
@@ -53,13 +74,13 @@ def is_pcd_tiles(path: Path) -> bool:
     return all(_PLACE_TILE.fullmatch(name) for name in names) and _lie_side_by_side(files_like(path, "*.pcd"))
 
 
-def _lie_side_by_side(files: list[Path]) -> bool:
+def _lie_side_by_side(files: list[Path], rule: TileRule = TILE_RULE) -> bool:
     """Whether the first points of files in turn lie in boxes that hardly overlap, seen from above. False if the files
     cannot be read: a reader says why."""
     boxes = []
-    for file in files[: _COMPARED + 1]:
+    for file in files[: rule.tiles + 1]:
         try:
-            points = next(stream_pcd(file)).points[:_COMPARED_POINTS, :2]
+            points = next(stream_pcd(file)).points[: rule.points, :2]
         except (MapvoteError, StopIteration):
             return False
         points = points[np.isfinite(points).all(axis=1)]
@@ -70,7 +91,7 @@ def _lie_side_by_side(files: list[Path]) -> bool:
         both = np.maximum(np.minimum(high_a, high_b) - np.maximum(low_a, low_b), 0.0).prod()
         smaller = min((high_a - low_a).prod(), (high_b - low_b).prod())
         common.append(float(both / max(smaller, 1e-9)))
-    return bool(common) and float(np.median(common)) < _MOST_COMMON
+    return bool(common) and float(np.median(common)) < rule.most_common
 
 
 def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
@@ -86,7 +107,7 @@ def read_pcd_table(path: Path) -> NDArray[np.void]:
     """
     with reading(path, "PCD file"), path.open("rb") as file:
         header = read_header(str(path), file)
-        tables = list(_tables(path, file, header))
+        tables = list(_tables(path, file, header, READ_SIZES.block))
     return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
@@ -96,7 +117,7 @@ def read_viewpoint(path: Path) -> F64:
         return np.array(read_header(str(path), file).viewpoint, dtype=np.float64)
 
 
-def stream_pcd(path: Path) -> Iterator[Cloud]:
+def stream_pcd(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
     """The points of a PCD file, piece by piece (binary_compressed, one block by its nature, in one); its VIEWPOINT is
     not applied: map points are in map metres already. MapvoteError as :func:`read_pcd_table`.
 
@@ -104,7 +125,7 @@ def stream_pcd(path: Path) -> Iterator[Cloud]:
     with reading(path, "PCD file"), path.open("rb") as file:
         header = read_header(str(path), file)
         empty_rays = 0
-        for table in _tables(path, file, header):
+        for table in _tables(path, file, header, sizes.block):
             cloud = cloud_of_table(str(path), table)
             if header.is_organised:
                 measured = _measured(cloud.points)
@@ -121,26 +142,26 @@ def _measured(points: NDArray[np.floating]) -> Bool:
     return np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1))
 
 
-def _tables(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+def _tables(path: Path, file: BinaryIO, header: PcdHeader, block: int) -> Iterator[NDArray[np.void]]:
     """The points that follow the header, block by block, their number checked; one empty block if there are none."""
     if header.points == 0:
         yield np.empty(0, header.layouts()[0])
     elif header.encoding == "ascii":
-        yield from _ascii(path, file, header)
+        yield from _ascii(path, file, header, block)
     elif header.encoding == "binary":
-        yield from _binary(path, file, header)
+        yield from _binary(path, file, header, block)
     else:
         yield _compressed(path, file, header)
         _check_end(path, header, _bytes_left(file))
 
 
-def _binary(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+def _binary(path: Path, file: BinaryIO, header: PcdHeader, block: int) -> Iterator[NDArray[np.void]]:
     there = path.stat().st_size - file.tell()
     sizes = {layout.itemsize * header.points: layout for layout in header.layouts()}
     dtype = sizes.get(there, header.layouts()[0])
     left = header.points
     while left > 0:
-        raw = file.read(min(left, _BLOCK) * dtype.itemsize)
+        raw = file.read(min(left, block) * dtype.itemsize)
         table = np.frombuffer(raw[: len(raw) // dtype.itemsize * dtype.itemsize], dtype=dtype)
         left -= len(table)
         if not len(table):
@@ -149,7 +170,7 @@ def _binary(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[n
     _check_end(path, header, _bytes_left(file) // dtype.itemsize)
 
 
-def _ascii(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np.void]]:
+def _ascii(path: Path, file: BinaryIO, header: PcdHeader, most: int) -> Iterator[NDArray[np.void]]:
     lines = _DataLines(file, header.lines)
     rows = iter(lines)
     first = next(rows, b"")
@@ -158,7 +179,7 @@ def _ascii(path: Path, file: BinaryIO, header: PcdHeader) -> Iterator[NDArray[np
     left = header.points
     rows = chain([first] if first else [], rows)
     while left > 0:
-        block = list(islice(rows, min(left, _BLOCK)))
+        block = list(islice(rows, min(left, most)))
         if not block:
             raise _cut_off(path, header.points - left, header)
         left -= len(block)

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.maps.cloud import Cloud, CloudPieces, cloud_of_table, table_of
+from mapvote.formats.maps.cloud import READ_SIZES, Cloud, CloudPieces, ReadSizes, cloud_of_table, table_of
 from mapvote.formats.reading import reading
 
-_BLOCK = 500_000
-"""Vertices handed on at a time."""
 _LONGEST_HEADER = 100_000
 """Bytes."""
 _TYPES = {
@@ -27,14 +25,14 @@ _TYPES = {
 _MEND = "correct the numbers of elements in the header, or export it again"
 
 
-def stream_ply(path: Path) -> Iterator[Cloud]:
+def stream_ply(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
     """The vertices of a PLY file with the fields that a map keeps, piece by piece. MapvoteError as
     :func:`stream_ply_tables`."""
-    for table in stream_ply_tables(path):
+    for table in stream_ply_tables(path, sizes):
         yield cloud_of_table(str(path), table)
 
 
-def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
+def stream_ply_tables(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[NDArray[np.void]]:
     """The vertices of a PLY file, ascii or binary, float or double, as structured arrays with every property; faces are
     ignored. Binary vertices without lists stay on disk until their piece is read. MapvoteError if the file is damaged
     or holds no element "vertex"."""
@@ -52,8 +50,8 @@ def stream_ply_tables(path: Path) -> Iterator[NDArray[np.void]]:
             raise ValueError("it holds no element vertex")
         vertices = file["vertex"].data
         vertices = vertices[[name for name in vertices.dtype.names if not vertices.dtype[name].hasobject]]  # no lists
-        for start in range(0, max(len(vertices), 1), _BLOCK):
-            part = np.array(vertices[start : start + _BLOCK])
+        for start in range(0, max(len(vertices), 1), sizes.block):
+            part = np.array(vertices[start : start + sizes.block])
             yield part.astype(part.dtype.newbyteorder("="))
 
 

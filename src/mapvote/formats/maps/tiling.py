@@ -26,14 +26,12 @@ from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, in_memory_if_small, lattice_of
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, MapvoteError
-from mapvote.formats.drives.point_fields import MAX_BAD_SHARE
+from mapvote.formats.drives.point_fields import POINT_RULE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
-from mapvote.formats.maps.cloud import GROUND, Cloud, joined
+from mapvote.formats.maps.cloud import READ_SIZES, Cloud, ReadSizes, joined
 from mapvote.formats.maps.field_names import kept_fields
-
-_IN_MEMORY = 64 << 20
-"""Bytes that are not worth a file."""
+from mapvote.formats.maps.laz_subprocess import LasClass
 
 Columns = dict[str, NDArray[Any]]
 
@@ -50,10 +48,11 @@ def on_earth(points: NDArray[np.floating]) -> Bool:
 class Spill:
     """Blocks of columns, written once, read back in any order."""
 
-    def __init__(self, folder: Path | None = None) -> None:
+    def __init__(self, folder: Path | None = None, sizes: ReadSizes = READ_SIZES) -> None:
         """``folder``: where there is room; else the system's place for temporary files."""
         self._folder = folder
-        self._file = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY, dir=str(folder) if folder else None)  # noqa: SIM115
+        place = str(folder) if folder else None
+        self._file = tempfile.SpooledTemporaryFile(max_size=sizes.in_memory_bytes, dir=place)  # noqa: SIM115
         self.close = weakref.finalize(self, self._file.close)
         """Let go of the file."""
         self._blocks: list[tuple[int, dict[str, tuple[np.dtype[Any], tuple[int, ...]]]]] = []
@@ -93,18 +92,16 @@ class Spill:
 
 log = logging.getLogger("mapvote.formats")
 
-_SOME = 1_000_000
-"""Points used to distinguish degrees from metres; and points in a piece."""
 _XYZ = "xyz"
 GPS_TIMES = "gps_times"
-"""What a map says of its points' times among its georeference, as ``Cloud.gps_times``."""
+"""Key of a map's georeference: times of its points, as ``Cloud.gps_times``."""
 
 Pieces = Callable[[], Iterator[NDArray[np.floating]]]
 """Points (n, 3) of a map, metres, from the start, piece by piece: as often as it is called."""
 Look = Callable[[Pieces, Pieces], None]
 """Given all points of a map, and those that the file classifies as ground; raises MapvoteError to stop."""
 UNCHECKED = "unchecked"
-"""What a map says among its georeference if its points were taken although a check refused them."""
+"""Key of a map's georeference if its points were taken although a check refused them."""
 
 
 def in_map_metres(
@@ -114,11 +111,11 @@ def in_map_metres(
     first: list[Cloud] = []
     for piece in pieces:
         first.append(piece)
-        if sum(len(p.points) for p in first) >= _SOME:
+        if sum(len(p.points) for p in first) >= READ_SIZES.piece:
             break
     if not first:
         return
-    frame, convert = settle(where, first[0].frame, wanted, joined(first).points[:_SOME], sure=sure)
+    frame, convert = settle(where, first[0].frame, wanted, joined(first).points[: READ_SIZES.piece], sure=sure)
     for piece in chain(first, pieces):
         yield replace(piece, points=convert(piece.points), frame=frame)
 
@@ -126,7 +123,7 @@ def in_map_metres(
 def grounded(columns: Mapping[str, NDArray[Any]], points: NDArray[np.floating]) -> NDArray[np.floating]:
     """Those of a block's ``points`` (n, 3) that its file classifies as ground; none if it has no classes."""
     classes = columns.get("classification")
-    return points[:0] if classes is None else points[classes == GROUND]
+    return points[:0] if classes is None else points[classes == LasClass.GROUND]
 
 
 def map_of(
@@ -134,7 +131,8 @@ def map_of(
     pieces: Iterable[Cloud],
     folder: Path | None = None,
     look: Look | None = None,
-    most_bad: float = MAX_BAD_SHARE,
+    most_bad: float = POINT_RULE.most_bad_share,
+    sizes: ReadSizes = READ_SIZES,
 ) -> PointMap:
     """The map of a cloud in pieces: tiles cut, ground computed, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
@@ -143,7 +141,7 @@ def map_of(
     ``look`` gets the points before tiles are cut and the ground is computed.
     MapvoteError if the cloud is empty or more than ``most_bad`` of it is not finite.
     """
-    taken = _Taken(where, Spill(folder), most_bad)
+    taken = _Taken(where, Spill(folder, sizes), most_bad)
     for piece in pieces:
         taken.take(piece)
     lattice = taken.lattice()
@@ -152,7 +150,7 @@ def map_of(
             lambda: (block[_XYZ] for block in taken.blocks()),
             lambda: (grounded(block, block[_XYZ]) for block in taken.blocks()),
         )
-    parts = _Parts(lattice, Spill(folder))
+    parts = _Parts(lattice, Spill(folder, sizes))
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
     done = 0
     for block in taken.blocks():
@@ -173,7 +171,7 @@ class _Taken:
 
     where: str
     spill: Spill
-    most_bad: float = MAX_BAD_SHARE
+    most_bad: float = POINT_RULE.most_bad_share
     frame: MapFrame = field(default_factory=MapFrame)
     total: int = 0
     bad: int = 0
@@ -199,8 +197,8 @@ class _Taken:
             return
         self._low = np.minimum(self._low, columns[_XYZ].min(axis=0))
         self._high = np.maximum(self._high, columns[_XYZ].max(axis=0))
-        for start in range(0, len(columns[_XYZ]), _SOME):
-            self.spill.add({name: column[start : start + _SOME] for name, column in columns.items()})
+        for start in range(0, len(columns[_XYZ]), READ_SIZES.piece):
+            self.spill.add({name: column[start : start + READ_SIZES.piece] for name, column in columns.items()})
 
     def georeference(self) -> dict[str, str]:
         """What the map says of its coordinates and times."""
@@ -247,7 +245,7 @@ class _Parts:
         for index, mine in cut_tiles(block[_XYZ], self._lattice):
             part = {name: column[mine] for name, column in block.items()}
             part[_XYZ] = self._lattice.tile(index).from_map(part[_XYZ])
-            if (part.get("classification", np.empty(0)) == GROUND).any():
+            if (part.get("classification", np.empty(0)) == LasClass.GROUND).any():
                 self._grounded.add(index)
             self._blocks.setdefault(index, []).append(self._spill.add(part))
             self.points[index] = self.points.get(index, 0) + len(mine)
@@ -266,7 +264,7 @@ class _Parts:
 
         def ask(index: TileIndex) -> Heights:
             columns = self.read(index)
-            points = columns[_XYZ][columns["classification"] == GROUND] if of_ground else columns[_XYZ]
+            points = columns[_XYZ][columns["classification"] == LasClass.GROUND] if of_ground else columns[_XYZ]
             return flat_cells(self._lattice.tile(index), points), points[:, 2]
 
         return _Asked(self._grounded if of_ground else self.points, ask)
