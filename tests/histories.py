@@ -74,11 +74,14 @@ class History:
     def policy(self, settings: FuseSettings) -> None:
         self.store.set_policy(Policy(fuse=settings))
 
-    def live(self, steps: int) -> None:
-        """So many steps; AssertionError, naming the step, at the first difference."""
+    def live(self, steps: int, troubled: bool = False) -> None:
+        """So many steps; AssertionError, naming the step, at the first difference. In a ``troubled`` history every
+        other step goes back, takes a vehicle out or clears away."""
         acts = [self.vote] * 8 + [self.round] * 8 + [self.publish] * 2 + [self.world] * 5
         acts += [self.again, self.back, self.take_out, self.other_policy, self.without, self.race]
         acts += [self.review, self.let_go, self.clear_away] + [self.part] * 3
+        if troubled:
+            acts += [self.back] * 8 + [self.without] * 7 + [self.take_out] * 2 + [self.clear_away] * 7
         for step in range(steps):
             act = self.rng.choice(acts)
             self.clock.now += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S]) * 10**9
@@ -261,7 +264,7 @@ class History:
 
     def without(self) -> None:
         vehicle = self.rng.choice(VEHICLES)
-        with suppress(NotFound):
+        if any(cast.vehicle == vehicle for cast in self.rules.casts):
             replay(self.store, vehicle, dry_run=False)
             self.rules.replay(vehicle, self.now_s)
 
@@ -315,11 +318,12 @@ def seen_along(way: str, by: int) -> U8:
     return np.where(np.roll(_mask(way), by, axis=1), np.uint8(UE), np.uint8(NO_VOTE))
 
 
-def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> str | None:
-    """One history; what the store and the rules disagree on, None if on nothing."""
+def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40, *, troubled: bool = False) -> str | None:
+    """One history; what the store and the rules disagree on, None if on nothing. ``troubled``: with many rollbacks,
+    vehicles taken out, replays and clearings."""
     history = History(seed, make_store)
     try:
-        history.live(steps)
+        history.live(steps, troubled)
     except (AssertionError, MapvoteError) as error:
         return f"seed {seed}: {type(error).__name__} {error}"
     finally:

@@ -21,7 +21,7 @@ from mapvote.core.types import MapvoteError
 from mapvote_server.errors import NotFound
 from mapvote_server.store import schema
 from mapvote_server.store.database import Question, insert_rows, is_sound
-from mapvote_server.store.queries import log_event, oldest_kept, shows_in_kept
+from mapvote_server.store.queries import log_event, oldest_kept, shows_in_kept, shows_in_target
 from mapvote_server.store.store import Store
 
 _BATCH = 500
@@ -86,23 +86,23 @@ def _wrong(digest: str, data: bytes) -> str:
 
 
 def _chain(connection: sa.Connection) -> Iterator[Damage]:
-    """Versions follow each other, and every plane that they name is there."""
+    """Versions follow each other, and every plane is there that a kept version or a replay needs."""
     v, t = schema.versions, schema.version_tiles
     last = None
     for number, parent in connection.execute(sa.select(v.c.number, v.c.parent).order_by(v.c.number)):
         if parent != last or (last is not None and number != last + 1):
             yield Damage("version", str(number), f"follows version {parent}, not {last}")
         last = number
-    kept = shows_in_kept(oldest_kept(connection))
+    oldest = oldest_kept(connection)
+    needed = shows_in_kept(oldest) | shows_in_target(oldest)
     for name in schema.TILE_PLANES:
         column = t.c[name]
         lost = sa.select(t.c.version, t.c.row, t.c.col, column).join(
             schema.blobs, schema.blobs.c.hash == column, isouter=True
         )
-        for row in connection.execute(lost.where(column.is_not(None), schema.blobs.c.hash.is_(None), kept)):
-            yield Damage(
-                "plane", row[3], f"{name} of tile {tile_key((row.row, row.col))} in version {row.version} is lost"
-            )
+        for row in connection.execute(lost.where(column.is_not(None), schema.blobs.c.hash.is_(None), needed)):
+            lacks = f"{name} of tile {tile_key((row.row, row.col))} in version {row.version} is lost"
+            yield Damage("plane", row[3], lacks)
 
 
 def _rows(connection: sa.Connection) -> Iterator[Damage]:

@@ -52,10 +52,23 @@ def oldest_kept(connection: sa.Connection) -> int:
 
 def shows_in_kept(oldest: int) -> sa.ColumnElement[bool]:
     """For a row of version_tiles: whether a version from ``oldest`` on shows that tile."""
+    return (schema.version_tiles.c.version >= oldest) | _shown_by(sa.literal(oldest))
+
+
+def shows_in_target(oldest: int) -> sa.ColumnElement[bool]:
+    """For a row of version_tiles: whether a version before ``oldest`` shows that tile to which a rollback after
+    ``oldest`` went back. A replay goes through that rollback again, so it needs what the tile remembered then."""
+    v = schema.versions.alias()
+    back = (v.c.kind == "rollback") & (v.c.number > oldest) & (v.c.target < oldest)
+    return sa.exists().where(back, _shown_by(v.c.target, v)).correlate(schema.version_tiles)
+
+
+def _shown_by(number: sa.ColumnElement[int], *beside: sa.FromClause) -> sa.ColumnElement[bool]:
+    """For a row of version_tiles: whether it is the last one of its tile up to version ``number``, a column of
+    ``beside``."""
     t, later = schema.version_tiles, schema.version_tiles.alias()
     same = (later.c.row == t.c.row) & (later.c.col == t.c.col) & (later.c.version > t.c.version)
-    hidden = sa.exists().where(same, later.c.version <= oldest)
-    return (t.c.version >= oldest) | ~hidden
+    return (t.c.version <= number) & ~sa.exists().where(same, later.c.version <= number).correlate(t, *beside)
 
 
 def tiles_of(

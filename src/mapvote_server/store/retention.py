@@ -1,7 +1,7 @@
 """Retention: deletes planes and decisions of old versions, and ballots that can decide nothing more.
 
 The rows that record a version or a ballot stay. From the oldest kept version on, publish, rollback and replay work as
-before.
+before: planes of an older version stay as long as a kept rollback went back to that version.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.store import schema
 from mapvote_server.store.database import MOST_ASKED
 from mapvote_server.store.policy import Policy, policy_in
-from mapvote_server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, version_of
+from mapvote_server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, shows_in_target, version_of
 from mapvote_server.store.store import Store
 
 
@@ -66,9 +66,10 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
 
 
 def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
-    """Planes that no version from ``oldest`` on shows."""
+    """Planes that no version from ``oldest`` on shows, and no version to which one of these went back."""
     t, b, planes = schema.version_tiles, schema.blobs, schema.TILE_PLANES
-    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shows_in_kept(oldest)) for name in planes))
+    shown = shows_in_kept(oldest) | shows_in_target(oldest)
+    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shown) for name in planes))
     unused = sa.select(b.c.hash, sa.func.length(b.c.data).label("size")).where(b.c.hash.not_in(needed))
     return list(connection.execute(unused).all())
 

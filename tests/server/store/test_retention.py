@@ -123,3 +123,41 @@ def test_the_policy_clears_by_itself_and_keeps_everything_unless_told(store: Sto
     assert clear(store).versions == 0
     with pytest.raises(NotFound, match="the oldest that is kept is 6"):
         store.point_map(5)
+
+
+def go_back_behind_what_is_kept(store: Store, clock: Clock) -> None:
+    """Versions 2 and 3 published, 4 back to 2, 5 published; of these the last three are kept."""
+    come_and_go(store, clock, 2)
+    rollback(store, 2)
+    clock.now += DAY_NS
+    say = Say(states_plane({(30, 30): CellState.CHANGED_OCCUPIED}), new_points=wall([(30, 30)], [0.45]))
+    send(store, *(make_ballot(store.point_map(), {(0, 0): say}, name, "d", clock.now) for name in ("a", "c")))
+    assert publish(store).version == 5
+    clear(store, dry_run=False)
+
+
+def test_a_vehicle_is_taken_out_after_a_rollback_behind_what_is_kept(
+    store: Store, clock: Clock, tmp_path: Path
+) -> None:
+    """The map is the one of a store that keeps everything."""
+    go_back_behind_what_is_kept(store, clock)
+    assert check(store) == []
+    replay(store, "c", dry_run=False)
+    cleared = [pack_tile(tile) for tile in store.point_map().tiles.values()]
+    other_clock = Clock(START_NS)
+    other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", two_walls(), Policy(fuse=FUSE), clock=other_clock)
+    go_back_behind_what_is_kept(other, other_clock)
+    assert [v.number for v in other.versions() if v.cleared_seq is None][0] == 1
+    replay(other, "c", dry_run=False)
+    assert cleared == [pack_tile(tile) for tile in other.point_map().tiles.values()]
+    other.close()
+
+
+def test_a_check_names_what_a_replay_would_lack(store: Store, clock: Clock) -> None:
+    go_back_behind_what_is_kept(store, clock)
+    t, b = schema.version_tiles.c, schema.blobs
+    with store.database.writing() as connection:
+        memory = connection.execute(sa.select(t.memory).where(t.version == 2)).scalar_one()
+        connection.execute(b.delete().where(b.c.hash == memory))
+    damage = [str(one) for one in check(store)]
+    assert damage == [f"plane {memory}: memory of tile 0,0 in version 2 is lost"]

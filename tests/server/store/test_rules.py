@@ -35,8 +35,8 @@ def sqlite_stores(tmp_path: Path) -> MakeStore:
     return lambda clock: Store.open(f"sqlite:///{shutil.copy(first, tmp_path / f'{next(names)}.db')}", clock=clock)
 
 
-def disagreements(make: MakeStore, seeds: range, steps: int = 25) -> list[str]:
-    return [found for seed in seeds if (found := live(seed, make, steps)) is not None]
+def disagreements(make: MakeStore, seeds: range, steps: int = 25, *, troubled: bool = False) -> list[str]:
+    return [found for seed in seeds if (found := live(seed, make, steps, troubled=troubled)) is not None]
 
 
 def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
@@ -65,6 +65,12 @@ def test_what_was_read_before_changes_nothing_that_is_decided(
 @pytest.mark.slow
 def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> None:
     assert disagreements(sqlite_stores, range(4, 4 + int(os.environ.get("HISTORIES", "166")))) == []
+
+
+@pytest.mark.slow
+def test_no_replay_fails_in_histories_full_of_rollbacks_and_clearings(sqlite_stores: MakeStore) -> None:
+    seeds = range(1_000, 1_000 + int(os.environ.get("HISTORIES", "300")))
+    assert disagreements(sqlite_stores, seeds, troubled=True) == []
 
 
 @pytest.mark.slow
