@@ -29,6 +29,7 @@ from mapvote.core.point_map import PointMap, made_in_turn
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import write_whole
+from mapvote.formats.reading import read_bytes, read_head
 
 Sent = Literal["created", "replaced", "repeated", "spooled"]
 Region = tuple[float, float, float, float]
@@ -107,17 +108,16 @@ class MapClient:
 
     def has(self, planes: TileHashes) -> bool:
         """Whether a tile can be read without a request."""
-        return all((self._planes / digest).exists() for digest in planes.planes().values())
+        return all((self._planes / digest).is_file() for digest in planes.planes().values())
 
     def points_of(self, planes: TileHashes) -> int:
         """How many points a tile has that :meth:`has` been downloaded."""
-        with (self._planes / planes.points).open("rb") as frame:
-            return points_in_plane(frame.read(FRAME_HEAD), planes.points)
+        return points_in_plane(read_head(self._planes / planes.points, FRAME_HEAD), planes.points)
 
     def download(self, planes: TileHashes) -> None:
         """Have the planes of a tile that ``home`` lacks. Raises as :meth:`fetch`."""
         for digest in planes.planes().values():
-            if not (self._planes / digest).exists():
+            if not (self._planes / digest).is_file():
                 self._plane(digest)
 
     def forget(self, needed: Iterable[TileHashes]) -> None:
@@ -206,14 +206,14 @@ class MapClient:
     def _decoded(self, content: bytes) -> Manifest:
         try:
             return _DECODER.decode(content)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
     def kept_manifest(self) -> Manifest | None:
         """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
         try:
-            return _DECODER.decode(self._kept_manifest.read_bytes())
-        except (OSError, msgspec.DecodeError):
+            return _DECODER.decode(read_bytes(self._kept_manifest))
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return None
 
     def _keep(self, manifest: Manifest) -> Manifest:
@@ -227,8 +227,8 @@ class MapClient:
     def _plane(self, digest: str) -> bytes:
         """The zstd frame of a plane."""
         kept = self._planes / digest
-        if kept.exists():
-            frame = kept.read_bytes()
+        if kept.is_file():
+            frame = read_bytes(kept)
             with suppress(MapvoteError):  # damaged on this disk: fetched again
                 check_plane(frame, digest)
                 os.utime(kept)

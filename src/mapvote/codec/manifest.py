@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import Annotated
 
 import msgspec
 
@@ -17,16 +18,22 @@ DIGESTS = 1 << 256
 """Sums of hashes are taken modulo this."""
 
 
+Digest = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+"""A SHA-256 in hex. A plane's digest becomes the name of its file, so a decoder takes no other text."""
+TileKey = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]{1,7},-?[0-9]{1,7}\Z")]
+"""Row and column of a tile: "row,col"."""
+
+
 class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
     """SHA-256 of the planes of one tile; None for a plane that it has not."""
 
-    points: str
+    points: Digest
     """What ballots name as their base."""
-    ground: str
-    free: str | None
-    memory: str | None = None
+    ground: Digest
+    free: Digest | None
+    memory: Digest | None = None
     """What a server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
-    fields: str | None = None
+    fields: Digest | None = None
     """What the points carry besides their place."""
 
     @classmethod
@@ -64,10 +71,10 @@ class Manifest(msgspec.Struct, omit_defaults=True, kw_only=True):
     version: int
     lattice: Lattice
     georeference: dict[str, str]
-    tiles: dict[str, TileHashes]
+    tiles: dict[TileKey, TileHashes]
     digest: str
     """Of all tiles of the version, also where only some are listed: 64 hexadecimal digits of :func:`digests_of`."""
-    removed: list[str]
+    removed: list[TileKey]
     """Tiles that the other version has and this one has not."""
     fields_digest: str = ""
     """Of the fields of their points; "" where there are none."""

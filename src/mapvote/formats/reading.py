@@ -3,18 +3,62 @@
 from __future__ import annotations
 
 import codecs
+import errno
+import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from mapvote.core.types import MapvoteError
+
+MOST_BYTES = 4_000_000_000
+"""Of a file that is read whole."""
+
+
+def read_bytes(file: Path, most: int = MOST_BYTES) -> bytes:
+    """The content of a regular file. OSError if it cannot be read, has more than ``most`` bytes, or is a pipe, a device
+    or a socket: reading one of these waits or goes on for ever."""
+    if _regular(file).st_size > most:
+        raise OSError(errno.EFBIG, f"larger than {most:,} bytes", str(file))
+    return file.read_bytes()
+
+
+def read_head(file: Path, size: int) -> bytes:
+    """The first bytes of a regular file; OSError as :func:`read_bytes`."""
+    _regular(file)
+    with file.open("rb") as stream:
+        return stream.read(size)
+
+
+def _regular(file: Path) -> os.stat_result:
+    state = file.stat()
+    if not stat.S_ISREG(state.st_mode):
+        raise OSError(errno.EINVAL, "no regular file", str(file))
+    return state
+
+
+def read_yaml(file: Path) -> Any:
+    """The content of a YAML file; MapvoteError if it cannot be read or is none."""
+    return parse_yaml(read_text(file), str(file))
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The content of a YAML text; MapvoteError, by the name of ``where`` it stands, if it is none."""
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, RecursionError) as error:
+        raise MapvoteError(f"{where}: cannot be read ({first_line(error)})") from error
 
 
 def read_text(file: Path) -> str:
     """The whole text of a file, UTF-8, or UTF-16 with a byte order mark; MapvoteError if it cannot be read or is not
     text."""
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
         wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         text = data.decode("utf-16" if wide else "utf-8-sig")
         return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -26,13 +26,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import yaml
 
 from mapvote.core.types import MapvoteError
+from mapvote.formats.listing import plain
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
 from mapvote.formats.maps.cloud import joined
 from mapvote.formats.maps.pcd import stream_pcd
-from mapvote.formats.reading import first_line
+from mapvote.formats.reading import first_line, read_yaml
 from mapvote.live.dds import Network, Publication, Subscription
 from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
 
@@ -106,7 +106,7 @@ class MapLoader:
             self.cells = cells
         except FileNotFoundError:
             return False
-        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise MapvoteError(f"{file}: not Autoware's metadata ({first_line(error)})") from error
         return True
 
@@ -172,13 +172,13 @@ class MapLoader:
 
 def _read_table(file: Path) -> dict[str, Cell]:
     """The tiles in Autoware's metadata, by id. Raises what yaml and the conversions raise if it is none."""
-    table = yaml.safe_load(file.read_text())
+    table = read_yaml(file)
     width = float(table.pop("x_resolution"))
     height = float(table.pop("y_resolution"))
     if not table:
         raise ValueError("it lists no tile")
     return {
-        name: Cell(name, float(x), float(y), float(x) + width, float(y) + height)
+        plain(name, file): Cell(name, float(x), float(y), float(x) + width, float(y) + height)
         for name, (x, y) in sorted(table.items())
     }
 

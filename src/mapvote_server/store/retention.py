@@ -17,7 +17,14 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.store import schema
 from mapvote_server.store.database import MOST_ASKED
 from mapvote_server.store.policy import Policy, policy_in
-from mapvote_server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, shows_in_target, version_of
+from mapvote_server.store.queries import (
+    current_number,
+    log_event,
+    oldest_kept,
+    shows_in_kept,
+    shows_in_target,
+    version_of,
+)
 from mapvote_server.store.store import Store
 
 

@@ -147,7 +147,7 @@ def test_a_vehicle_is_taken_out_after_a_rollback_behind_what_is_kept(
     other_clock = Clock(START_NS)
     other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", two_walls(), Policy(fuse=FUSE), clock=other_clock)
     go_back_behind_what_is_kept(other, other_clock)
-    assert [v.number for v in other.versions() if v.cleared_seq is None][0] == 1
+    assert next(v.number for v in other.versions() if v.cleared_seq is None) == 1
     replay(other, "c", dry_run=False)
     assert cleared == [pack_tile(tile) for tile in other.point_map().tiles.values()]
     other.close()

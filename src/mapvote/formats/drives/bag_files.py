@@ -15,10 +15,8 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-import yaml
-
 from mapvote.core.types import MapvoteError
-from mapvote.formats.reading import first_line
+from mapvote.formats.reading import first_line, read_yaml
 
 STORAGES = (".mcap", ".db3", ".bag")
 UNFINISHED = ".active"
@@ -127,11 +125,11 @@ def _wrong_in_metadata(about: Path) -> str:
     """Why the reader cannot use a metadata.yaml, "" if it can. What compresses messages is written nowhere else, so
     such a file is left to the reader."""
     try:
-        table = yaml.safe_load(about.read_text())["rosbag2_bagfile_information"]
+        table = read_yaml(about)["rosbag2_bagfile_information"]
         storage, listed = table["storage_identifier"], table["relative_file_paths"]
         missing = [name for name in listed if not (about.parent / Path(name).name).is_file()]
         table["topics_with_message_count"], table["version"]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+    except (MapvoteError, KeyError, TypeError) as error:
         return f"not the metadata of a bag ({first_line(error)})"
     if table.get("compression_mode", "").lower() not in ("", "none"):
         return ""

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
@@ -49,8 +49,9 @@ from mapvote.formats.drives.trajectory import (
     sorted_trajectory,
 )
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, utm_of
-from mapvote.formats.listing import entry, files_like
+from mapvote.formats.listing import below, entry, files_like
 from mapvote.formats.maps.pcd import read_pcd_table
+from mapvote.formats.reading import read_bytes as whole_file
 from mapvote.formats.reading import read_text
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
@@ -151,30 +152,62 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
         stamps = np.array([stamp_in_name_ns(f) for f in files], dtype=np.int64)
         return open_scan_folder(path, options, ScanFolder(files, stamps, read))
     rows = _scene(path, tables, options.topic)
-    files = [path / row["filename"] for row in rows]
-    stamps = np.array([row["timestamp"] * 1000 for row in rows], dtype=np.int64)
-    poses, mounts = _nuscenes_table(tables / "ego_pose.json"), _nuscenes_table(tables / "calibrated_sensor.json")
-    T_base_lidar = _nuscenes_poses([mounts[rows[0]["calibrated_sensor_token"]]])[0]
+    files = [path / row.filename for row in rows]
+    stamps = np.array([row.timestamp * 1000 for row in rows], dtype=np.int64)
+    T_base_lidar = _nuscenes_poses(tables / "calibrated_sensor.json", [rows[0].calibrated_sensor_token])[0]
     T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ _NUSCENES_AXES
-    T_map_base = _nuscenes_poses([poses[row["ego_pose_token"]] for row in rows])
+    T_map_base = _nuscenes_poses(tables / "ego_pose.json", [row.ego_pose_token for row in rows])
     folder = ScanFolder(files, stamps, read, lambda: T_map_base @ T_base_lidar, T_base_lidar=T_base_lidar)
     return open_scan_folder(path, options, folder)
 
 
-def _scene(path: Path, tables: Path, wanted: str | None) -> list[dict[str, Any]]:
+class _Named(msgspec.Struct):
+    """A row of nuScenes' scene.json."""
+
+    token: str
+    name: str
+
+
+class _Sample(msgspec.Struct):
+    """A row of sample.json."""
+
+    token: str
+    scene_token: str
+
+
+class _Recorded(msgspec.Struct):
+    """A row of sample_data.json: one scan or picture."""
+
+    token: str
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    timestamp: Annotated[int, msgspec.Meta(ge=0, le=1 << 52)]
+    """Microseconds since 1970."""
+    filename: str
+
+
+class _Posed(msgspec.Struct):
+    """A row of ego_pose.json or calibrated_sensor.json."""
+
+    token: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    """Quaternion w, x, y, z."""
+
+
+def _scene(path: Path, tables: Path, wanted: str | None) -> list[_Recorded]:
     """The rows of sample_data.json of one scene's LIDAR_TOP whose files are there, by time."""
-    scenes = {row["name"]: row["token"] for row in _nuscenes_table(tables / "scene.json").values()}
+    scenes = {row.name: row.token for row in _nuscenes_table(tables / "scene.json", _Named)}
     if wanted is None and len(scenes) == 1:
         wanted = next(iter(scenes))
     if wanted not in scenes:
         raise MapvoteError(f"{path}: choose a scene with --topic: {', '.join(sorted(scenes)) or 'there is none'}")
-    samples = _nuscenes_table(tables / "sample.json")
-    rows = [
-        row
-        for row in _nuscenes_table(tables / "sample_data.json").values()
-        if "LIDAR_TOP" in row["filename"] and samples[row["sample_token"]]["scene_token"] == scenes[wanted]
-    ]
-    there = sorted((row for row in rows if (path / row["filename"]).is_file()), key=lambda row: row["timestamp"])
+    samples = {r.token for r in _nuscenes_table(tables / "sample.json", _Sample) if r.scene_token == scenes[wanted]}
+    table = tables / "sample_data.json"
+    recorded = _nuscenes_table(table, _Recorded)
+    rows = [row for row in recorded if "LIDAR_TOP" in row.filename and row.sample_token in samples]
+    there = sorted((row for row in rows if below(path, row.filename, table).is_file()), key=lambda row: row.timestamp)
     if not there:
         raise MapvoteError(f"{path}: {wanted} has {len(rows)} scans in its tables, but none of their files is here")
     if len(there) < len(rows):
@@ -182,16 +215,29 @@ def _scene(path: Path, tables: Path, wanted: str | None) -> list[dict[str, Any]]
     return there
 
 
-def _nuscenes_table(file: Path) -> dict[str, dict[str, Any]]:
+_Row = TypeVar("_Row")
+
+
+def _nuscenes_table(file: Path, kind: type[_Row]) -> list[_Row]:
     try:
-        return {row["token"]: row for row in msgspec.json.decode(file.read_bytes())}
-    except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
+        return msgspec.json.decode(whole_file(file), type=list[kind])  # type: ignore[valid-type]
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a table of nuScenes ({error}); unpack the metadata again") from error
 
 
-def _nuscenes_poses(rows: list[dict[str, Any]]) -> F64:
-    rotations = scipy.spatial.transform.Rotation.from_quat([row["rotation"] for row in rows], scalar_first=True)
-    return geometry.poses_at([row["translation"] for row in rows], rotations.as_matrix())
+def _nuscenes_poses(file: Path, tokens: list[str]) -> F64:
+    """(n, 4, 4) the poses of these tokens; MapvoteError if the table lacks one, or one is no rigid motion."""
+    rows = {row.token: row for row in _nuscenes_table(file, _Posed)}
+    lost = next((token for token in tokens if token not in rows), None)
+    if lost is not None:
+        raise MapvoteError(f"{file}: has no row {lost[:80]!r}, which sample_data.json names; unpack the metadata again")
+    quaternions = np.array([rows[token].rotation for token in tokens])
+    translations = np.array([rows[token].translation for token in tokens])
+    norms = np.linalg.norm(quaternions, axis=1)
+    if not (np.isfinite(translations).all() and np.isfinite(norms).all() and (norms > 1e-6).all()):
+        raise MapvoteError(f"{file}: holds a pose that is no rigid motion; unpack the metadata again")
+    rotations = scipy.spatial.transform.Rotation.from_quat(quaternions, scalar_first=True)
+    return geometry.poses_at(translations, rotations.as_matrix())
 
 
 @dataclass(frozen=True, slots=True)

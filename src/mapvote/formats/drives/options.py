@@ -28,7 +28,7 @@ from mapvote.formats.drives.sensor_estimate import (
     turning_about,
 )
 from mapvote.formats.geo.frame import MapFrame, enu_frame
-from mapvote.formats.listing import entry
+from mapvote.formats.listing import below, entry
 from mapvote.formats.reading import read_text
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -123,6 +123,11 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
         table = tomllib.loads(read_text(file)) if file.is_file() else {}
     except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"{file}: not valid TOML ({error})") from error
+    prior = table.get("prior")
+    # A name with a slash in front is a topic, unless it is a file elsewhere.
+    if isinstance(prior, str) and (not prior.startswith("/") or Path(prior).exists()):
+        place = below(beside(folder), prior, file)
+        table["prior"] = str(place) if place.is_file() else prior
     keys = [key for key in DriveOptions.__struct_fields__ if key not in _NOT_IN_FILE]
     for key in table:
         if key not in keys:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mapvote.core.extras import require
 from mapvote.core.geometry import poses_at
 from mapvote.core.types import F64, Bool, MapvoteError
-from mapvote.formats.reading import read_text
+from mapvote.formats.reading import parse_yaml, read_text
 
 LOCAL = "local"
 """Metres from an unknown place on Earth."""
@@ -287,10 +287,10 @@ def frame_of(georeference: Mapping[str, str]) -> MapFrame:
 
 def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
     """The frame that a map_projector_info.yaml describes; MapvoteError says what is missing or unknown."""
+    about = parse_yaml(text, where)
     try:
-        about = yaml.safe_load(text)
         kind = str(about["projector_type"])
-    except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError) as error:
         raise MapvoteError(f"{where}: no projector_type in it; one of {', '.join(TYPES)}") from error
     heights = {"WGS84": "above the WGS 84 ellipsoid", "EGM2008": "EGM2008 height"}.get(about.get("vertical_datum"), "")
     if kind.lower() == LOCAL:

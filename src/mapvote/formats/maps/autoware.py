@@ -16,19 +16,19 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
-import yaml
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import folder_beside, whole_file, whole_folder, write_whole
 from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
-from mapvote.formats.listing import entry, files_like
+from mapvote.formats.listing import entry, files_like, plain
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
 from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
-from mapvote.formats.reading import first_line, read_text
+from mapvote.formats.reading import read_bytes, read_text, read_yaml
 
 log = logging.getLogger("mapvote.formats")
 
@@ -54,10 +54,7 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     MapvoteError names a tile that is missing, broken, or whose points lie outside it by more than a centimetre.
     """
     file = path / METADATA
-    try:
-        table = yaml.safe_load(read_text(file))
-    except (yaml.YAMLError, ValueError) as error:
-        raise MapvoteError(f"{file}: cannot be read ({first_line(error)})") from error
+    table = read_yaml(file)
     if not isinstance(table, dict):
         raise MapvoteError(f"{file}: not Autoware's metadata; {_CONTENT}")
     try:
@@ -65,8 +62,10 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
         corners = {str(name): np.array([float(v) for v in corner]) for name, corner in table.items()}
         if not corners or (size <= 0).any() or any(c.shape != (2,) for c in corners.values()):
             raise ValueError("no tiles, or a corner that is not [x, y]")
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {_CONTENT}") from error
+    for name in corners:
+        plain(name, file)
     frame = _frame(path)
     _warn_of_unlisted(path, set(corners))
     for name, corner in corners.items():
@@ -171,7 +170,7 @@ class _Laid(msgspec.Struct):
     """One version in the folder's history."""
 
     version: int
-    tiles: list[str]
+    tiles: list[Annotated[str, msgspec.Meta(pattern=rf"^{FOLLOWED.pattern}\Z")]]
     map_id: str = ""
     """Of the map; "" where the caller did not name it."""
 
@@ -273,8 +272,8 @@ def _history(folder: Path) -> list[_Laid]:
     if not file.is_file():
         return []
     try:
-        return _HISTORY.decode(file.read_bytes())
-    except (OSError, msgspec.DecodeError) as error:
+        return _HISTORY.decode(read_bytes(file))
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: cannot be read ({error}); empty the folder and follow again") from error
 
 
