@@ -70,7 +70,9 @@ def serving_here(store: Path, *, log: Path, settings: str = "") -> Iterator[str]
             servers.put(self)
 
     def run() -> None:
-        serve.serve(opened, read, port=0, opened=True, gate=gate_by(read.ndt), ready=addresses.put)
+        serve.serve(
+            opened, read, port=0, opened=True, gate=gate_by(read.ndt, read.server.gate_drives), ready=addresses.put
+        )
 
     thread = threading.Thread(target=run)
     with log.open("a") as written, mock.patch.object(serve, "_Server", Kept):

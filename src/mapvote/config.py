@@ -262,6 +262,7 @@ class ServerSettings(Section):
         default=("127.0.0.1", "::1"),
         description="addresses or networks of reverse proxies. Forwarded and X-Forwarded-For count from these alone",
     )
+    gate_drives: str = Field(default="", description="folder of the drives that a policy may name as its gate.drive")
     webhook_url: str = Field(
         default="", pattern="^(https?://.*)?$", description="URL that events are posted to. Empty disables this"
     )

@@ -6,6 +6,7 @@ localised in the old map and in the new one from the same initial guesses, and t
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
+from mapvote.formats.listing import below
 from mapvote.matching.ndt_map import MapWindow
 from mapvote.matching.prepare import deskew, thin_for_levels, twist_between
 from mapvote.shapes.change_objects import changed_cells
@@ -77,17 +79,31 @@ class Measure:
         )
 
 
-def gate_by(ndt: NdtSettings) -> Gate:
-    """The gate of the policy's reference drive; an abstention lets the version through. MapvoteError if the drive is
-    missing."""
+def gate_by(ndt: NdtSettings, drives: str) -> Gate:
+    """The gate of the policy's reference drive, which lies below the folder ``drives`` ("": there is none); an
+    abstention lets the version through. MapvoteError if the drive is missing."""
 
     def reasons(asked: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
         settings = GateSettings.model_validate(asked.model_dump(exclude={"drive"}))
-        verdict, why = gate(old, new, open_drive(Path(asked.drive)), settings, ndt)
+        verdict, why = gate(old, new, _gate_drive(drives, asked.drive), settings, ndt)
         structlog.get_logger("mapvote").info("gate", verdict=verdict, reasons=why)
         return why if verdict == "hold" else []
 
     return reasons
+
+
+def _gate_drive(drives: str, name: str) -> Drive:
+    """The drive of this name below a folder. MapvoteError does not tell where that folder lies."""
+    if not drives:
+        raise MapvoteError(
+            f"the policy judges versions by the drive {name}, and no folder of gate drives is stated here: start with "
+            "--gate-drives DIR, or [server] gate_drives"
+        )
+    try:
+        return open_drive(below(Path(drives), name, Path("gate.drive")))
+    except MapvoteError as error:
+        said = str(error).replace(f"{Path(drives)}{os.sep}", "")
+        raise MapvoteError(f"gate.drive = {name}, below the folder of gate drives: {said}") from None
 
 
 def gate(

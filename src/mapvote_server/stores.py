@@ -42,7 +42,7 @@ def api_of(name: str, settings: Settings | None = None, executor: Executor | Non
     A Ctrl-C ends the process at once: the API works in other threads, and a transaction that is not finished leaves
     nothing behind, as after a kill -9.
     """
-    gate = None if settings is None else gate_by(settings.ndt)
+    gate = None if settings is None else gate_by(settings.ndt, settings.server.gate_drives)
     with (
         opened_store(name) as store,
         _errors_only(),

@@ -41,6 +41,9 @@ def serve(
         bool, typer.Option("--open", help="need no key, on this machine only, until the first key is issued")
     ] = False,
     upgrade: Annotated[bool, typer.Option("--upgrade", help="only upgrade the schema of an older STORE")] = False,
+    gate_drives: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder of the drives that the policy may name as gate.drive")
+    ] = None,
     config: Config = None,
 ) -> None:
     """Serve a store to vehicles and operators until stopped. The first operator key of a new store is shown once.
@@ -77,7 +80,10 @@ def serve(
         if new and not open_:
             key = issue(opened, "operator", "operator", by=who())
             print(f"key of the operator, shown this once: {key}", flush=True)
-        gate = gate_by(settings.ndt)
+        drives = str(gate_drives or settings.server.gate_drives)
+        if drives and not Path(drives).is_dir():
+            raise MapvoteError(f"{drives}: no folder of gate drives is there")
+        gate = gate_by(settings.ndt, drives)
 
         def ready(url: str) -> None:
             print(f"serving {url}", flush=True)

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import httpx2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from hand_made import two_walls
+from live_server import serving_here
 from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote_server.gate import Localised, compare, gate, gate_by, pass_or_hold
-from mapvote_server.store.policy import GatePolicy
+from mapvote_server.store.keys import issue
+from mapvote_server.store.policy import GatePolicy, Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.store import Store
+from stores import vote_gone
 from streets import drive_along, path, street, sweep, twist_of
 
 NDT, SETTINGS = NdtSettings(), GateSettings()
@@ -99,9 +108,38 @@ def test_within_tolerance_passes_worse_holds_and_between_it_abstains(gains: list
 
 
 def test_the_gate_judges_by_the_drive_that_the_policy_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    drives = {"/drives/ring": drive_through(STREET)}
+    drives = {"/srv/drives/north/ring": drive_through(STREET)}
     monkeypatch.setattr("mapvote_server.gate.open_drive", lambda path: drives[str(path)])
-    asked = GatePolicy(drive="/drives/ring", **SETTINGS.model_dump())
+    asked = GatePolicy(drive="north/ring", **SETTINGS.model_dump())
     wrong = without(-22.0, 22.0)
-    assert gate_by(NDT)(asked, street_map(STREET), street_map(wrong)) != []
-    assert gate_by(NDT)(asked, street_map(STREET), street_map(STREET)) == []
+    judge = gate_by(NDT, "/srv/drives")
+    assert judge(asked, street_map(STREET), street_map(wrong)) != []
+    assert judge(asked, street_map(STREET), street_map(STREET)) == []
+
+
+def test_a_gate_drive_lies_below_the_folder_that_the_server_was_given(tmp_path: Path) -> None:
+    """Nobody learns over HTTP which other paths exist, nor where the folder lies."""
+    street = street_map(STREET)
+    with pytest.raises(MapvoteError, match="start with --gate-drives DIR"):
+        gate_by(NDT, "")(GatePolicy(drive="ring"), street, street)
+    with pytest.raises(MapvoteError, match=r"^gate\.drive = ring, below the folder") as refused:
+        gate_by(NDT, str(tmp_path))(GatePolicy(drive="ring"), street, street)
+    assert str(tmp_path) not in str(refused.value)
+    for name in ("/etc/passwd", "../ring", "a/../../ring", "..", "\0", "a//b", "C:\\ring"):
+        with pytest.raises(ValidationError, match="below the folder of gate drives"):
+            GatePolicy(drive=name)
+
+
+def test_a_reader_learns_that_there_is_a_gate_and_not_its_drive(tmp_path: Path) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(gate=GatePolicy(drive="north/ring")))
+    vote_gone(store)
+    publish(store, override=True, gate=lambda asked, old, new: [])
+    keys = {role: issue(store, "one", role) for role in ("reader", "reviewer")}
+    store.close()
+    seen = {}
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url:
+        for role, key in keys.items():
+            bearer = {"Authorization": f"Bearer {key}"}
+            asked = [httpx2.get(url + path, headers=bearer).json() for path in ("/v1/policy", "/v1/map/versions")]
+            seen[role] = [asked[0]["policy"]["gate"]["drive"], asked[1]["versions"][-1]["policy"]["gate"]["drive"]]
+    assert seen == {"reader": ["hidden", "hidden"], "reviewer": ["north/ring", "north/ring"]}

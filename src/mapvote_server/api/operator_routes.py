@@ -66,7 +66,7 @@ from mapvote_server.questions.vehicles import (
 )
 from mapvote_server.store import keys
 from mapvote_server.store.integrity import check, restore_plane, set_aside
-from mapvote_server.store.policy import PolicyChange
+from mapvote_server.store.policy import Policy, PolicyChange, without_drive
 from mapvote_server.store.publish import Outcome, preview, publish
 from mapvote_server.store.queries import log_event
 from mapvote_server.store.retention import Cleared, clear
@@ -236,13 +236,15 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
 
 @router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
 @on("questions")
-def policy(parts: Parts) -> Response:
-    """The policy in force, who set it and why."""
-    return _policy_of(parts)
+def policy(parts: Parts, known: Known) -> Response:
+    """The policy in force, who set it and why. Only reviewers and operators see the name of its gate drive."""
+    return _policy_of(parts, known)
 
 
-def _policy_of(parts: Services) -> Response:
-    return as_json(parts.store.policy_changes()[-1])
+def _policy_of(parts: Services, known: bool) -> Response:
+    newest = parts.store.policy_changes()[-1]
+    told = newest.policy if known else Policy.model_validate(without_drive(newest.policy.model_dump()))
+    return as_json(replace(newest, policy=told))
 
 
 @router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
@@ -250,7 +252,7 @@ def _policy_of(parts: Services) -> Response:
 def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
     parts.store.change_policy(ask.values, by=by, reason=ask.reason)
-    return _policy_of(parts)
+    return _policy_of(parts, known=True)
 
 
 @router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")

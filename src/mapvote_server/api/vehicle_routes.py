@@ -29,10 +29,11 @@ from mapvote_server.api.schemas import (
     as_table,
     problems,
 )
-from mapvote_server.api.services import Parts, own, services
+from mapvote_server.api.services import Known, Parts, own, services
 from mapvote_server.questions.history import origin_of
 from mapvote_server.store.admission import Intake, Receipt
 from mapvote_server.store.examination import Examination, Incoming
+from mapvote_server.store.policy import without_drive
 from mapvote_server.store.votes import withdraw
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
@@ -52,13 +53,15 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
 
 @router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
 @on("questions")
-def versions(parts: Parts, format: Table = "json") -> Response:
-    """Every version, oldest first, with the policy it was made by."""
+def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
+    """Every version, oldest first, with the policy it was made by. Only reviewers and operators see the name of the
+    policy's gate drive."""
     found = parts.store.versions()
     listed = [origin_of(v) | {"created": utc(v.created_ns)} for v in found]
     if format == "csv":
         return as_table(listed)
-    return as_json({"versions": [one | {"policy": v.policy} for one, v in zip(listed, found, strict=True)]})
+    policies = [v.policy if known else without_drive(v.policy) for v in found]
+    return as_json({"versions": [one | {"policy": said} for one, said in zip(listed, policies, strict=True)]})
 
 
 @router.get(

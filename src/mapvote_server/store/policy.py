@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import sqlalchemy as sa
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from mapvote.config import FuseSettings, GateSettings, RuleName, Section, Settings, did_you_mean, wanted_of
 from mapvote.core.types import MapvoteError
+from mapvote.formats.listing import below
 from mapvote_server.store import schema
 from mapvote_server.store.queries import log_event
 
@@ -42,9 +44,16 @@ class GatePolicy(GateSettings):
     drive: str = Field(
         default="",
         max_length=1000,
-        pattern=r"^[^\x00-\x1f]*$",
-        description="drive on the machine that publishes; empty: no gate",
+        description="reference drive, below the folder of gate drives of the machine that publishes; empty: no gate",
     )
+
+    @field_validator("drive")
+    @classmethod
+    def _below_the_folder(cls, name: str) -> str:
+        try:
+            return name and below(Path(), name, Path("gate.drive")).as_posix()
+        except MapvoteError:
+            raise ValueError("give a name below the folder of gate drives (serve --gate-drives DIR)") from None
 
 
 class KeepPolicy(Section):
@@ -89,6 +98,15 @@ def policy_in(connection: sa.Connection) -> Policy:
     p = schema.policies
     newest = sa.select(p.c.policy).order_by(p.c.seq.desc()).limit(1)
     return Policy.model_validate(connection.execute(newest).scalar_one())
+
+
+HIDDEN = "hidden"
+
+
+def without_drive(policy: Mapping[str, Any]) -> dict[str, Any]:
+    """A policy as readers see it, who learn that there is a gate and not by which drive it judges."""
+    gate = policy.get("gate", {})
+    return {**policy, "gate": {**gate, "drive": HIDDEN}} if gate.get("drive") else dict(policy)
 
 
 def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, reason: str) -> int:
