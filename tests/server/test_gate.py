@@ -134,7 +134,7 @@ def test_a_reader_learns_that_there_is_a_gate_and_not_its_drive(tmp_path: Path) 
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(gate=GatePolicy(drive="north/ring")))
     vote_gone(store)
     publish(store, override=True, gate=lambda asked, old, new: [])
-    keys = {role: issue(store, "one", role) for role in ("reader", "reviewer")}
+    keys = {role: issue(store, role, role) for role in ("reader", "reviewer")}
     store.close()
     seen = {}
     with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url:
