@@ -25,7 +25,7 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
 from mapvote.formats import DriveWriter, open_drive, read_map, write_map
-from mapvote.formats.listing import below, plain
+from mapvote.formats.listing import below, plain_name
 from mapvote.formats.maps.autoware import METADATA, write_autoware
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import FolderManifest
@@ -230,5 +230,5 @@ def test_a_name_that_leads_elsewhere_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["0_0.pcd", "n015-2018-07-24__LIDAR_TOP__1.pcd.bin", "Straße 1.pcd", "..a", "a.."])
 def test_an_ordinary_name_is_taken(name: str) -> None:
-    assert plain(name, Path("m")) == name
+    assert plain_name(name, Path("m")) == name
     assert below(Path("d"), f"lidar/{name}", Path("m")) == Path("d/lidar") / name

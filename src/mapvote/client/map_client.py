@@ -29,7 +29,7 @@ from mapvote.core.point_map import PointMap, made_in_turn
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import write_whole
-from mapvote.formats.reading import read_bytes, read_head
+from mapvote.formats.reading import first_bytes, read_whole
 
 Sent = Literal["created", "replaced", "repeated", "spooled"]
 Region = tuple[float, float, float, float]
@@ -112,7 +112,7 @@ class MapClient:
 
     def points_of(self, planes: TileHashes) -> int:
         """How many points a tile has that :meth:`has` been downloaded."""
-        return points_in_plane(read_head(self._planes / planes.points, FRAME_HEAD), planes.points)
+        return points_in_plane(first_bytes(self._planes / planes.points, FRAME_HEAD), planes.points)
 
     def download(self, planes: TileHashes) -> None:
         """Have the planes of a tile that ``home`` lacks. Raises as :meth:`fetch`."""
@@ -212,7 +212,7 @@ class MapClient:
     def kept_manifest(self) -> Manifest | None:
         """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
         try:
-            return _DECODER.decode(read_bytes(self._kept_manifest))
+            return _DECODER.decode(read_whole(self._kept_manifest))
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return None
 
@@ -228,7 +228,7 @@ class MapClient:
         """The zstd frame of a plane."""
         kept = self._planes / digest
         if kept.is_file():
-            frame = read_bytes(kept)
+            frame = read_whole(kept)
             with suppress(MapvoteError):  # damaged on this disk: fetched again
                 check_plane(frame, digest)
                 os.utime(kept)

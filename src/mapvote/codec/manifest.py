@@ -18,7 +18,7 @@ DIGESTS = 1 << 256
 """Sums of hashes are taken modulo this."""
 
 
-Digest = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+PlaneHash = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
 """A SHA-256 in hex. A plane's digest becomes the name of its file, so a decoder takes no other text."""
 TileKey = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]{1,7},-?[0-9]{1,7}\Z")]
 """Row and column of a tile: "row,col"."""
@@ -27,13 +27,13 @@ TileKey = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]{1,7},-?[0-9]{1,7}\Z")]
 class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
     """SHA-256 of the planes of one tile; None for a plane that it has not."""
 
-    points: Digest
+    points: PlaneHash
     """What ballots name as their base."""
-    ground: Digest
-    free: Digest | None
-    memory: Digest | None = None
+    ground: PlaneHash
+    free: PlaneHash | None
+    memory: PlaneHash | None = None
     """What a server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
-    fields: Digest | None = None
+    fields: PlaneHash | None = None
     """What the points carry besides their place."""
 
     @classmethod

@@ -13,7 +13,7 @@ from mapvote.core.types import MapvoteError
 _PLAIN = re.compile(r"[^/\\\x00-\x1f\x7f]{1,255}")
 
 
-def plain(name: str, said_by: Path) -> str:
+def plain_name(name: str, said_by: Path) -> str:
     """``name``, which ``said_by`` gives to a file or folder. MapvoteError if it leads elsewhere ("..", "a/b", "C:x"):
     content never opens a file that nobody handed over."""
     if not _PLAIN.fullmatch(name) or name in (".", "..") or PureWindowsPath(name).drive:
@@ -22,8 +22,8 @@ def plain(name: str, said_by: Path) -> str:
 
 
 def below(folder: Path, name: str, said_by: Path) -> Path:
-    """The place below ``folder`` that ``said_by`` names ("lidar/0.pcd"); MapvoteError as :func:`plain`."""
-    return folder.joinpath(*(plain(part, said_by) for part in name.split("/")))
+    """The place below ``folder`` that ``said_by`` names ("lidar/0.pcd"); MapvoteError as :func:`plain_name`."""
+    return folder.joinpath(*(plain_name(part, said_by) for part in name.split("/")))
 
 
 def entry(folder: Path, name: str) -> Path:

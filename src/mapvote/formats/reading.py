@@ -19,7 +19,7 @@ MOST_BYTES = 4_000_000_000
 """Of a file that is read whole."""
 
 
-def read_bytes(file: Path, most: int = MOST_BYTES) -> bytes:
+def read_whole(file: Path, most: int = MOST_BYTES) -> bytes:
     """The content of a regular file. OSError if it cannot be read, has more than ``most`` bytes, or is a pipe, a device
     or a socket: reading one of these waits or goes on for ever."""
     if _regular(file).st_size > most:
@@ -27,8 +27,8 @@ def read_bytes(file: Path, most: int = MOST_BYTES) -> bytes:
     return file.read_bytes()
 
 
-def read_head(file: Path, size: int) -> bytes:
-    """The first bytes of a regular file; OSError as :func:`read_bytes`."""
+def first_bytes(file: Path, size: int) -> bytes:
+    """The first bytes of a regular file; OSError as :func:`read_whole`."""
     _regular(file)
     with file.open("rb") as stream:
         return stream.read(size)
@@ -58,7 +58,7 @@ def read_text(file: Path) -> str:
     """The whole text of a file, UTF-8, or UTF-16 with a byte order mark; MapvoteError if it cannot be read or is not
     text."""
     try:
-        data = read_bytes(file)
+        data = read_whole(file)
         wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         text = data.decode("utf-16" if wide else "utf-8-sig")
         return text.replace("\r\n", "\n").replace("\r", "\n")

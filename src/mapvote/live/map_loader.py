@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.listing import plain
+from mapvote.formats.listing import plain_name
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
 from mapvote.formats.maps.cloud import joined
 from mapvote.formats.maps.pcd import stream_pcd
@@ -178,7 +178,7 @@ def _read_table(file: Path) -> dict[str, Cell]:
     if not table:
         raise ValueError("it lists no tile")
     return {
-        plain(name, file): Cell(name, float(x), float(y), float(x) + width, float(y) + height)
+        plain_name(name, file): Cell(name, float(x), float(y), float(x) + width, float(y) + height)
         for name, (x, y) in sorted(table.items())
     }
 

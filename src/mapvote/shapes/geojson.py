@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+import shapely
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64
@@ -34,7 +34,7 @@ def to_geojson(
     ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
     """
     frame = frame_of(georeference or {})
-    features = [_feature(o, lattice, _neighbours(o, objects)) for o in objects]
+    features = [_feature(o, lattice, near) for o, near in zip(objects, _neighbours(objects), strict=True)]
     if lonlat and not frame.is_local:
         for feature in features:
             rings_to_lonlat(feature["geometry"], frame)
@@ -79,14 +79,17 @@ def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
-def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
-    """Ids of other large things whose box is within 15 m, nearest first."""
-    near, a = [], change.box
-    for other in objects:
-        if other is not change and other.size == "large":
-            gaps = [max(a[i] - other.box[i + 2], other.box[i] - a[i + 2], 0.0) for i in (0, 1)]
-            near.append((CELL_SIZE * math.hypot(*gaps), other.id))
-    return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
+def _neighbours(objects: Sequence[ChangeObject]) -> list[list[str]]:
+    """For each object the ids of other large things whose box is within 15 m, nearest first."""
+    large = [other for other in objects if other.size == "large"]
+    boxes, others = (shapely.box(*np.array([o.box for o in some]).reshape(-1, 4).T) for some in (objects, large))
+    here, there = shapely.STRtree(others).query(boxes, predicate="dwithin", distance=NEAR_M / CELL_SIZE)
+    distance_m = CELL_SIZE * shapely.distance(boxes[here], others[there])
+    near: list[list[tuple[float, str]]] = [[] for _ in objects]
+    for i, k, metres in zip(here.tolist(), there.tolist(), distance_m.tolist(), strict=True):
+        if objects[i] is not large[k]:
+            near[i].append((metres, large[k].id))
+    return [[name for _, name in sorted(one)][:MOST_NEIGHBOURS] for one in near]
 
 
 def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:

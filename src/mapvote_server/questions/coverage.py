@@ -3,133 +3,228 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key, unpack_path
-from mapvote.config import FuseSettings
-from mapvote.core.grid import CELL_SIZE, Grid, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, TileIndex
 from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError
 from mapvote.fusion.next_pass import Stretch, Waiting, Witness, lacks_quorum_only, one_vote_short, stretches
 from mapvote.fusion.tile_vote import TileVote, by_voter, one_each
 from mapvote.shapes.geojson import collection
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import said_by
+from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.queries import tile_as_of, version_of
 from mapvote_server.store.store import Store
-from mapvote_server.store.votes import (
-    FOREVER,
-    Electorate,
-    electorate_now,
-    from_sound_ballots,
-    judged_on,
-    standing_tiles,
-)
+from mapvote_server.store.votes import Electorate, electorate_now, from_sound_ballots, judged_on
 
 
-@dataclass(slots=True)
-class _Tally:
-    """The changes that lack only the quorum, over some tiles."""
+@dataclass(frozen=True, slots=True)
+class _Waits:
+    """The changes on one tile that lack only the quorum."""
 
+    cells: int
+    drives: frozenset[str]
+    vehicles: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    """What one more pass would decide on one tile."""
+
+    waits: _Waits | None
+    stretches: Sequence[Stretch] = ()
     cells: int = 0
-    drives: set[str] = field(default_factory=set)
-    vehicles: set[str] = field(default_factory=set)
+    """Cells that one more vote would decide."""
+    without_path: int = 0
+    """Those of them that no drive with a path saw."""
+    damaged: str = ""
+    """The tile's key if it cannot be read."""
 
-    def add(self, drives: Sequence[TileVote], states: Sequence[U8], quorum: int) -> None:
-        """Another tile: its ``drives``, and the ``states`` (256, 256) of each voter."""
-        if not states:
-            return
-        change = lacks_quorum_only(states, quorum)
-        waits = change != NO_VOTE
-        self.cells += int(waits.sum())
-        for drive in drives:
-            if (said_by(drive)[waits] == change[waits]).any():
-                self.drives.add(drive.digest)
-                self.vehicles.add(drive.vehicle)
 
-    def waiting(self, quorum: int) -> Waiting | None:
-        """All of them; None if there are none."""
-        return Waiting(self.cells, len(self.drives), sorted(self.vehicles), quorum) if self.cells else None
+class _Kept:
+    """What waits on the tiles of one store, where anything does."""
+
+    def __init__(self) -> None:
+        self.few: KeptTiles[_Tile] = KeptTiles()
+        """Tiles on which fewer vehicles than the quorum vote."""
+        self.every: KeptTiles[_Tile] = KeptTiles()
+
+
+_kept: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
+_lock = Lock()
+PATH_REACH_M = 200.0
+"""A vehicle votes on no cell farther from its path."""
+
+
+def _kept_of(store: Store) -> _Kept:
+    with _lock:
+        return _kept.setdefault(store, _Kept())
 
 
 def waiting_votes(store: Store) -> Waiting | None:
     """The changes that lack only the quorum; None if there are none. Tiles on which the quorum votes are not read."""
-    found = _Tally()
-    with store.database.reading() as connection:
-        asked = electorate_now(connection, store.clock())
-        for window, drives in _counting(connection, store, asked, _few_vehicles(connection, asked.settings), []):
-            found.add(drives, _states(drives, window, asked.settings), asked.settings.min_votes)
-    return found.waiting(asked.settings.min_votes)
+    tiles = _kept_of(store).few
+    with tiles.lock:
+        with store.database.reading() as connection:
+            now_ns = store.clock()
+            asked = electorate_now(connection, now_ns)
+            quorum = asked.settings.min_votes
+
+            def look(index: TileIndex) -> _Tile | None:
+                if _vehicles_on(connection, index) >= quorum:
+                    return None
+                drives = _counting(connection, store, asked, index)
+                waits = None if drives is None else _waits(drives, _states(drives, store, index, asked), quorum)
+                return None if waits is None else _Tile(waits)
+
+            tiles.refresh(connection, asked, now_ns, look)
+        return _together(tiles.found.values(), quorum)
 
 
-def _few_vehicles(connection: sa.Connection, settings: FuseSettings) -> list[TileIndex]:
-    """Tiles that fewer vehicles than the quorum vote on."""
+def _vehicles_on(connection: sa.Connection, index: TileIndex) -> int:
+    """Vehicles with a standing ballot on a tile."""
     b, t = schema.ballots.c, schema.ballot_tiles.c
-    vehicles = sa.func.count(sa.distinct(b.vehicle))
-    few = sa.select(t.row, t.col).join(schema.ballots, b.seq == t.ballot).where(b.gone_seq.is_(None))
-    rows = connection.execute(few.group_by(t.row, t.col).having(vehicles < settings.min_votes))
-    return sorted((row.row, row.col) for row in rows)
+    vehicles = sa.select(sa.func.count(sa.distinct(b.vehicle))).join(schema.ballot_tiles, b.seq == t.ballot)
+    here = vehicles.where(t.row == index[0], t.col == index[1], b.gone_seq.is_(None))
+    return int(connection.execute(here).scalar_one())
 
 
-def _counting(
-    connection: sa.Connection, store: Store, asked: Electorate, tiles: Sequence[TileIndex], damaged: list[str]
-) -> Iterator[tuple[Grid, list[TileVote]]]:
-    """Of some tiles: the window, and the votes of the drives that count, in the cells where they do. A tile that cannot
-    be read is left out and named in ``damaged``."""
+def _counting(connection: sa.Connection, store: Store, asked: Electorate, index: TileIndex) -> list[TileVote] | None:
+    """The votes on a tile of the drives that count, in the cells where they do; None if the tile cannot be read."""
     newest = version_of(connection).number
-    for index in tiles:
-        window = store.lattice.tile(index)
-        try:
-            tile = tile_as_of(connection, window, newest)
-        except Unavailable:
-            raise
-        except MapvoteError:
-            damaged.append(tile_key(index))
-            continue
-        judged = from_sound_ballots(connection, asked, lambda now, tile=tile: judged_on(connection, tile, now))  # type: ignore[misc]
-        yield window, [one.vote for one in judged if one.vote is not None]
+    try:
+        tile = tile_as_of(connection, store.lattice.tile(index), newest)
+    except Unavailable:
+        raise
+    except MapvoteError:
+        return None
+    judged = from_sound_ballots(connection, asked, lambda now: judged_on(connection, tile, now))
+    return [one.vote for one in judged if one.vote is not None]
 
 
-def _states(drives: Sequence[TileVote], window: Grid, settings: FuseSettings) -> list[U8]:
+def _states(drives: Sequence[TileVote], store: Store, index: TileIndex, asked: Electorate) -> list[U8]:
     """(256, 256) of each voter."""
-    return [said_by(vote) for vote in one_each(by_voter(drives, settings), window)]
+    return [said_by(vote) for vote in one_each(by_voter(drives, asked.settings), store.lattice.tile(index))]
+
+
+def _waits(drives: Sequence[TileVote], states: Sequence[U8], quorum: int) -> _Waits | None:
+    """The changes that lack only the quorum, by the ``drives`` on a tile and the ``states`` (256, 256) of each voter;
+    None if there are none."""
+    if not states:
+        return None
+    change = lacks_quorum_only(states, quorum)
+    waits = change != NO_VOTE
+    if not waits.any():
+        return None
+    for_it = [drive for drive in drives if (said_by(drive)[waits] == change[waits]).any()]
+    digests = frozenset(drive.digest for drive in for_it)
+    return _Waits(int(waits.sum()), digests, frozenset(drive.vehicle for drive in for_it))
+
+
+def _together(tiles: Iterable[_Tile], quorum: int) -> Waiting | None:
+    """What lacks only the quorum, over some tiles."""
+    found = [tile.waits for tile in tiles if tile.waits is not None]
+    drives = frozenset[str]().union(*(waits.drives for waits in found))
+    vehicles = frozenset[str]().union(*(waits.vehicles for waits in found))
+    cells = sum(waits.cells for waits in found)
+    return Waiting(cells, len(drives), sorted(vehicles), quorum) if cells else None
 
 
 def wanted_passes(store: Store) -> dict[str, Any]:
     """Stretches of road on which one more pass would decide cells, those with most cells first: GeoJSON lines in map
-    metres, each in the direction to drive, with what the pass would decide there.
+    metres, each in the direction to drive, with what the pass would decide there; as many as ``MOST_STRETCHES``.
 
     Besides, "cells" that one more vote would decide; "without_path", those of them that no drive with a path saw;
     "waits", text: what lacks only the quorum; "damaged" tiles, which are left out.
     """
-    found: list[Stretch] = []
-    damaged: list[str] = []
-    tally = _Tally()
-    cells = without_path = 0
-    with store.database.reading() as connection:
-        asked = electorate_now(connection, store.clock())
-        quorum, driven = asked.settings.min_votes, _driven(connection, store)
-        for window, drives in _counting(connection, store, asked, standing_tiles(connection, FOREVER), damaged):
-            named = by_voter(drives, asked.settings)
-            vehicles = {voter.vehicle: drive.vehicle for voter, drive in zip(named, drives, strict=True)}
-            voters = one_each(named, window)
-            witnesses = [Witness(said_by(vote), driven[vehicles[vote.vehicle]]) for vote in voters]
-            found += stretches(window, witnesses, quorum)
-            tally.add(drives, [witness.states for witness in witnesses], quorum)
-            if witnesses:
-                short = one_vote_short([witness.states for witness in witnesses], quorum)
-                seen = [w.states == short for w in witnesses if any(len(path) > 1 for path in w.paths_m)]
-                waiting = short != NO_VOTE
-                cells += int(waiting.sum())
-                without_path += int((waiting & ~np.any(seen, axis=0)).sum() if seen else waiting.sum())
-    waits = tally.waiting(quorum)
-    told = {"cells": cells, "without_path": without_path, "waits": "" if waits is None else str(waits)}
-    return collection([_line(stretch) for stretch in _in_order(found)]) | told | {"damaged": damaged}
+    tiles = _kept_of(store).every
+    with tiles.lock:
+        with store.database.reading() as connection:
+            now_ns = store.clock()
+            asked = electorate_now(connection, now_ns)
+
+            @lru_cache(maxsize=100)
+            def path_of(ballot: int) -> F64:
+                return _driven(connection, store, ballot)
+
+            tiles.refresh(connection, asked, now_ns, lambda index: _look(connection, store, asked, index, path_of))
+        found = list(tiles.found.values())
+    waits = _together(found, asked.settings.min_votes)
+    told = {
+        "cells": sum(tile.cells for tile in found),
+        "without_path": sum(tile.without_path for tile in found),
+        "waits": "" if waits is None else str(waits),
+        "damaged": sorted(tile.damaged for tile in found if tile.damaged),
+    }
+    every = _in_order([stretch for tile in found for stretch in tile.stretches])
+    return collection([_line(stretch) for stretch in every[:MOST_STRETCHES]]) | told
+
+
+MOST_STRETCHES = 1_000
+"""Those with most cells: more than a fleet drives in a day."""
+
+
+def _look(
+    connection: sa.Connection, store: Store, asked: Electorate, index: TileIndex, path_of: Callable[[int], F64]
+) -> _Tile | None:
+    """What one more pass would decide on a tile; None if nothing."""
+    window, quorum = store.lattice.tile(index), asked.settings.min_votes
+    drives = _counting(connection, store, asked, index)
+    if drives is None:
+        return _Tile(None, damaged=tile_key(index))
+    if not drives:
+        return None
+    named = by_voter(drives, asked.settings)
+    vehicles = {voter.vehicle: drive.vehicle for voter, drive in zip(named, drives, strict=True)}
+    voters = one_each(named, window)
+    states = [said_by(vote) for vote in voters]
+    short = one_vote_short(states, quorum)
+    waiting = short != NO_VOTE
+    waits = _waits(drives, states, quorum)
+    if not waiting.any():
+        return None if waits is None else _Tile(waits)
+    paths = _paths_on(connection, window, path_of)
+    witnesses = [Witness(said_by(vote), paths[vehicles[vote.vehicle]]) for vote in voters]
+    seen = [w.states == short for w in witnesses if any(len(path) > 1 for path in w.paths_m)]
+    unseen = int((waiting & ~np.any(seen, axis=0)).sum() if seen else waiting.sum())
+    return _Tile(waits, stretches(window, witnesses, quorum), int(waiting.sum()), unseen)
+
+
+def _paths_on(connection: sa.Connection, window: Grid, path_of: Callable[[int], F64]) -> dict[str, list[F64]]:
+    """By vehicle: of each standing drive with a path that votes on a tile the part from where it first comes near to
+    where it leaves, (n, 2) map metres."""
+    b, t, p = schema.ballots.c, schema.ballot_tiles.c, schema.paths.c
+    row, col = window.tile_index
+    here = (
+        sa.select(b.seq, b.vehicle).join(schema.ballot_tiles, t.ballot == b.seq).join(schema.paths, p.ballot == b.seq)
+    )
+    here = here.where(t.row == row, t.col == col, b.gone_seq.is_(None)).order_by(b.seq)
+    low = np.array([window.x0, window.y0]) - PATH_REACH_M
+    high = low + 2 * PATH_REACH_M + TILE_CELLS * CELL_SIZE
+    out = defaultdict[str, list[F64]](list)
+    for ballot, vehicle in connection.execute(here).all():
+        path = path_of(ballot)
+        near = np.flatnonzero(((path >= low) & (path <= high)).all(axis=1))
+        if len(near):
+            out[vehicle].append(path[near[0] : near[-1] + 1])
+    return out
+
+
+def _driven(connection: sa.Connection, store: Store, ballot: int) -> F64:
+    """(n, 2) the path of a ballot's drive, map metres."""
+    p = schema.paths.c
+    path = connection.execute(sa.select(p.path).where(p.ballot == ballot)).scalar_one()
+    return np.array([store.lattice.x0, store.lattice.y0]) + (unpack_path(path)[:, ::-1] + 0.5) * CELL_SIZE
 
 
 def _in_order(found: Sequence[Stretch]) -> list[Stretch]:
@@ -142,14 +237,3 @@ def _line(stretch: Stretch) -> tuple[dict[str, Any], dict[str, Any]]:
     counts = {"cells": stretch.cells, "built": stretch.built, "gone": stretch.gone}
     heading_deg = round(float(np.degrees(stretch.heading_rad)))
     return line, {"row": stretch.tile[0], "col": stretch.tile[1], "heading_deg": heading_deg} | counts
-
-
-def _driven(connection: sa.Connection, store: Store) -> dict[str, list[F64]]:
-    """By vehicle: the path of each of its standing drives, (n, 2) map metres."""
-    b, p = schema.ballots.c, schema.paths.c
-    query = sa.select(b.vehicle, p.path).join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
-    out = defaultdict[str, list[F64]](list)
-    for vehicle, path in connection.execute(query.order_by(b.seq)):
-        corner = np.array([store.lattice.x0, store.lattice.y0])
-        out[vehicle].append(corner + (unpack_path(path)[:, ::-1] + 0.5) * CELL_SIZE)
-    return out

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import UNSAID, in_nats
-from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
@@ -47,7 +47,6 @@ from mapvote_server.store.votes import (
     judged_votes,
     read_votes,
     recent_votes,
-    standing_tiles,
     stored_votes,
 )
 
@@ -416,11 +415,9 @@ def _said_on(
     return from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), read)
 
 
-def votes_by_tile(connection: sa.Connection, lattice: Lattice, policy: Policy) -> Iterator[tuple[Grid, list[TileVote]]]:
-    """Of each tile with standing votes: its window, and the votes inside the policy's window, one a vehicle."""
-    for index in standing_tiles(connection, FOREVER):
-        window = lattice.tile(index)
-        yield window, one_each(_said_on(connection, index, policy, lambda vote, why: not why), window)
+def votes_on(connection: sa.Connection, lattice: Lattice, index: TileIndex, policy: Policy) -> list[TileVote]:
+    """The standing votes on a tile inside the policy's window, one a vehicle."""
+    return one_each(_said_on(connection, index, policy, lambda vote, why: not why), lattice.tile(index))
 
 
 _NEVER_SEEN = 255

@@ -8,10 +8,13 @@ test is exact for few data, and "undecidable" is one of its results.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from threading import Lock
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
@@ -23,11 +26,13 @@ from mapvote.core.types import F32, I64, U8, CellState
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.shapes.geojson import collection, utc
 from mapvote.shapes.outlines import pieces
-from mapvote_server.questions.explain import said_by, seen, votes_by_tile
+from mapvote_server.questions.explain import said_by, seen, votes_on
+from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.policy import policy_in
 from mapvote_server.store.queries import load_tile, tiles_of, version_of
 from mapvote_server.store.store import Store
+from mapvote_server.store.votes import FOREVER, Electorate
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
 Claim = Literal["occupied", "empty"]
@@ -119,10 +124,53 @@ def vehicle_standings(store: Store) -> list[VehicleStanding]:
 
     The state of the world (occupied or empty now) is compared, so votes on an older base count too.
     """
-    with store.database.reading() as connection:
-        by_tile = votes_by_tile(connection, store.lattice, policy_in(connection))
-        compared = [one for window, votes in by_tile for one in compare(window.tile_index, votes)]
-    return standings_of(compared, store.lattice)
+    with _lock:
+        kept = _compared.setdefault(store, _AllCompared())
+    with kept.tiles.lock:
+        with store.database.reading() as connection:
+            asked = Electorate(FOREVER, policy_in(connection), FOREVER)
+
+            def look(index: TileIndex) -> Sequence[Compared] | None:
+                return compare(index, votes_on(connection, store.lattice, index, asked.policy)) or None
+
+            kept.tiles.refresh(connection, asked, store.clock(), look)
+        return standings_of(kept.entries(), store.lattice)
+
+
+class _AllCompared:
+    """The comparisons on all tiles of one store, and their sums: only tiles with contradictions are gone through."""
+
+    def __init__(self) -> None:
+        self.tiles: KeptTiles[Sequence[Compared]] = KeptTiles(self._come, self._go)
+        self._cells: Counter[str] = Counter()
+        self._tiles: Counter[str] = Counter()
+        self._opposed: dict[int, Sequence[Compared]] = {}
+
+    def entries(self) -> list[Compared]:
+        """As many comparisons as say the same as all: one a vehicle with its cells, and those with contradictions."""
+        none, no_claim = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)
+        sums = [Compared(name, self._cells[name], none, none, no_claim) for name in self._tiles]
+        return sums + [replace(entry, cells=0) for entries in self._opposed.values() for entry in entries]
+
+    def _come(self, compared: Sequence[Compared]) -> None:
+        for entry in compared:
+            self._cells[entry.vehicle] += entry.cells
+            self._tiles[entry.vehicle] += 1
+        opposed = [entry for entry in compared if len(entry.rows)]
+        if opposed:
+            self._opposed[id(compared)] = opposed
+
+    def _go(self, compared: Sequence[Compared]) -> None:
+        for entry in compared:
+            self._cells[entry.vehicle] -= entry.cells
+            self._tiles[entry.vehicle] -= 1
+            if not self._tiles[entry.vehicle]:
+                del self._tiles[entry.vehicle], self._cells[entry.vehicle]
+        self._opposed.pop(id(compared), None)
+
+
+_compared: WeakKeyDictionary[Store, _AllCompared] = WeakKeyDictionary()
+_lock = Lock()
 
 
 def standings_of(

@@ -12,10 +12,11 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, BinaryIO, cast
 
 from mapvote.core.types import MapvoteError
+from mapvote.formats.listing import plain_name
 from mapvote.formats.reading import first_line, read_yaml
 
 STORAGES = (".mcap", ".db3", ".bag")
@@ -127,7 +128,8 @@ def _wrong_in_metadata(about: Path) -> str:
     try:
         table = read_yaml(about)["rosbag2_bagfile_information"]
         storage, listed = table["storage_identifier"], table["relative_file_paths"]
-        missing = [name for name in listed if not (about.parent / Path(name).name).is_file()]
+        names = [plain_name(PurePath(name).name, about) for name in listed]  # of which the reader takes no more either
+        missing = [name for name in names if not (about.parent / name).is_file()]
         table["topics_with_message_count"], table["version"]
     except (MapvoteError, KeyError, TypeError) as error:
         return f"not the metadata of a bag ({first_line(error)})"

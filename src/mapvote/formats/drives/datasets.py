@@ -51,8 +51,7 @@ from mapvote.formats.drives.trajectory import (
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, utm_of
 from mapvote.formats.listing import below, entry, files_like
 from mapvote.formats.maps.pcd import read_pcd_table
-from mapvote.formats.reading import read_bytes as whole_file
-from mapvote.formats.reading import read_text
+from mapvote.formats.reading import read_text, read_whole
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
 _NUSCENES_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -198,14 +197,14 @@ class _Posed(msgspec.Struct):
 
 def _scene(path: Path, tables: Path, wanted: str | None) -> list[_Recorded]:
     """The rows of sample_data.json of one scene's LIDAR_TOP whose files are there, by time."""
-    scenes = {row.name: row.token for row in _nuscenes_table(tables / "scene.json", _Named)}
+    scenes = {row.name: row.token for row in _nuscenes_table(tables / "scene.json", _SCENES)}
     if wanted is None and len(scenes) == 1:
         wanted = next(iter(scenes))
     if wanted not in scenes:
         raise MapvoteError(f"{path}: choose a scene with --topic: {', '.join(sorted(scenes)) or 'there is none'}")
-    samples = {r.token for r in _nuscenes_table(tables / "sample.json", _Sample) if r.scene_token == scenes[wanted]}
+    samples = {r.token for r in _nuscenes_table(tables / "sample.json", _SAMPLES) if r.scene_token == scenes[wanted]}
     table = tables / "sample_data.json"
-    recorded = _nuscenes_table(table, _Recorded)
+    recorded = _nuscenes_table(table, _RECORDED)
     rows = [row for row in recorded if "LIDAR_TOP" in row.filename and row.sample_token in samples]
     there = sorted((row for row in rows if below(path, row.filename, table).is_file()), key=lambda row: row.timestamp)
     if not there:
@@ -215,19 +214,23 @@ def _scene(path: Path, tables: Path, wanted: str | None) -> list[_Recorded]:
     return there
 
 
+_SCENES = msgspec.json.Decoder(list[_Named])
+_SAMPLES = msgspec.json.Decoder(list[_Sample])
+_RECORDED = msgspec.json.Decoder(list[_Recorded])
+_POSED = msgspec.json.Decoder(list[_Posed])
 _Row = TypeVar("_Row")
 
 
-def _nuscenes_table(file: Path, kind: type[_Row]) -> list[_Row]:
+def _nuscenes_table(file: Path, rows: msgspec.json.Decoder[list[_Row]]) -> list[_Row]:
     try:
-        return msgspec.json.decode(whole_file(file), type=list[kind])  # type: ignore[valid-type]
+        return rows.decode(read_whole(file))
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a table of nuScenes ({error}); unpack the metadata again") from error
 
 
 def _nuscenes_poses(file: Path, tokens: list[str]) -> F64:
     """(n, 4, 4) the poses of these tokens; MapvoteError if the table lacks one, or one is no rigid motion."""
-    rows = {row.token: row for row in _nuscenes_table(file, _Posed)}
+    rows = {row.token: row for row in _nuscenes_table(file, _POSED)}
     lost = next((token for token in tokens if token not in rows), None)
     if lost is not None:
         raise MapvoteError(f"{file}: has no row {lost[:80]!r}, which sample_data.json names; unpack the metadata again")

@@ -37,8 +37,7 @@ from mapvote.formats.maps.las import stream_las
 from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
 from mapvote.formats.maps.ply import stream_ply_tables
-from mapvote.formats.reading import read_bytes as whole_file
-from mapvote.formats.reading import read_text
+from mapvote.formats.reading import read_text, read_whole
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 _EARLIEST_NS = 946_684_800 * 10**9
@@ -172,7 +171,7 @@ class BinLayout:
 def read_bytes(file: Path) -> bytes:
     """The bytes of a scan; MapvoteError if it is gone."""
     try:
-        return whole_file(file)
+        return read_whole(file)
     except OSError as error:
         raise MapvoteError(f"{file}: {error.strerror}; the drive changed while it was read") from error
 

@@ -24,11 +24,11 @@ import numpy as np
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import folder_beside, whole_file, whole_folder, write_whole
 from mapvote.formats.geo.frame import PROJECTOR, MapFrame, frame_of_projector, projector_of
-from mapvote.formats.listing import entry, files_like, plain
+from mapvote.formats.listing import entry, files_like, plain_name
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, warn_of_float32
 from mapvote.formats.maps.pcd import save_pcd, stream_pcd
 from mapvote.formats.maps.tiling import Spill
-from mapvote.formats.reading import read_bytes, read_text, read_yaml
+from mapvote.formats.reading import read_text, read_whole, read_yaml
 
 log = logging.getLogger("mapvote.formats")
 
@@ -65,7 +65,7 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {_CONTENT}") from error
     for name in corners:
-        plain(name, file)
+        plain_name(name, file)
     frame = _frame(path)
     _warn_of_unlisted(path, set(corners))
     for name, corner in corners.items():
@@ -272,7 +272,7 @@ def _history(folder: Path) -> list[_Laid]:
     if not file.is_file():
         return []
     try:
-        return _HISTORY.decode(read_bytes(file))
+        return _HISTORY.decode(read_whole(file))
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: cannot be read ({error}); empty the folder and follow again") from error
 

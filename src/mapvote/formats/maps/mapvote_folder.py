@@ -22,7 +22,7 @@ from mapvote.core.point_map import LazyTiles, PointMap, in_memory_if_small
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
-from mapvote.formats.reading import read_bytes, read_head
+from mapvote.formats.reading import first_bytes, read_whole
 
 MANIFEST = "manifest.json"
 FORMAT = "mapvote-map"
@@ -86,7 +86,7 @@ def read_manifest(path: Path) -> FolderManifest:
     """The manifest of a map folder, checked; no tile is opened. MapvoteError if it is not one we can read."""
     file = path / MANIFEST
     try:
-        manifest = _DECODER.decode(read_bytes(file))
+        manifest = _DECODER.decode(read_whole(file))
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a readable map manifest ({error}); copy the map again") from error
     if manifest.format != FORMAT or not 1 <= manifest.format_version <= FORMAT_VERSION:
@@ -125,7 +125,7 @@ def read_map_folder(path: Path) -> PointMap:
     n_points = {}
     for index, hashes in named.items():
         with _whole(path, index):
-            n_points[index] = points_in_plane(read_head(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
+            n_points[index] = points_in_plane(first_bytes(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
     tiles = in_memory_if_small(LazyTiles(load, n_points))
     for index, hashes in named.items() if isinstance(tiles, LazyTiles) else ():
         with _whole(path, index):
@@ -150,7 +150,7 @@ def _whole(path: Path, index: TileIndex) -> Iterator[None]:
 
 def _planes(path: Path, hashes: TileHashes) -> dict[str, bytes]:
     """The frames of a tile's planes, by name."""
-    return {name: read_bytes(path / "planes" / digest) for name, digest in hashes.planes().items()}
+    return {name: read_whole(path / "planes" / digest) for name, digest in hashes.planes().items()}
 
 
 def _positions(data: bytes, path: Path) -> F64:
