@@ -54,7 +54,8 @@ def record(*, votes: bool = False) -> Callable[[Record], Record]:
 
 
 def numbers(*, votes: bool = False, packages: tuple[str, ...] = ("mapvote", "mapvote_server")) -> list[RecordField]:
-    """Every field of every record of ``packages``; ``votes``: only of those that vehicles vote by."""
+    """Every field of every record of ``packages`` ("mapvote_lab" is the laboratory's, which needs its extra);
+    ``votes``: only of those that vehicles vote by."""
     for module in modules_with_records(packages, votes=votes):
         import_module(module)
     chosen = [
