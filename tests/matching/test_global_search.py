@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap, has_open_ground, map_from_points
 from mapvote.core.types import F64, U8, U32, MapvoteError, Scan
-from mapvote.matching import global_search
-from mapvote.matching.global_search import MARGIN, CoarseMap, GlobalSearch, correlate, highest, laid_out
+from mapvote.matching.global_search import (
+    MARGIN,
+    CoarseMap,
+    GlobalSearch,
+    GlobalSearchNumbers,
+    correlate,
+    highest,
+    laid_out,
+)
 
 
 def street() -> PointMap:
@@ -92,10 +99,9 @@ def test_the_highest_are_those_of_a_sort_of_all(scores: list[int], most: int) ->
     np.testing.assert_array_equal(highest(every, most), np.argsort(every, kind="stable")[::-1][:most])
 
 
-def test_a_map_too_large_to_search_asks_for_a_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(global_search, "_MAX_CELLS", 1_000)
+def test_a_map_too_large_to_search_asks_for_a_prior() -> None:
     with pytest.raises(MapvoteError, match=r"too large to search; give the drive a prior"):
-        laid_out(street())
+        laid_out(street(), GlobalSearchNumbers(max_cells=1_000))
 
 
 CAMPUS = Path(__file__).parents[2] / "../shared/data/campus"

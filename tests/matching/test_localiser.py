@@ -11,7 +11,7 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, PosePrior, Scan
-from mapvote.matching.localiser import LOOKS, WAIT_SCANS, Localiser
+from mapvote.matching.localiser import LOCALISATION, Localiser
 from mapvote.matching.ndt_map import NdtMap
 from mapvote.matching.odometry import Fix
 from mapvote.matching.pose_check import Verdict
@@ -95,7 +95,7 @@ def test_a_track_that_holds_is_looked_at_quickly_and_with_care_where_that_leaves
     monkeypatch.setattr(one.judge, "judge", doubting)
     assert all(fix.trusted for fix in drive(one, POSES))
     first = looks.index(True)
-    assert first == LOOKS, "before the place is confirmed nothing is saved"
+    assert first == LOCALISATION.checks, "before the place is confirmed nothing is saved"
     assert looks[first:] == [True, False] * (len(looks[first:]) // 2)
 
 
@@ -142,4 +142,4 @@ def test_what_waits_is_bounded(point_map: PointMap) -> None:
     one = localiser(point_map)
     empty = np.zeros((0, 3), dtype=np.float32)
     out = [len(one.push(Scan(i * 100_000_000, empty), told(POSES[0]))) for i in range(60)]
-    assert sum(out) == 60 - WAIT_SCANS
+    assert sum(out) == 60 - LOCALISATION.wait_scans

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
-from mapvote.matching import pose_check
 from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap, build_ndt
 from mapvote.matching.ndt_voxels import Level
-from mapvote.matching.pose_check import Judge, Verdict, height_above_lowest, stands_above_ground
+from mapvote.matching.pose_check import POSE_CHECK, Judge, Verdict, height_above_lowest, stands_above_ground
 
 HERE = np.eye(4)
-ALL_POINTS = 10**6
+ALL_POINTS = replace(POSE_CHECK, points=10**6)
 NOISE_M = 0.05
 TWELVE_UP = np.array([0.0, 0.0, 12.0])
 
@@ -76,7 +75,7 @@ def test_more_noise_than_the_sensor_has_fits_worse_than_expected() -> None:
     assert Judge(0.4, ALL_POINTS).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
 
 
-def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_where_the_map_has_never_been_count_only_as_unknown() -> None:
     """Half of the scan stands 12 m above everything: the fit of the other half is what it was, unless more must be
     known. A scan that meets nothing of the map fits nowhere."""
     cloud, judge = clusters(2, 2500, NOISE_M), Judge(NOISE_M, ALL_POINTS)
@@ -85,8 +84,8 @@ def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told(monk
     assert verdict.known == pytest.approx(0.5)
     assert verdict.fit == pytest.approx(1.0, abs=0.02)
     for least, fits in ((0.49, True), (0.5, True), (0.51, False)):
-        monkeypatch.setattr(pose_check, "MIN_KNOWN", least)
-        assert (judge.fit(far_map(), scan, HERE) > 0.9) == fits
+        strict = Judge(NOISE_M, replace(ALL_POINTS, min_known=least))
+        assert (strict.fit(far_map(), scan, HERE) > 0.9) == fits
     lost = judge.judge(far_map(), with_ground(cloud + TWELVE_UP), HERE)
     assert (lost.fit, lost.known) == (0.0, 0.0)
 
@@ -179,7 +178,7 @@ def seen_from(T: F64, seed: int = 3) -> F64:
     return transform(inverse(T), points + rng.normal(0, 0.02, points.shape))
 
 
-JUDGE = Judge(0.02, 3000)
+JUDGE = Judge(0.02, replace(POSE_CHECK, points=3000))
 TRUTH = from_xyz_rpy(0.5, -0.4, 1.8, 0.0, 0.0, 0.3)
 
 
@@ -191,7 +190,7 @@ def test_the_right_place_leads_clearly(square: NdtMap, quick: bool) -> None:
     assert 0.75 < found.fit < 1.3
     assert found.known > 0.95
     assert found.lead > 0.3
-    few = Judge(0.02, 400).judge(square, seen_from(TRUTH), TRUTH, quick)
+    few = Judge(0.02, replace(POSE_CHECK, points=400)).judge(square, seen_from(TRUTH), TRUTH, quick)
     assert few.fit == pytest.approx(found.fit, abs=0.1)
     assert few.lead > 0.2, "by a handful of points, too"
 

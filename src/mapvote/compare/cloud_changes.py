@@ -1,7 +1,7 @@
-"""What differs between two clouds of one place that lie in one frame: gone, new, and not seen by the other.
+"""Objects that only one of two clouds of one place and frame has: gone, new, and not seen by the other.
 
-An object of one cloud is gone or new where the other cloud has nothing that stands within two cells, and must have
-seen the place. A map made of scans knows free space: it saw the place if half of the object's voxels are free in it. A
+An object of one cloud is gone or new where the other cloud has no surface within two cells, and must have seen the
+place. A map made of scans knows free space: it saw the place if half of the object's voxels are free in it. A
 bare cloud knows no rays: it saw the place if it has ground there. Rays to the ground pass below what hangs, and through
 gaps they show ground behind a house. So the ground does not decide where free space is known.
 
@@ -21,11 +21,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from mapvote.compare.register import SIDE_M, Registered
+from mapvote.compare.register import PATCHES, Registered
 from mapvote.core.columns import rebased
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import SCANS, PointMap, all_points, has_open_ground
+from mapvote.core.record import record
 from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapvoteError
@@ -36,18 +37,34 @@ from mapvote.shapes.outlines import Ring, group, pieces, rings
 
 Kind = Literal["gone", "new", "not seen"]
 BAND = np.uint64(0b1_1111_1100)
-"""The voxels .6 to 2.7 m above the layer of the ground: what is lower is kerb, grass or a slope's error."""
-REACH_CELLS = 2
-GROUND_APART_M = 0.4
-"""Grounds that lie farther apart are not one ground: a roof, a car's floor, a second level."""
-_EXPLAINED_M = 0.45
-"""A point so near to the other cloud under the motion of a bent patch is explained by the bend."""
-_VOXELS, _VOXELS_A_CELL, _VOXELS_ENOUGH = 4, 2, 80
-"""Occupied voxels that an object of A cells must have: 4 + 2 A, or 80, much as new objects of a drive must.
-What is thinner, one point a cell, is the fringe of a survey or the trail of something that moved."""
-_WALKED_BY = 8.0
-"""Scans that hit a voxel (0.3 m) while a walker of 0.5 m passes it at 1 m/s, at 10 Hz. What stands in reach of a survey
-is hit by tens. An object whose cells were hit less often (median), in a map that counts scans, is not listed."""
+"""The voxels 0.6 to 2.7 m above the layer of the ground: lower ones hold kerb, grass or a slope's error."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CloudComparison:
+    """Numbers of the comparison of two clouds."""
+
+    reach_cells: int = 2
+    """Cells around an object within which the other cloud must have no surface."""
+    ground_apart_m: float = 0.4
+    """Height difference from which two grounds are not one ground: a roof, a car's floor, a second level."""
+    explained_m: float = 0.45
+    """Distance from the other cloud, under the motion of a bent patch, within which the bend explains a point."""
+    voxels: int = 4
+    """Occupied voxels that every object must have, as new objects of a drive must."""
+    voxels_a_cell: int = 2
+    """Further voxels for each cell of the object: one point a cell is the fringe of a survey or a trail."""
+    voxels_enough: int = 80
+    """Voxels that are enough for an object of any size."""
+    walked_by: float = 8.0
+    """Scans that hit a 0.3 m voxel while a walker of 0.5 m passes it at 1 m/s, at 10 Hz. An object whose cells were hit
+    less often (median) is not listed; a standing surface in reach is hit by tens."""
+    on_page: int = 12
+    """Objects drawn on the page."""
+
+
+CLOUD_COMPARISON = CloudComparison()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +79,7 @@ class CloudChange:
     height_m: float
     """Its highest point above the ground."""
     points: int
-    """Of the cloud that has it, in its cells and above the ground."""
+    """Points of the cloud that has it, in its cells and above the ground."""
     box: tuple[float, float, float, float]
     """x0, y0, x1, y1 in a's frame, metres."""
     confidence: float
@@ -105,10 +122,10 @@ class CloudPlanes:
 
 @dataclass(frozen=True, slots=True)
 class OneSided:
-    """What only one of two clouds has, (rows, cols)."""
+    """Cells in which only one of two clouds has a surface, (rows, cols)."""
 
     changed: Bool
-    """The other cloud saw the place, and has nothing there."""
+    """The other cloud saw the place, and has no surface there."""
     not_seen: Bool
     """The other cloud does not show it, and may not have seen it."""
     sure: F64
@@ -132,8 +149,8 @@ class CellComparison:
 def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
     """The planes of a map that :func:`compare_cells` looks at."""
     here = reference_window(point_map, window)
-    known = np.isfinite(here.ground_z)
-    beside = (above_ground_points(point_map, window) != 0) & known
+    has_ground = np.isfinite(here.ground_z)
+    beside = (above_ground_points(point_map, window) != 0) & has_ground
     own, has_rays = (np.zeros(window.shape, dtype=np.bool_) for _ in range(2))
     scans = np.full(window.shape, np.inf)
     for index in window.tiles():
@@ -147,8 +164,8 @@ def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
         own[into] = (np.bincount(tile.cells[~tile.columns[1]], minlength=CELLS) > 0).reshape(tile.window.shape)[cut]
     free = np.zeros_like(here.occupied) if here.free is None else here.free
     return CloudPlanes(
-        here.ground_z, here.base, here.occupied, here.top_z, here.counts.astype(np.float64), own & known, beside, free,
-        has_rays, scans,
+        here.ground_z, here.base, here.occupied, here.top_z, here.counts.astype(np.float64), own & has_ground, beside,
+        free, has_rays, scans,
     )  # fmt: skip
 
 
@@ -164,7 +181,12 @@ def _mean_scans(tile: Tile) -> F64:
     return np.asarray((total / np.maximum(number, 1)).reshape(tile.window.shape))
 
 
-def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | None = None) -> CellComparison:
+def compare_cells(
+    map_a: PointMap,
+    map_b: PointMap,
+    registered: Registered | None = None,
+    numbers: CloudComparison = CLOUD_COMPARISON,
+) -> CellComparison:
     """Maps of one lattice and frame, cell by cell. ``registered``: how b came there; its bent parts are left out.
 
     MapvoteError if they do not overlap, or if one of them has no ground.
@@ -177,14 +199,17 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
                 f"{name} has no ground: the places that it saw are unknown, so whether an object is gone, new or not "
                 "seen cannot be decided by geometry alone"
             )
-    apart = (np.abs(a.ground_z - b.ground_z) > GROUND_APART_M) & a.own_ground & b.own_ground  # measured, not filled in
-    alone = [own.low & ~_hangs(own) & ~_around(other.low, REACH_CELLS) for own, other in ((a, b), (b, a))]
+    # Cells with two levels of ground (measured, not filled in), and cells in which only one cloud has a surface.
+    apart = (np.abs(a.ground_z - b.ground_z) > numbers.ground_apart_m) & a.own_ground & b.own_ground
+    alone = [own.low & ~_hangs(own) & ~_around(other.low, numbers.reach_cells) for own, other in ((a, b), (b, a))]
+    # Bent parts, and points that the bend explains.
     left_out = np.zeros(window.shape, dtype=np.bool_)
     if registered is not None:
         rows, cols = np.nonzero(alone[0] | alone[1])
         x, y = window.centres()
         left_out[rows, cols] = ~registered.compared(np.column_stack([x[cols], y[rows]]))
-        left_out |= _explained(alone, left_out, (map_a, map_b), window, registered)
+        left_out |= _explained(alone, left_out, (map_a, map_b), window, registered, numbers.explained_m)
+    # Whether the other cloud saw the place.
     sides = []
     for only, own, other in zip(alone, (a, b), (b, a), strict=True):
         low = own.words & BAND
@@ -209,26 +234,33 @@ def _around(cells: Bool, reach: int) -> Bool:
 
 
 def _explained(
-    alone: list[Bool], left_out: Bool, maps: tuple[PointMap, PointMap], window: Grid, registered: Registered
+    alone: list[Bool],
+    left_out: Bool,
+    maps: tuple[PointMap, PointMap],
+    window: Grid,
+    registered: Registered,
+    explained_m: float,
 ) -> Bool:
     """(rows, cols) cells of which half of the points fit the other cloud under the motion of a bent patch near them.
-    ``alone``: what only a has, and what only b has."""
+    ``alone``: cells of surfaces that only a has, and that only b has."""
     out = np.zeros(window.shape, dtype=np.bool_)
     motions = [] if registered.unbent else registered.other_motions()
     if not motions:
         return out
     clouds = [all_points(one) for one in maps]
     for k, cells in enumerate(alone):
-        mine = clouds[k][window.value_at(cells & ~left_out, clouds[k])]
-        fits = np.zeros(len(mine), dtype=np.bool_)
+        # The points of one cloud that fit the other one under any of the motions.
+        points = clouds[k][window.value_at(cells & ~left_out, clouds[k])]
+        fits = np.zeros(len(points), dtype=np.bool_)
         for centre, T in motions:  # T moves b's points
             others = clouds[1 - k][_near(clouds[1 - k], centre)]
-            here = np.flatnonzero(_near(mine, centre) & ~fits)
+            here = np.flatnonzero(_near(points, centre) & ~fits)
             if not len(others) or not len(here):
                 continue
-            at, others = (mine[here], transform(T, others)) if k == 0 else (transform(T, mine[here]), others)
-            fits[here] = KDTree(others).query(at, distance_upper_bound=_EXPLAINED_M)[0] < _EXPLAINED_M
-        rows, cols, _ = window.indices_of(mine)
+            at, others = (points[here], transform(T, others)) if k == 0 else (transform(T, points[here]), others)
+            fits[here] = KDTree(others).query(at, distance_upper_bound=explained_m)[0] < explained_m
+        # The share of them in each cell.
+        rows, cols, _ = window.indices_of(points)
         total, explained = np.zeros(window.shape), np.zeros(window.shape)
         np.add.at(total, (rows, cols), 1.0)
         np.add.at(explained, (rows[fits], cols[fits]), 1.0)
@@ -237,52 +269,61 @@ def _explained(
 
 
 def _near(points: F64, centre: F64) -> Bool:
-    return np.asarray((np.abs(points[:, :2] - centre) < SIDE_M).all(axis=1))
+    return np.asarray((np.abs(points[:, :2] - centre) < PATCHES.side_m).all(axis=1))
 
 
-def differences(found: CellComparison, min_m2: float = 0.5) -> list[CloudChange]:
-    """Objects of at least ``min_m2`` that only one cloud has: gone and new by area, then what was not seen."""
+def differences(
+    compared: CellComparison, min_m2: float = 0.5, numbers: CloudComparison = CLOUD_COMPARISON
+) -> list[CloudChange]:
+    """Objects of at least ``min_m2`` that only one cloud has: gone and new by area, then those not seen."""
     out = [
-        *_objects(found, "gone", "a", min_m2),
-        *_objects(found, "new", "b", min_m2),
-        *_objects(found, "not seen", "a", min_m2),
-        *_objects(found, "not seen", "b", min_m2),
+        *_objects(compared, "gone", "a", min_m2, numbers),
+        *_objects(compared, "new", "b", min_m2, numbers),
+        *_objects(compared, "not seen", "a", min_m2, numbers),
+        *_objects(compared, "not seen", "b", min_m2, numbers),
     ]
     return sorted(out, key=lambda one: (one.kind == "not seen", -one.area_m2))
 
 
-def _objects(found: CellComparison, kind: Kind, has: Literal["a", "b"], min_m2: float) -> list[CloudChange]:
-    owner, other, side = (found.a, found.b, found.only_a) if has == "a" else (found.b, found.a, found.only_b)
+def _objects(
+    compared: CellComparison, kind: Kind, has: Literal["a", "b"], min_m2: float, numbers: CloudComparison
+) -> list[CloudChange]:
+    """The objects of one kind that one cloud has."""
+    a, b = compared.a, compared.b
+    owner, other, side = (a, b, compared.only_a) if has == "a" else (b, a, compared.only_b)
     cells = side.not_seen if kind == "not seen" else side.changed
-    rows, cols = (found_at.astype(np.int64) for found_at in np.nonzero(cells))
+    rows, cols = (indices.astype(np.int64) for indices in np.nonzero(cells))
     if not len(rows):
         return []
-    window = found.window
+    window = compared.window
+    # Cells that hang together, and their outlines.
     kinds = np.zeros(len(rows), dtype=np.int64)
     hang_together = pieces(rows, cols, kinds)
     things = group(rows, cols, kinds, hang_together.objects)
     outlines = rings(rows + window.row0, cols + window.col0, hang_together.polygons)
+    # Each object with enough area, voxels and scans.
     ground = np.where(np.isfinite(owner.ground_z), owner.ground_z, other.ground_z)
     height = (owner.top_z - ground)[rows, cols]
     x, y = (centres - 0.5 * CELL_SIZE for centres in window.centres())
     out = []
-    for mine in np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1]):
-        area_m2 = len(mine) * CELL_SIZE**2
+    for of_object in np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1]):
+        area_m2 = len(of_object) * CELL_SIZE**2
         if area_m2 < min_m2 - 1e-9:
             continue
-        r, c = rows[mine], cols[mine]
+        r, c = rows[of_object], cols[of_object]
         voxels = int(np.bitwise_count(owner.words[r, c]).sum())
-        if kind != "not seen" and voxels < min(_VOXELS + _VOXELS_A_CELL * len(mine), _VOXELS_ENOUGH):
+        needed = min(numbers.voxels + numbers.voxels_a_cell * len(of_object), numbers.voxels_enough)
+        if kind != "not seen" and voxels < needed:
             continue
-        if kind != "not seen" and np.median(owner.scans[r, c]) < _WALKED_BY:
+        if kind != "not seen" and np.median(owner.scans[r, c]) < numbers.walked_by:
             continue
         points = int(owner.counts[r, c].sum())
         out.append(
             CloudChange(
                 kind,
-                [outlines[p] for p in np.unique(hang_together.polygons[mine])],
+                [outlines[p] for p in np.unique(hang_together.polygons[of_object])],
                 area_m2,
-                float(np.nanmax(height[mine], initial=0.0)),
+                float(np.nanmax(height[of_object], initial=0.0)),
                 points,
                 (float(x[c.min()]), float(y[r.min()]), float(x[c.max()] + CELL_SIZE), float(y[r.max()] + CELL_SIZE)),
                 float(side.sure[r, c].mean()) if kind != "not seen" else 0.0,
@@ -293,10 +334,7 @@ def _objects(found: CellComparison, kind: Kind, has: Literal["a", "b"], min_m2: 
     return out
 
 
-_ON_PAGE = 12
-
-
-def difference_rows(found: Sequence[CloudChange]) -> list[dict[str, Any]]:
+def difference_rows(changes: Sequence[CloudChange]) -> list[dict[str, Any]]:
     """One row per object, numbered as listed."""
     return [
         {
@@ -311,19 +349,19 @@ def difference_rows(found: Sequence[CloudChange]) -> list[dict[str, Any]]:
             "points": one.points,
             "confidence": round(one.confidence, 2),
         }
-        for number, one in enumerate(found, 1)
+        for number, one in enumerate(changes, 1)
     ]
 
 
 def difference_geojson(
-    found: Sequence[CloudChange], lattice: Lattice, georeference: Mapping[str, str], told: Sequence[str]
+    changes: Sequence[CloudChange], lattice: Lattice, georeference: Mapping[str, str], registration: Sequence[str]
 ) -> dict[str, Any]:
     """A FeatureCollection (RFC 7946) of the footprints: in longitude and latitude where map A knows its place on Earth,
-    else in A's metres; its member "frame" says which. ``told``: sentences on the registration."""
+    else in A's metres; its member "frame" says which. ``registration``: sentences on it."""
     frame = frame_of(georeference)
     origin = np.array([lattice.x0, lattice.y0])
     features = []
-    for row, one in zip(difference_rows(found), found, strict=True):
+    for row, one in zip(difference_rows(changes), changes, strict=True):
         polygons = [[np.round(ring * CELL_SIZE + origin, 3).tolist() for ring in polygon] for polygon in one.outline]
         geometry = {"type": "MultiPolygon", "coordinates": polygons}
         if not frame.is_local:
@@ -332,17 +370,18 @@ def difference_geojson(
     return {
         "type": "FeatureCollection",
         "frame": MAP_METRES if frame.is_local else "WGS 84 longitude, latitude",
-        "registration": list(told),
+        "registration": list(registration),
         "features": features,
     }
 
 
-def difference_page(title: str, found: Sequence[CloudChange], map_a: PointMap, map_b: PointMap) -> str:
-    """HTML of the largest things that are gone or new, with both clouds around them; a file that needs nothing else.
+def difference_page(title: str, changes: Sequence[CloudChange], map_a: PointMap, map_b: PointMap) -> str:
+    """HTML of the largest objects that are gone or new, with both clouds around them; a file that needs nothing else.
 
-    What both clouds have (a point of B within a voxel of one of A) is drawn as A's. ``map_b`` lies in A's frame.
+    Points of B within a voxel of one of A are drawn as A's. ``map_b`` lies in A's frame.
     """
-    shown = sorted((one for one in found if one.kind != "not seen"), key=lambda one: -one.area_m2)[:_ON_PAGE]
+    seen = sorted((one for one in changes if one.kind != "not seen"), key=lambda one: -one.area_m2)
+    shown = seen[: CLOUD_COMPARISON.on_page]
     after: dict[TileIndex, Tile] = {}
 
     def tile_after(index: TileIndex) -> Tile:

@@ -21,6 +21,7 @@ from mapvote.compare.register import Registered, register_maps
 from mapvote.core.geometry import inverse, inverses, poses_at, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
+from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.core.voxels import VoxelCloud, voxel_keys
 from mapvote.formats.maps.tiling import GPS_TIMES, UNCHECKED
@@ -28,12 +29,26 @@ from mapvote.survey.clean_map import specks, strays
 from mapvote.survey.driven_road import road_under
 from mapvote.survey.pose_graph import Anchors, Links, optimise
 
-MOST_APART_M = 0.1
-"""How far the patches of a pair may be apart (median), after the adjustment, unless another bound is given."""
-_HELD = 1e-4
-_SAME_FRAME_M, _SAME_FRAME_RAD = 0.5, np.radians(0.5)
 _MOST_MAPS = 64
 """Bits of a point's sources."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Merging:
+    """Numbers of the adjustment of several maps."""
+
+    most_apart_m: float = 0.1
+    """Greatest distance of the patches of a pair (median), after the adjustment, unless another bound is given."""
+    held: float = 1e-4
+    """Sigma, metres and radians, that holds the first map in its place."""
+    same_frame_m: float = 0.5
+    """Shift up to which maps that were registered lie in one stated frame."""
+    same_frame_rad: float = float(np.radians(0.5))
+    """Sigma of the attitude of a map that states this frame."""
+
+
+MERGING = Merging()
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +62,7 @@ class Merged:
     """Median distance of the patches of each pair that overlaps, after the adjustment."""
 
 
-def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MOST_APART_M) -> Merged:
+def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MERGING.most_apart_m) -> Merged:
     """One map on the lattice and in the frame of the first, or in the mean of their frames if all state one.
 
     The ground is computed anew, from the driven paths where the maps carry them; the paths stay. A voxel is free if its
@@ -60,27 +75,31 @@ def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MOST_APART_M) 
     if not 2 <= len(maps) <= _MOST_MAPS:
         raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
     clouds = [all_points(one) for one in maps]
-    pairs, why = {}, {}
+    pairs, reasons = {}, {}
     for i, j in combinations(range(len(maps)), 2):
         try:
             pairs[i, j] = register_maps(maps[i], maps[j])
         except MapvoteError as error:
-            why[i, j] = str(error)
-    T = _adjusted(maps, pairs, why, np.array([np.median(cloud, axis=0) for cloud in clouds]))
+            reasons[i, j] = str(error)
+    T = _adjusted(maps, pairs, reasons, np.array([np.median(cloud, axis=0) for cloud in clouds]))
     apart_m = {(i, j): float(np.median(one.patches.apart_m(inverse(T[i]) @ T[j]))) for (i, j), one in pairs.items()}
     _refuse_contradictions(pairs, apart_m, most_apart_m)
     return Merged(_laid(maps, clouds, T), T, apart_m)
 
 
 def _adjusted(
-    maps: Sequence[PointMap], pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str], middles: F64
+    maps: Sequence[PointMap],
+    pairs: dict[tuple[int, int], Registered],
+    reasons: dict[tuple[int, int], str],
+    middles: F64,
+    numbers: Merging = MERGING,
 ) -> F64:
     """(n, 4, 4) where the maps lie in the first one's frame: along the pairs, then all links together.
 
-    Surveys of one lattice that lie within _SAME_FRAME_M of where they say, at their ``middles`` (n, 3), state one
+    Surveys of one lattice that lie within ``same_frame_m`` of where they say, at their ``middles`` (n, 3), state one
     frame, each with the error of its own prior: then no map is right alone, and the adjusted frame is the mean of
     theirs."""
-    T = _along_the_pairs(len(maps), pairs, why)
+    T = _along_the_pairs(len(maps), pairs, reasons)
     # The graph holds each map's middle in a frame about the first one's middle: in the coordinates of a country the
     # error of a turn would be multiplied by the distance from their origin.
     about = poses_at(middles)
@@ -95,21 +114,22 @@ def _adjusted(
         )
         for (i, j), one in pairs.items()
     ]
+    # One stated frame, or that of the first map.
     moved_m = [np.linalg.norm(transform(T[k], middles[k][None])[0] - middles[k]) for k in range(len(maps))]
     apart = any(one.lattice != maps[0].lattice or _place(one) != _place(maps[0]) for one in maps)
-    if apart or any(far_m > _SAME_FRAME_M for far_m in moved_m):
-        anchors = Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)
+    if apart or any(far_m > numbers.same_frame_m for far_m in moved_m):
+        anchors = Anchors(np.array([0]), np.eye(4)[None], numbers.held, numbers.held)
     else:
-        anchors = Anchors(np.arange(len(T)), inverse(about[0]) @ about, _SAME_FRAME_M, _SAME_FRAME_RAD)
+        anchors = Anchors(np.arange(len(T)), inverse(about[0]) @ about, numbers.same_frame_m, numbers.same_frame_rad)
     return np.asarray(about[0] @ optimise(nodes, links, [anchors], iterations=10) @ inverses(about))
 
 
 def _place(one: PointMap) -> dict[str, str]:
-    """What a map says of its coordinates; what it says of its points' times tells no frame."""
+    """The frame that a map states; the times of its points are no part of it."""
     return {name: text for name, text in one.georeference.items() if name not in (GPS_TIMES, UNCHECKED)}
 
 
-def _along_the_pairs(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str]) -> F64:
+def _along_the_pairs(n: int, pairs: dict[tuple[int, int], Registered], reasons: dict[tuple[int, int], str]) -> F64:
     """(n, 4, 4) where the maps lie in the first one's frame, each by one pair. MapvoteError where no pair leads."""
     T = np.tile(np.eye(4), (n, 1, 1))
     placed = {0}
@@ -117,8 +137,8 @@ def _along_the_pairs(n: int, pairs: dict[tuple[int, int], Registered], why: dict
         step = next(((i, j) for i, j in pairs if (i in placed) != (j in placed)), None)
         if step is None:
             lost = min(set(range(n)) - placed)
-            reasons = "; ".join(f"with map {min(p) + 1}: {text}" for p, text in why.items() if lost in p)
-            raise MapvoteError(f"map {lost + 1} cannot be registered to any of the others ({reasons})")
+            listed = "; ".join(f"with map {min(p) + 1}: {text}" for p, text in reasons.items() if lost in p)
+            raise MapvoteError(f"map {lost + 1} cannot be registered to any of the others ({listed})")
         i, j = step
         if i in placed:
             T[j] = T[i] @ pairs[step].T_a_b
@@ -208,9 +228,9 @@ def _without_strays(merged: PointMap, maps: Sequence[PointMap], T: F64) -> Point
     points, scans = all_points(merged), all_fields(merged)[SCANS].astype(np.int32)
     indices = sorted(merged.tiles)
     standing = np.concatenate([merged.tiles[index].columns[1] for index in indices])
-    asked = np.flatnonzero(standing & (scans > 0))
+    counted = np.flatnonzero(standing & (scans > 0))
     dropped = np.zeros(len(points), dtype=np.bool_)
-    dropped[asked] = strays(points[asked], scans[asked], np.concatenate(driven), merged.lattice)
+    dropped[counted] = strays(points[counted], scans[counted], np.concatenate(driven), merged.lattice)
     left = np.flatnonzero(standing & ~dropped)
     dropped[left] = specks(points[left], np.where(scans > 0, scans, 255)[left], merged.lattice)
     ends = np.cumsum([len(merged.tiles[index].points) for index in indices])

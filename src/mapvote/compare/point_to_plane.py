@@ -13,9 +13,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from mapvote.core.geometry import exp, log, transform
+from mapvote.core.record import record
 from mapvote.core.types import F64
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class PlaneMatch:
     """Numbers of the refinement."""
@@ -36,14 +38,14 @@ class PlaneMatch:
     """Standard deviation of one match along its normal. Neighbours share their surface's roughness, so it is larger
     than that of a range."""
     settled_m: float = 1e-4
-    """A step shorter than this, 20 m away too, is the last."""
+    """A step shorter than this, also at ``lever_m``, is the last."""
+    lever_m: float = 20.0
+    """Distance at which a turn counts as a shift in ``settled_m``."""
     least: int = 50
     """Fewer matches decide nothing: the start stays."""
 
 
 PLANE_MATCH = PlaneMatch()
-_LEVER_M = 20.0
-"""Distance at which a turn counts as a shift in ``settled_m``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ def refine_on_planes(
         H = (J * weight[:, None]).T @ J + information
         step = np.linalg.solve(H, J.T @ (weight * off_m) - information @ log(moved))
         moved = exp(step) @ moved
-        if np.linalg.norm(step[:3]) + _LEVER_M * np.linalg.norm(step[3:]) < numbers.settled_m:
+        if np.linalg.norm(step[:3]) + numbers.lever_m * np.linalg.norm(step[3:]) < numbers.settled_m:
             break
     refined = moved.copy()
     refined[:3, :3] = moved[:3, :3] @ T_a_b[:3, :3]

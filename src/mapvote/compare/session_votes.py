@@ -3,7 +3,8 @@
 The cloud is registered to the map without a prior. It votes occupied where it has points, gone or new as
 :mod:`mapvote.compare.cloud_changes` decides it, empty where it has ground and nothing else, and nowhere else. The
 map learns free space from a trajectory only: a ray runs from each of its poses to what the cloud shows first in that
-direction. Such rays are not measured, so they decide no change. A bent part casts no vote.
+direction. Such rays are not measured, so they decide no change. Two rays must pass a voxel to make it free: one may
+follow an error of the trajectory. A bent part casts no vote.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from mapvote.core.columns import dilated, rebased
 from mapvote.core.geometry import poses_at, rows_from, transform
 from mapvote.core.grid import Grid, Lattice, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState, MapvoteError
@@ -33,18 +35,29 @@ from mapvote.perception.raycast import CLEARANCE_M
 from mapvote.rules.voter import NewPoints, TileVotes
 from mapvote.vehicle import write_ballot
 
-_RANGE_M = 30.0
-_BIN_RAD = np.radians(1.0)
-_PASSES = 2
-"""Poses whose rays must pass a voxel to make it free: one may be an error of the trajectory."""
-_POSE_STEP_M = 1.0
 _LOW = np.uint64(0b11) | BAND
-"""Voxels that go with a thing in BAND; above them what hangs together with it."""
+"""Voxels that are deleted with an object in BAND, and above them those that hang together with it."""
+
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class TrajectoryRays:
+    """Numbers of the free space that a session's trajectory gives."""
+
+    range_m: float = 30.0
+    """Half of the side of the square around a position within which rays are followed."""
+    bin_rad: float = float(np.radians(1.0))
+    """Width of a direction with one ray."""
+    pose_step_m: float = 1.0
+    """Spacing of the positions."""
+
+
+TRAJECTORY_RAYS = TrajectoryRays()
 
 
 @dataclass(frozen=True, slots=True)
 class SessionVote:
-    """What came of a session's cloud."""
+    """The ballot of a session's cloud, with its registration and its changes."""
 
     ballot: Ballot
     registered: Registered
@@ -102,31 +115,34 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
 
 
 def _votes(
-    lattice: Lattice, found: CellComparison, session_free: U64, changes: list[CloudChange], registered: Registered
+    lattice: Lattice, compared: CellComparison, session_free: U64, changes: list[CloudChange], registered: Registered
 ) -> Iterator[tuple[TileIndex, TileVotes]]:
     """Tile by tile; ``session_free`` (rows, cols): column words of the session's free space over the window of the
     comparison. Only where a part of the session lies that one motion registers to the map."""
-    mine, other = found.a, found.b
-    x, y = found.window.centres()
+    own, other = compared.a, compared.b
+    x, y = compared.window.centres()
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    known = registered.compared(xy).reshape(found.window.shape) & ~found.left_out
-    there = rebased(other.words, other.base - mine.base)
-    near = dilated(there, mine.base, 1)
-    states = np.full(mine.low.shape, NO_VOTE, dtype=np.uint8)
-    states[other.own_ground & ~other.stands & ~mine.stands] = CellState.UNCHANGED_EMPTY
-    states[mine.words & near != 0] = CellState.UNCHANGED_OCCUPIED
-    gone, new = np.zeros_like(mine.words), np.zeros_like(mine.words)
+    covered = registered.compared(xy).reshape(compared.window.shape) & ~compared.left_out
+    # Cells that agree with the map: empty, or occupied where both have voxels.
+    there = rebased(other.words, other.base - own.base)
+    near = dilated(there, own.base, 1)
+    states = np.full(own.low.shape, NO_VOTE, dtype=np.uint8)
+    states[other.own_ground & ~other.stands & ~own.stands] = CellState.UNCHANGED_EMPTY
+    states[own.words & near != 0] = CellState.UNCHANGED_OCCUPIED
+    # Cells of the changes.
+    gone, new = np.zeros_like(own.words), np.zeros_like(own.words)
     for change in changes:
         if change.kind == "gone":
-            gone[change.cells] = _hanging_together(mine.words[change.cells]) & ~near[change.cells]
+            gone[change.cells] = _hanging_together(own.words[change.cells]) & ~near[change.cells]
             states[change.cells] = np.where(gone[change.cells] != 0, np.uint8(CellState.CHANGED_EMPTY), NO_VOTE)
         elif change.kind == "new":
-            new[change.cells] = there[change.cells] & ~mine.words[change.cells]
+            new[change.cells] = there[change.cells] & ~own.words[change.cells]
             states[change.cells] = CellState.CHANGED_OCCUPIED
-    states[~known] = NO_VOTE
-    free = rebased(session_free, other.base - mine.base) & ~near & ~mine.words
-    for tile in found.window.tiles():
-        cut = lattice.tile(tile).slices_in(found.window)
+    states[~covered] = NO_VOTE
+    # The votes of each tile.
+    free = rebased(session_free, other.base - own.base) & ~near & ~own.words
+    for tile in compared.window.tiles():
+        cut = lattice.tile(tile).slices_in(compared.window)
         if (states[cut] != NO_VOTE).any():
             yield tile, _tile_votes(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
 
@@ -143,8 +159,8 @@ def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
 
 
 def _hanging_together(words: U64) -> U64:
-    """(n,) the lowest voxels of each column, and above them what follows without a gap of two: a car, not the crown of
-    the tree that it stood under."""
+    """(n,) the lowest voxels of each column, and those above them without a gap of two: a car, not the crown of the
+    tree that it stood under."""
     out = words & _LOW
     while True:
         more = words & ((out << np.uint64(1)) | (out << np.uint64(2)))
@@ -153,21 +169,23 @@ def _hanging_together(words: U64) -> U64:
         out |= more
 
 
-def with_free_space(session_map: PointMap, driven: F64) -> PointMap:
+def with_free_space(session_map: PointMap, driven: F64, numbers: TrajectoryRays = TRAJECTORY_RAYS) -> PointMap:
     """The map with the voxels free that rays from the positions ``driven`` (n, 3), map metres, pass on their way to
-    what they would have measured."""
+    the first surface."""
+    # Positions that lie apart.
     points = all_points(session_map)
     spacing_m = _spacing(points)
     kept = [driven[0]]
     for position in driven[1:]:
-        if np.linalg.norm(position - kept[-1]) >= _POSE_STEP_M:
+        if np.linalg.norm(position - kept[-1]) >= numbers.pose_step_m:
             kept.append(position)
+    # Voxels that rays of one position passed, and of two.
     once: dict[TileIndex, U64] = {}
     twice: dict[TileIndex, U64] = {}
     for origin in kept:
-        window = window_around(session_map.lattice, origin[0], origin[1], 2 * _RANGE_M)
+        window = window_around(session_map.lattice, origin[0], origin[1], 2 * numbers.range_m)
         base = np.ascontiguousarray(reference_window(session_map, window).base)
-        passed = _passed(points, origin, base, window, spacing_m)
+        passed = _passed(points, origin, base, window, spacing_m, numbers)
         for tile in window.tiles():
             if tile in session_map.tiles:
                 common = session_map.lattice.tile(tile).intersection(window)
@@ -185,25 +203,28 @@ def with_free_space(session_map: PointMap, driven: F64) -> PointMap:
 
 
 def _free_words(point_map: PointMap, window: Grid) -> U64:
-    known = reference_window(point_map, window).free
-    return np.zeros(window.shape, dtype=np.uint64) if known is None else known
+    free = reference_window(point_map, window).free
+    return np.zeros(window.shape, dtype=np.uint64) if free is None else free
 
 
-def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float) -> U64:
+def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float, numbers: TrajectoryRays) -> U64:
     """(rows, cols) column words that rays from ``origin`` pass: one ray for each direction of a degree, to the nearest
     point there. Near points are as wide as the spacing of the cloud: no ray passes between two of one surface."""
+    # The range image of one return for each direction.
     away = points - origin
-    away = away[(np.abs(away[:, :2]) < _RANGE_M).all(axis=1)]
+    away = away[(np.abs(away[:, :2]) < numbers.range_m).all(axis=1)]
     reach = np.linalg.norm(away, axis=1)
     away, reach = away[reach > 1.0], reach[reach > 1.0]
-    col = np.floor((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / _BIN_RAD).astype(np.int64) % 360
-    row = np.floor((np.arcsin(away[:, 2] / reach) + np.pi / 2) / _BIN_RAD).astype(np.int64)
+    col = np.floor((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / numbers.bin_rad).astype(np.int64) % 360
+    row = np.floor((np.arcsin(away[:, 2] / reach) + np.pi / 2) / numbers.bin_rad).astype(np.int64)
     image = np.full((181, 360), np.inf)
     np.minimum.at(image, (row, col), reach)
+    # Near points widen over the directions that their surface covers.
     nearest = image.copy()
     for wide in (1, 2, 4, 8):
-        near = np.where(image * _BIN_RAD * wide < 1.5 * spacing_m, image, np.inf)
+        near = np.where(image * numbers.bin_rad * wide < 1.5 * spacing_m, image, np.inf)
         nearest = np.minimum(nearest, ndimage.minimum_filter(near, 2 * wide + 1, mode=("nearest", "wrap")))
+    # The rays to the first surface.
     first = (reach <= image[row, col]) & (reach <= nearest[row, col] + CLEARANCE_M)
     words = np.zeros(window.shape, dtype=np.uint64)
     rays = follow_rays(rows_from(away[first] + origin, origin), CLEARANCE_M)
@@ -213,5 +234,5 @@ def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float)
 
 def _spacing(points: F64) -> float:
     """Median distance to the nearest neighbour of a sample of (n, 3) points, metres."""
-    some = points[np.random.default_rng(0).permutation(len(points))[:2000]]
-    return float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
+    sample = points[np.random.default_rng(0).permutation(len(points))[:2000]]
+    return float(np.median(KDTree(points).query(sample, k=2)[0][:, 1]))

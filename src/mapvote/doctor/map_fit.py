@@ -28,7 +28,7 @@ from mapvote.matching.global_search import GlobalSearch
 from mapvote.matching.matcher import likeliest, likelihood_at
 from mapvote.matching.ndt_map import MapWindow, NdtMap
 from mapvote.matching.ndt_voxels import LEVELS
-from mapvote.matching.pose_check import MIN_FIT, Judge
+from mapvote.matching.pose_check import POSE_CHECK, Judge
 from mapvote.matching.prepare import deskew, motion_at, solid_sample, thin_for_levels
 
 Step = TypeVar("Step")
@@ -83,7 +83,7 @@ class Place:
     @property
     def fits(self) -> bool:
         """Whether the scan was taken here."""
-        return self.fit >= MIN_FIT
+        return self.fit >= POSE_CHECK.min_fit
 
 
 def fitting(places: Sequence[Place]) -> list[Place]:
@@ -171,7 +171,7 @@ def check_on_map(
         best = max(places, key=lambda p: p.fit)
         what = f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the "
         mend = "is it the map of another street, in another scale or tilt, or all changed?"
-        return [*found, Finding("error", f"{what}same street fits above {MIN_FIT}", mend)], T
+        return [*found, Finding("error", f"{what}same street fits above {POSE_CHECK.min_fit}", mend)], T
     # Places far apart show the scale as well, but no better than the prior's positions are known.
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
@@ -280,7 +280,7 @@ def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
         found = search.find(scan)
     except MapvoteError:  # too large to search
         return None
-    return None if found is None or found.fit < MIN_FIT else found.T_map_lidar
+    return None if found is None or found.fit < POSE_CHECK.min_fit else found.T_map_lidar
 
 
 def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], judge: Judge) -> Place:

@@ -1,7 +1,7 @@
-"""Where in the whole map was this scan taken? A search without any prior, over every place that can be driven on.
+"""The place of a scan in the whole map: a search without any prior, over every place that can be driven on.
 
 Exhaustive correlation (Olson, Real-time correlative scan matching, 2009) with a column word for every metre of map:
-what stands in the scan, by its height above the ground, is looked up at every drivable place and heading. Heights
+the points of the scan, by their heights above the ground, are looked up at every drivable place and heading. Heights
 above the ground need no roll, pitch or altitude. The best peaks are refined by NDT and judged like any other pose.
 One km2 of streets has some 10^7 places and headings: seconds, so no branching and bounding.
 """
@@ -19,24 +19,59 @@ from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
-from mapvote.matching.coarse_search import LEAST_LEAD, best_and_rival, distinct, place_without_prior
+from mapvote.matching.coarse_search import COARSE_SEARCH, best_and_rival, distinct, place_without_prior
 from mapvote.matching.matcher import map_around
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Tracker
-from mapvote.matching.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
+from mapvote.matching.pose_check import POSE_CHECK, Judge, PoseCheck, height_above_lowest
 from mapvote.matching.prepare import Sample, deskew, solid_sample, thin_for_levels
 
-CELL_M = 1.0
-LAYER_M = 1.0
-LOW_M, HIGH_M = 0.8, 30.0
-"""Heights above the ground that are used."""
 MARGIN = 32
-"""Of every second cell: more than the 45 m within which points are used."""
+"""Margin of every second cell around the map: more than the 45 m within which points are used."""
 _SPAN = 64
 """Cells of a row that are looked up together."""
-_MAX_CELLS = 40_000_000
-"""Of one metre: a box of 6 km by 6 km."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class GlobalSearchNumbers:
+    """Numbers of the search over the whole map."""
+
+    cell_m: float = 1.0
+    """Side of a cell."""
+    layer_m: float = 1.0
+    """Height of a layer."""
+    low_m: float = 0.8
+    """Least height above the ground of the points that are used."""
+    high_m: float = 30.0
+    """Greatest height above the ground of the points that are used: 32 layers fit into a word."""
+    max_cells: int = 40_000_000
+    """Cells of the largest map that is searched: a box of 6 km by 6 km."""
+    reach_m: float = 45.0
+    """Distance from the sensor up to which points are used."""
+    points: int = 200
+    """Points that are looked up at each place."""
+    first: int = 48
+    """Points after which a hopeless place is given up."""
+    yaws: int = 120
+    """Headings tried, 3 deg apart."""
+    spread_m: float = 3.0
+    """Distance within which two peaks are one."""
+    spread_rad: float = float(np.radians(15.0))
+    """Turn within which two peaks are one."""
+    peaks: int = 60
+    """Peaks that are sharpened on single cells."""
+    refined: int = 12
+    """Sharpened peaks that are refined by the matcher."""
+    judged: int = 3
+    """Refined places that are judged."""
+    min_score: float = 0.4
+    """Mean likelihood of the points above the ground from which a place in a map without ground is accepted."""
+
+
+GLOBAL_SEARCH = GlobalSearchNumbers()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +83,10 @@ class CoarseMap:
     ground_z: F32
     """(rows, cols) map metres, NaN where unknown."""
     words: U32
-    """(rows, cols) what stands, by layers of a metre above the ground."""
+    """(rows, cols) occupied layers of a metre above the ground."""
     wide: U32
     """(2, 2, rows / 2, cols / 2) the same, dilated, by even and odd rows and columns, with MARGIN cells and more on
-    each side: what places on every second cell look up for one point of a scan lies side by side."""
+    each side: the words that places on every second cell look up for one point of a scan lie side by side."""
     rows: I64
     cols: I64
     """Cells on a coarser raster in which a vehicle can stand, row by row."""
@@ -59,29 +94,33 @@ class CoarseMap:
     """(m, 3) row and first column in ``wide``, and the first of these cells, of each stretch of a row with any."""
 
 
-def laid_out(point_map: PointMap) -> CoarseMap:
+def laid_out(point_map: PointMap, numbers: GlobalSearchNumbers = GLOBAL_SEARCH) -> CoarseMap:
     """The whole map. MapvoteError if it is too large to search."""
+    cell_m = numbers.cell_m
+    # The box of all tiles.
     windows = [tile.window for tile in point_map.tiles.values()]
     x0, y0 = min(w.x0 for w in windows), min(w.y0 for w in windows)
-    cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / CELL_M))
-    rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / CELL_M))
-    if rows * cols > _MAX_CELLS:
+    cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / cell_m))
+    rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / cell_m))
+    if rows * cols > numbers.max_cells:
         raise MapvoteError(
             f"map {point_map.map_id} is {cols} m by {rows} m: too large to search; give the drive a prior (--prior)"
         )
+    # Ground and layers of each tile.
     words, ground_z = np.zeros((rows, cols), dtype=np.uint32), np.full((rows, cols), np.nan, dtype=np.float32)
     for tile in point_map.tiles.values():
         x, y = tile.window.centres()
-        known = np.nonzero(np.isfinite(tile.ground_z))
-        at = ((y[known[0]] - y0) / CELL_M).astype(np.int64), ((x[known[1]] - x0) / CELL_M).astype(np.int64)
-        ground_z[at] = tile.ground_z[known]
+        measured = np.nonzero(np.isfinite(tile.ground_z))
+        at = ((y[measured[0]] - y0) / cell_m).astype(np.int64), ((x[measured[1]] - x0) / cell_m).astype(np.int64)
+        ground_z[at] = tile.ground_z[measured]
         points = tile.points_map
         height = points[:, 2] - tile.ground_z.reshape(-1)[flat_cells(tile.window, tile.points)]
-        tall = (height > LOW_M) & (height < HIGH_M)  # nowhere over unknown ground
-        bit = np.uint32(1) << np.floor(height[tall] / LAYER_M).astype(np.uint32)
-        at = ((points[tall, 1] - y0) / CELL_M).astype(np.int64), ((points[tall, 0] - x0) / CELL_M).astype(np.int64)
+        tall = (height > numbers.low_m) & (height < numbers.high_m)  # nowhere over unknown ground
+        bit = np.uint32(1) << np.floor(height[tall] / numbers.layer_m).astype(np.uint32)
+        at = ((points[tall, 1] - y0) / cell_m).astype(np.int64), ((points[tall, 0] - x0) / cell_m).astype(np.int64)
         np.bitwise_or.at(words, at, bit)
-    low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)  # and the four cells beside each
+    # Cells on which a vehicle can stand: known ground, with no low obstacle in the cell or the four beside it.
+    low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)
     r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
     first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
     spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
@@ -89,7 +128,7 @@ def laid_out(point_map: PointMap) -> CoarseMap:
 
 
 def _by_parity(words: U32) -> U32:
-    """As :class:`CoarseMap` has it."""
+    """``CoarseMap.wide`` of dilated words (rows, cols)."""
     rows, cols = words.shape
     wide = np.pad(words, ((0, rows % 2), (0, cols % 2)))
     split = wide.reshape(len(wide) // 2, 2, -1, 2).transpose(1, 3, 0, 2)
@@ -100,8 +139,8 @@ def highest(scores: U8, most: int) -> I64:
     """Indices of the ``most`` highest of (n,), in descending order; of equal ones the last first."""
     counts = np.cumsum(np.bincount(scores, minlength=256)[::-1])
     least = 255 - int(np.searchsorted(counts, most))
-    found = np.flatnonzero(scores >= max(least, 0))
-    return found[np.argsort(scores[found], kind="stable")[::-1][:most]]
+    candidates = np.flatnonzero(scores >= max(least, 0))
+    return candidates[np.argsort(scores[candidates], kind="stable")[::-1][:most]]
 
 
 def _dilated(words: U32) -> U32:
@@ -120,8 +159,8 @@ def _dilated(words: U32) -> U32:
 def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
     """(places, headings) how many of the points (n <= 255) match the map at their height there; 0 where hopeless.
 
-    ``cols`` (places,) in ``wide``. Span by span, point by point: what the cells of a span look up lies side by side, so
-    that all of them are sooner asked for than the places among them.
+    ``cols`` (places,) in ``wide``. Span by span, point by point: the words of the cells of a span lie side by side, so
+    that all of them are looked up sooner than the places among them.
     """
     n, rows, width = len(xy), wide.shape[2], wide.shape[3]
     flat = wide.reshape(-1)
@@ -204,40 +243,35 @@ def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) ->
     return best / len(xy), at[0], at[1], at[2]
 
 
-_REACH_M = 45.0
-_POINTS = 200
-_FIRST = 48
-"""Points after which a hopeless place is given up."""
-_YAWS = 120
-_SPREAD_M, _SPREAD_RAD = 3.0, np.radians(15.0)
-"""Peaks nearer to each other than this are one."""
-_PEAKS, _REFINED, _JUDGED = 60, 12, 3
-_LEAST_SCORE = 0.4
-"""Mean likelihood of what stands in a scan, of a map without ground."""
-
-
 @dataclass(frozen=True, slots=True)
 class Found:
     """The best place in the map."""
 
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.matching.pose_check.Verdict` has it."""
+    """The fit of :class:`mapvote.matching.pose_check.Verdict`."""
     lead: float
-    """By how much it fits better than the best place elsewhere."""
+    """Difference of its fit from that of the best place elsewhere."""
 
 
 class GlobalSearch:
     """The whole map as arrays for the search, made at the first call."""
 
-    def __init__(self, point_map: PointMap, ndt: NdtSettings, range_sigma_m: float) -> None:
-        self.point_map, self.ndt = point_map, ndt
+    def __init__(
+        self,
+        point_map: PointMap,
+        ndt: NdtSettings,
+        range_sigma_m: float,
+        numbers: GlobalSearchNumbers = GLOBAL_SEARCH,
+        check: PoseCheck = POSE_CHECK,
+    ) -> None:
+        self.point_map, self.ndt, self.numbers = point_map, ndt, numbers
         self.map_around = map_around(ndt.matcher, point_map)
-        self.judge = Judge(range_sigma_m)
+        self.judge = Judge(range_sigma_m, check)
 
     def in_map(self, point_map: PointMap) -> GlobalSearch:
         """The same search in another version of the map."""
-        other = GlobalSearch(point_map, self.ndt, 0.0)
+        other = GlobalSearch(point_map, self.ndt, 0.0, self.numbers)
         other.judge = self.judge
         return other
 
@@ -251,7 +285,7 @@ class GlobalSearch:
 
     @cached_property
     def _layout(self) -> CoarseMap:
-        return laid_out(self.point_map)
+        return laid_out(self.point_map, self.numbers)
 
     def __call__(self, scan: Scan) -> F64 | None:
         """The pose (4, 4) of the scan, or None if no place holds or another fits as well.
@@ -261,43 +295,55 @@ class GlobalSearch:
         """
         if not self._has_ground:
             placed = place_without_prior(self._points, scan.points.astype(np.float64))
-            return placed.T_a_b if placed.lead >= LEAST_LEAD and placed.score >= _LEAST_SCORE else None
-        found = self.find(scan)
-        if found is None or found.fit < MIN_FIT or found.lead < MIN_LEAD:
+            return (
+                placed.T_a_b
+                if placed.lead >= COARSE_SEARCH.min_lead and placed.score >= self.numbers.min_score
+                else None
+            )
+        place = self.find(scan)
+        if place is None or place.fit < self.judge.check.min_fit or place.lead < self.judge.check.min_lead:
             return None
-        return found.T_map_lidar
+        return place.T_map_lidar
 
     def find(self, scan: Scan) -> Found | None:
-        """The best place, however good it is; None if nothing stands in the scan or nothing in the map is like it."""
+        """The best place, however good it is; None if the scan has hardly a point above the ground, or the map no place
+        like it."""
+        numbers = self.numbers
+        # Points above the ground near the sensor, and their layers.
         few = solid_sample(scan.points, 1.0)
         height = height_above_lowest(few)
-        near = few[:, 0] ** 2 + few[:, 1] ** 2 < _REACH_M**2
-        sample = few[near & (height > LOW_M) & (height < HIGH_M)]
-        if len(sample) < _FIRST:
+        near = few[:, 0] ** 2 + few[:, 1] ** 2 < numbers.reach_m**2
+        used = near & (height > numbers.low_m) & (height < numbers.high_m)
+        sample = few[used]
+        if len(sample) < numbers.first:
             return None
-        bits = np.floor(height[near & (height > LOW_M) & (height < HIGH_M)] / LAYER_M).astype(np.uint32)
-        order = np.random.default_rng(0).permutation(len(sample))[:_POINTS]  # any will do, the same each time
+        bits = np.floor(height[used] / numbers.layer_m).astype(np.uint32)
+        order = np.random.default_rng(0).permutation(len(sample))[: numbers.points]  # the same each time
         xy, bits = sample[order, :2], bits[order]
+        # The sensor's height over the ground, and the poses of the best peaks.
         below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
         sensor_m = -float(np.quantile(below, 0.05)) if len(below) else 1.8
-        best = sorted(self._peaks(xy, bits), key=lambda peak: -peak[0])[:_REFINED]
+        best = sorted(self._peaks(xy, bits), key=lambda peak: -peak[0])[: numbers.refined]
         return self._choose(scan, [self._pose(peak, sensor_m) for peak in best])
 
     def _peaks(self, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
-        lay = self._layout
-        yaws = np.arange(_YAWS) * (2.0 * np.pi / _YAWS)
-        hopeless = int(0.5 * MIN_FIT * MIN_KNOWN * _FIRST)
-        scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, _FIRST)
-        likely = highest(scores.ravel(), 400 * _PEAKS)
-        place, heading = likely // _YAWS, likely % _YAWS
+        lay, numbers = self._layout, self.numbers
+        yaws = np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws)
+        check = self.judge.check
+        hopeless = int(0.5 * check.min_fit * check.min_known * numbers.first)
+        scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, numbers.first)
+        likely = highest(scores.ravel(), 400 * numbers.peaks)
+        place, heading = likely // numbers.yaws, likely % numbers.yaws
         x, y = lay.cols[place] + 0.5, lay.rows[place] + 0.5
-        kept = apart(x * CELL_M, y * CELL_M, yaws[heading], _PEAKS, _SPREAD_M, _SPREAD_RAD)
+        spread = numbers.peaks, numbers.spread_m, numbers.spread_rad
+        kept = apart(x * numbers.cell_m, y * numbers.cell_m, yaws[heading], *spread)
         return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
 
     def _pose(self, peak: tuple[float, float, float, float], sensor_m: float) -> F64:
         """(4, 4) on the map's ground at a peak, level with it."""
         lay, (_, x, y, yaw) = self._layout, peak
+        cell_m = self.numbers.cell_m
         row, col = int(y), int(x)
         low_r, low_c = max(row - 5, 0), max(col - 5, 0)
         patch = lay.ground_z[low_r : row + 6, low_c : col + 6]
@@ -309,7 +355,7 @@ class GlobalSearch:
         ahead /= np.linalg.norm(ahead)
         T = np.eye(4)
         T[:3, 0], T[:3, 1], T[:3, 2] = ahead, np.cross(up, ahead), up
-        T[:3, 3] = np.array([lay.x0 + x * CELL_M, lay.y0 + y * CELL_M, z]) + sensor_m * up
+        T[:3, 3] = np.array([lay.x0 + x * cell_m, lay.y0 + y * cell_m, z]) + sensor_m * up
         return T
 
     def _choose(self, scan: Scan, guesses: list[F64]) -> Found | None:
@@ -319,10 +365,10 @@ class GlobalSearch:
         clouds = [np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // 2000)]) for cloud in clouds]
         refined = [self.map_around(guess[:3, 3]).refine(clouds, guess) for guess in guesses]
         refined.sort(key=lambda result: -result.score)
-        places = distinct((one.T_map_lidar for one in refined), _SPREAD_RAD)[:_JUDGED]
+        places = distinct((one.T_map_lidar for one in refined), self.numbers.spread_rad)[: self.numbers.judged]
         if not places:
             return None
-        fit, T, rival = best_and_rival([self._judged(scan, T) for T in places], _SPREAD_RAD)
+        fit, T, rival = best_and_rival([self._judged(scan, T) for T in places], self.numbers.spread_rad)
         return Found(T, fit, fit - rival)
 
     def _judged(self, scan: Scan, T: F64) -> tuple[float, F64]:

@@ -2,7 +2,7 @@
 
 A scan waits until the place of its track has been confirmed by a look taken at it or after it. So nothing has to be
 recalled once a track proves wrong: its scans since the last good look have not voted yet. Where another place fits
-better the track moves there, and what waits moves along. Memory is bounded by the scans that may wait.
+better the track moves there, and the scans that wait move along. Memory is bounded by the scans that may wait.
 """
 
 from __future__ import annotations
@@ -16,35 +16,48 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
 from mapvote.matching.global_search import GlobalSearch
 from mapvote.matching.matcher import map_around
 from mapvote.matching.ndt_voxels import LEVELS
-from mapvote.matching.odometry import TWIST_AGE_S, Fix, Tracker
+from mapvote.matching.odometry import Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
 from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
 from mapvote.matching.prior_frame import PriorFrame, distance_to
 
-LOOKS = 3
-"""In turn that must hold before the first vote."""
-WAIT_SCANS = 40
-"""Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
-_EVERY_M, _EVERY_S = 10.0, 0.35
-"""A track that holds is checked again after this distance, well within the 15 m of a check, or this time:
-four scans at 10 Hz, however their stamps jitter. A vote is up to so much later for it."""
-_JUMPS = 4
-"""How often a track may move on one scan before it counts as lost there."""
-_MEMORY = 0.1
-"""Weight of the newest difference between fix and prior in the one remembered."""
-_BACK_M, _BACK_RAD = 1.0, float(np.radians(5.0))
-"""A scan that is followed back farther off the motion of the scans after it is lost: metres, radians."""
-_FIRST_SEARCH = 6
-"""Scans without a confirmed place before the whole map is searched; every further search waits twice as long."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class Localisation:
+    """Numbers of the confirmation of a track."""
+
+    checks: int = 3
+    """Checks in turn that must hold before the first vote."""
+    wait_scans: int = 40
+    """Scans that wait at most until their track is confirmed: the number that a vehicle can hold, 4 s at 10 Hz."""
+    every_m: float = 10.0
+    """Distance after which a track that holds is checked again, well within the 15 m of a check."""
+    every_s: float = 0.35
+    """Time after which it is checked again: four scans at 10 Hz, however their stamps jitter. A vote waits so long."""
+    jumps: int = 4
+    """Moves of a track on one scan before it counts as lost there."""
+    memory: float = 0.1
+    """Weight of the newest difference between fix and prior in the one remembered."""
+    back_m: float = 1.0
+    """Distance from the motion of the scans after it at which a scan that is followed back is lost."""
+    back_rad: float = float(np.radians(5.0))
+    """Turn from that motion at which it is lost."""
+    first_search: int = 6
+    """Scans without a confirmed place before the whole map is searched; every further search waits twice as long."""
+
+
+LOCALISATION = Localisation()
 
 
 class Localise(Protocol):
-    """Where were these scans taken? Scans go in, in order of time; fixes come out in the same order, some later."""
+    """Poses of scans. Scans go in, in order of time; fixes come out in the same order, some later."""
 
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
         """One more scan; the fixes that are decided by now. Untrusted ones cast no vote."""
@@ -59,15 +72,15 @@ class Localise(Protocol):
 class _Waiting:
     fix: Fix
     misfit: F64 | None
-    """(3,) how far the fix lies off the prior as it came, map metres."""
+    """(3,) shift of the fix from the unchanged prior, map metres."""
     prior: PosePrior | None = None
-    """As it came."""
+    """The prior of the scan, unchanged."""
     in_map: PosePrior | None = None
     """The prior in the map's frame, where its own frame was known."""
     begun: int = 0
-    """Which of the frames that the prior began it is in."""
+    """Number of the prior's frame: a prior may begin several."""
     nowhere: bool = False
-    """Whether no place is known yet."""
+    """Whether the scan has no place yet."""
 
 
 class Localiser:
@@ -76,27 +89,30 @@ class Localiser:
     Without a prior, and when no place holds for long, the whole map is searched.
     """
 
-    def __init__(self, point_map: PointMap, settings: Settings, sensor: Sensor) -> None:
+    def __init__(
+        self, point_map: PointMap, settings: Settings, sensor: Sensor, numbers: Localisation = LOCALISATION
+    ) -> None:
+        self.numbers = numbers
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
         self.map_around = map_around(settings.ndt.matcher, point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
         self.prior_frame = PriorFrame()
         self.misfit = np.zeros(3)
-        """How far trusted fixes lately lay off their priors, map metres."""
+        """(3,) shift of trusted fixes from their priors lately, map metres."""
         self._waiting: deque[_Waiting] = deque()
         self._held = 0
         """Looks in turn that held."""
         self._confirmed = False
         self._looked_at: Fix | None = None
-        self._unconfirmed, self._next_search = 0, _FIRST_SEARCH
+        self._unconfirmed, self._next_search = 0, self.numbers.first_search
 
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
             nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
             self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None, prior, nowhere=True))
-            return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+            return self._decide(max(0, len(self._waiting) - self.numbers.wait_scans), False)
         if prior is not None:
             self._catch_leap(scan, prior)
         usable = prior is not None and not self.prior_frame.is_unknown
@@ -109,7 +125,7 @@ class Localiser:
             self._look()
             if self._confirmed and self._held:
                 return self._decide(len(self._waiting), True)
-        return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+        return self._decide(max(0, len(self._waiting) - self.numbers.wait_scans), False)
 
     def flush(self) -> list[Fix]:
         """See :class:`Localise`."""
@@ -131,13 +147,13 @@ class Localiser:
             return True
         if self._unconfirmed < self._next_search and self._unconfirmed > 1:
             return False
-        self._next_search = 2 * max(self._unconfirmed, _FIRST_SEARCH)
-        found = self.search(scan)
-        if found is not None:
-            self.tracker.move_to(found, scan.stamp_ns)
-            if prior is not None and self.prior_frame.is_far(prior, found):
-                self._take_frame(prior, found)
-        return found is not None or not homeless
+        self._next_search = 2 * max(self._unconfirmed, self.numbers.first_search)
+        T_map_lidar = self.search(scan)
+        if T_map_lidar is not None:
+            self.tracker.move_to(T_map_lidar, scan.stamp_ns)
+            if prior is not None and self.prior_frame.is_far(prior, T_map_lidar):
+                self._take_frame(prior, T_map_lidar)
+        return T_map_lidar is not None or not homeless
 
     def _take_frame(self, prior: PosePrior, T_map_lidar: F64) -> None:
         """The prior is in a frame of its own: the scans that wait were taken where their priors lie in it."""
@@ -165,14 +181,14 @@ class Localiser:
     def _catch_leap(self, scan: Scan, prior: PosePrior) -> None:
         """A prior of its own frame that leaps away from a track that holds has begun anew: so does its frame."""
         age = 1e-9 * (scan.stamp_ns - self.tracker.last_stamp_ns)
-        if not self._confirmed or self.tracker.last_pose is None or age > TWIST_AGE_S:
+        if not self._confirmed or self.tracker.last_pose is None or age > self.tracker.numbers.twist_age_s:
             return
         predicted = self.tracker.last_pose @ exp(age * self.tracker.twist)
         if self.prior_frame.leapt(prior, predicted):
             self.prior_frame.begin(prior, predicted)
 
     def _corrected(self, prior: PosePrior) -> PosePrior:
-        """The prior in the map's frame, without what it was off by lately, and no surer of itself than that."""
+        """The prior in the map's frame, without its error of late, and no more certain than that error."""
         if self.prior_frame.is_own:
             return self.prior_frame.in_map(prior)
         T_map_lidar = prior.T_map_lidar.copy()
@@ -184,12 +200,14 @@ class Localiser:
         if last is None or not self._confirmed or not fix.trusted:
             return True
         way = np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - last.registration.T_map_lidar[:3, 3])
-        return bool(way >= _EVERY_M or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= _EVERY_S)
+        return bool(
+            way >= self.numbers.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self.numbers.every_s
+        )
 
     def _look(self) -> None:
         """Judge the newest fix; move the track while another place fits better."""
         verdict = self._verdict()
-        for _ in range(_JUMPS):
+        for _ in range(self.numbers.jumps):
             if verdict.lead >= 0.0 or verdict.T_map_lidar_other is None:
                 break
             self._move(verdict.T_map_lidar_other)
@@ -197,7 +215,7 @@ class Localiser:
         self._looked_at = self._waiting[-1].fix
         if self._looked_at.trusted and self.judge.holds(verdict):
             self._held += 1
-            if not self._confirmed and self._held >= LOOKS:
+            if not self._confirmed and self._held >= self.numbers.checks:
                 self._confirmed = True
                 self._follow_back()
         else:
@@ -219,7 +237,7 @@ class Localiser:
             guess = later.registration.T_map_lidar @ exp(-seconds * twist)
             self._register_anew(waiting[i], guess, twist)
             off_m, off_rad = distance_to(guess, waiting[i].fix.registration.T_map_lidar)
-            if not waiting[i].fix.trusted or off_m > _BACK_M or off_rad > _BACK_RAD:
+            if not waiting[i].fix.trusted or off_m > self.numbers.back_m or off_rad > self.numbers.back_rad:
                 waiting[i].fix = replace(waiting[i].fix, trusted=False)
                 return
 
@@ -266,19 +284,19 @@ class Localiser:
             last = self._waiting[-2]
             seconds = 1e-9 * (newest.fix.scan.stamp_ns - last.fix.scan.stamp_ns)
             poses = last.fix.registration.T_map_lidar, newest.fix.registration.T_map_lidar
-            twist = twist_between(*poses, seconds) if seconds <= TWIST_AGE_S else None
+            twist = twist_between(*poses, seconds) if seconds <= self.tracker.numbers.twist_age_s else None
         registration = newest.fix.registration
         self.tracker.move_to(registration.T_map_lidar, newest.fix.scan.stamp_ns, twist, registration.score)
 
     def _decide(self, count: int, confirmed: bool) -> list[Fix]:
-        """The fixes of the oldest ``count`` scans, which nothing changes any more; what they say of the prior is
-        remembered if they are trusted."""
+        """The fixes of the oldest ``count`` scans, which nothing changes any more; trusted ones correct the remembered
+        error of the prior."""
         decided = []
         for _ in range(count):
             waiting = self._waiting.popleft()
             fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
             if fix.trusted and waiting.misfit is not None:
-                self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
+                self.misfit = self.misfit + self.numbers.memory * (waiting.misfit - self.misfit)
             if waiting.prior is not None and waiting.begun == self.prior_frame.begun:
                 self._place_prior(waiting)  # by all that was learnt before this scan
                 if fix.trusted:

@@ -24,11 +24,11 @@ INLIER_E = 7.81
 """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
 CUTOFF_E = 25.0
 """Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
-_BLOCK = 1024
+_SUM_BLOCK = 1024
 """Points whose sums are taken in float32 before they are added up in float64."""
-TOGETHER = 64
+PAIRED_AT_ONCE = 64
 """Points that are paired together."""
-LEVER_M = 20.0
+TURN_LEVER_M = 20.0
 """Distance at which a rotation is weighed against a shift, where one number must serve both."""
 _UNPAIRED = np.int32(-(1 << 30))
 """No point's home: all are to be paired."""
@@ -45,7 +45,7 @@ class Room(NamedTuple):
     origin: F64
     """(3,) map metres: near the sensor, so that float32 suffices."""
     moved: I64
-    """(TOGETHER,) and below (7, TOGETHER): who is paired, with whom."""
+    """(PAIRED_AT_ONCE,) and below (7, PAIRED_AT_ONCE): who is paired, with whom."""
     partner: I32
     sums: F64
     """(50,), (3, 3) and (3,): of :func:`linearise`."""
@@ -61,7 +61,7 @@ def room_for(n: int) -> Room:
     """Any number of alignments of n points, one after the other, may use it."""
     return Room(
         np.empty((7, 9, n), np.float32), np.empty((3, n), np.int32), np.zeros(3),
-        np.empty(TOGETHER, np.int64), np.empty((7, TOGETHER), np.int32),
+        np.empty(PAIRED_AT_ONCE, np.int64), np.empty((7, PAIRED_AT_ONCE), np.int32),
         np.empty(50), np.empty((3, 3), np.float32), np.empty(3, np.float32),
         np.empty((7, 6, 6)), np.empty((3, 6, 1)), np.empty((3, 3, 3)),
     )  # fmt: skip
@@ -88,9 +88,9 @@ def pair_up(points: F32, T: F64, window: Window, cells: F64, room: Room) -> None
     rows, lowest, size, flat, beside = window
     of, home, origin, moved, partner = room.of, room.home, room.origin, room.moved, room.partner
     stride = rows.shape[1] * rows.shape[2]
-    for first in range(0, points.shape[1], TOGETHER):
+    for first in range(0, points.shape[1], PAIRED_AT_ONCE):
         m = 0
-        for i in range(first, min(first + TOGETHER, points.shape[1])):
+        for i in range(first, min(first + PAIRED_AT_ONCE, points.shape[1])):
             x, y, z = _in_map(points, T, i)
             ax, ay, az = voxel_of(size, x, y, z)
             ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
@@ -215,8 +215,8 @@ def linearise(points: F32, room: Room, T: F64, H: F64, M: F64, g: F64) -> tuple[
         for c in range(3):
             R[r, c] = T[r, c]
     n = points.shape[1]
-    for first in range(0, n, _BLOCK):
-        _sum_block(points, room.of, first, min(first + _BLOCK, n), R, d, sums)
+    for first in range(0, n, _SUM_BLOCK):
+        _sum_block(points, room.of, first, min(first + _SUM_BLOCK, n), R, d, sums)
     k = 0
     for r in range(6):
         for c in range(r, 6):
@@ -331,7 +331,7 @@ def _length(step: F64) -> float:
     """How far a step shifts the sensor, or a point 20 m away by its turn, whichever is more."""
     shift = np.sqrt(step[0, 0] ** 2 + step[1, 0] ** 2 + step[2, 0] ** 2)
     turn = np.sqrt(step[3, 0] ** 2 + step[4, 0] ** 2 + step[5, 0] ** 2)
-    return max(shift, turn * LEVER_M)
+    return max(shift, turn * TURN_LEVER_M)
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""Where the vehicle is, scan after scan: predict, register, judge, recover (paper II).
+"""The track of a vehicle, scan after scan: predict, register, judge, recover (paper II).
 
 A vehicle that does not trust its pose abstains: a lost vehicle must never demolish a street.
 """
@@ -12,30 +12,45 @@ import numpy as np
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, PosePrior, Registration, Scan
 from mapvote.matching.matcher import LocalMatcher, best_of
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, deskew, twist_between
 
-_REFINED = 3
-"""How many of the best guesses are refined when the vehicle is lost."""
-_RECONSIDERED = 8
-"""The same, when a scan fits worse than the ones before it."""
-_POOR = 0.9
-"""Share of the usual score below which other places are tried."""
-_STEP_M, _REACH_M = 1.0, 10.0
-"""Spacing of the guesses when the vehicle is lost, and the farthest."""
-ACCELERATION_MPS2 = 3.0
-"""How fast a prediction by constant velocity goes stale: a car brakes harder than this only in an emergency."""
-_YAWS_RAD = np.radians([0.0, -3.0, 3.0])
-_ROUNDS = 2
-"""How often a scan is de-skewed anew with the motion just found, while that still changes."""
-_SPEEDS_MPS = np.arange(-2.5, 32.6, 2.5)
-"""Forward speeds tried on a first scan."""
-_FAR_BETTER = 1.2
-"""What another height must fit better by before the prior's is given up."""
-TWIST_AGE_S = 1.0
-"""Two poses farther apart in time than this say little about the present velocity."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class Tracking:
+    """Numbers of the track of a vehicle."""
+
+    refined: int = 3
+    """Best guesses that are refined when the vehicle is lost."""
+    reconsidered: int = 8
+    """Best guesses that are refined when a scan fits worse than the ones before it."""
+    poor: float = 0.9
+    """Share of the usual score below which other places are tried."""
+    step_m: float = 1.0
+    """Spacing of the guesses when the vehicle is lost."""
+    reach_m: float = 10.0
+    """Farthest guess when the vehicle is lost."""
+    acceleration_mps2: float = 3.0
+    """Rate at which a prediction by constant velocity goes stale: a car brakes harder only in an emergency."""
+    yaws_deg: tuple[float, ...] = (0.0, -3.0, 3.0)
+    """Turns of the guesses when the vehicle is lost."""
+    rounds: int = 2
+    """Times that a scan is de-skewed anew with the new motion, while that still changes."""
+    speeds_mps: tuple[float, float, float] = (-2.5, 32.6, 2.5)
+    """First, last and spacing of the forward speeds tried on a first scan."""
+    far_better: float = 1.2
+    """Factor by which another height must fit better before the prior's is given up."""
+    twist_age_s: float = 1.0
+    """Time between two poses beyond which they say little about the present velocity."""
+    memory: float = 0.2
+    """Weight of the newest score in the usual one."""
+
+
+TRACKING = Tracking()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +60,7 @@ class Fix:
     scan: Scan
     registration: Registration
     points: F32
-    """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed with the motion found."""
+    """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed."""
     trusted: bool
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
     prior: PosePrior | None = None
@@ -59,8 +74,13 @@ class Tracker:
     :class:`mapvote.matching.matcher.MapAround`.
     """
 
-    def __init__(self, map_around: Callable[[F64], LocalMatcher], settings: NdtSettings) -> None:
+    def __init__(
+        self, map_around: Callable[[F64], LocalMatcher], settings: NdtSettings, numbers: Tracking = TRACKING
+    ) -> None:
         self.map_around = map_around
+        self.numbers = numbers
+        self._speeds_mps = np.arange(*numbers.speeds_mps)
+        self._yaws_rad = np.radians(numbers.yaws_deg)
         self.settings = settings
         self.twist = np.zeros(6)
         """Motion per second in the lidar frame (velocity, angular velocity), from the last two trusted poses."""
@@ -69,47 +89,50 @@ class Tracker:
         self._measured = False
         """Whether ``twist`` was measured from two poses, so that it predicts the next."""
         self._usual_score = 0.0
-        """What trusted scans scored lately: far less than that means the wrong place, however sure it looks."""
+        """Score of trusted scans lately: a far lower one means the wrong place, however certain the registration."""
 
     def localise(self, scan: Scan, prior: PosePrior | None = None) -> Fix:
         """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin.
 
         A prior is a guess and a factor, no gate: whether a pose can be voted with is the Localiser's to say.
         """
+        # The first guess and the motion by which the scan is de-skewed.
         seed, reach = self._seed(scan.stamp_ns, prior)
         around = self.map_around(seed[:3, 3])
         sample = Sample(scan)
-        if reach >= _STEP_M:
+        if reach >= self.numbers.step_m:
             seed = self._levelled(around, sample, seed)
         twist = (
             self.twist if self._knows_motion(scan) else self.guess_motion(around, scan.stamp_ns, sample, seed, prior)
         )
+        # The pose from the first guess; others where it fits badly.
         clouds = sample.clouds(twist)
         result = around.refine(clouds, seed, prior, self._first_level(reach))
-        if result.score < _POOR * self._usual_score:
+        if result.score < self.numbers.poor * self._usual_score:
             result = self._reconsider(around, clouds, scan.stamp_ns, result, prior)
         trusted = self.is_sound(result)
         if not trusted:
             centre = prior.T_map_lidar if prior is not None else seed
             result = self._search(around, clouds, centre, reach, prior)
             trusted = self.is_sound(result)
-        found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
-        for _ in range(_ROUNDS):
-            if scan.time_s is None or found is None or not _differ(twist, found):
+        # De-skewed anew while the motion to the new pose changes.
+        moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
+        for _ in range(self.numbers.rounds):
+            if scan.time_s is None or moved is None or not _differ(twist, moved):
                 break
-            twist = found
+            twist = moved
             result = around.refine(sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
             trusted = self.is_sound(result)
-            found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
+            moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         if trusted:
-            self._accept(result.T_map_lidar, scan.stamp_ns, found, twist)
-            rate = 0.2 if self._usual_score else 1.0
+            self._accept(result.T_map_lidar, scan.stamp_ns, moved, twist)
+            rate = self.numbers.memory if self._usual_score else 1.0
             self._usual_score += rate * (result.score - self._usual_score)
         return Fix(scan, result, deskew(scan, twist), trusted)
 
     def _first_level(self, reach: float) -> int:
         """The coarsest level that a guess needs which may be off by ``reach`` metres."""
-        if self.last_pose is None or reach > 0.5 * _STEP_M:
+        if self.last_pose is None or reach > 0.5 * self.numbers.step_m:
             return 0
         return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
 
@@ -122,11 +145,11 @@ class Tracker:
         """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
         age = 1e-9 * (stamp_ns - self.last_stamp_ns)
         moved: list[tuple[float, F64]] = []
-        for speed in _SPEEDS_MPS:
+        for speed in self._speeds_mps:
             twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
             start = seed if self.last_pose is None else self.last_pose @ exp(age * twist)
             moved.append((around.refine(sample.coarse(twist), start, prior).score, twist))
-        return max(moved, key=lambda found: found[0])[1]
+        return max(moved, key=lambda scored: scored[0])[1]
 
     def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
         """Take the first pose as given: where there is no map yet, the first scan makes it."""
@@ -138,22 +161,22 @@ class Tracker:
         """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
-            known = self._measured or bool(self.twist.any())
-            drift = 0.5 * ACCELERATION_MPS2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
+            has_motion = self._measured or bool(self.twist.any())
+            drift = 0.5 * self.numbers.acceleration_mps2 * age**2 if has_motion else age * float(self._speeds_mps[-1])
             if prior is None or drift < prior.sigma_m:
                 return self.last_pose @ exp(age * self.twist), drift
         if prior is None:
-            return np.eye(4), _REACH_M
+            return np.eye(4), self.numbers.reach_m
         return prior.T_map_lidar, 2.0 * prior.sigma_m
 
     def _levelled(self, around: LocalMatcher, sample: Sample, seed: F64) -> F64:
         """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
         road that lies metres from the scan's own."""
-        steps = np.arange(_STEP_M, _REACH_M + 1e-6)
+        steps = np.arange(self.numbers.step_m, self.numbers.reach_m + 1e-6)
         guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
         fits = around.likelihood(sample.coarse(np.zeros(6))[0], np.array(guesses))
         best = int(np.argmax(fits))
-        return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
+        return guesses[best] if fits[best] > self.numbers.far_better * fits[0] else seed
 
     def move_to(self, T_map_lidar: F64, stamp_ns: int, twist: F64 | None = None, score: float = 0.0) -> None:
         """The vehicle was here then: the track goes on from this pose, with this motion or none known."""
@@ -184,32 +207,32 @@ class Tracker:
         guesses = [] if prior is None else [prior.T_map_lidar]
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
-            guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
-        found = best_of(around, clouds, guesses, _RECONSIDERED, prior)
-        return found if found.score > result.score else result
+            guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in self._speeds_mps]
+        best = best_of(around, clouds, guesses, self.numbers.reconsidered, prior)
+        return best if best.score > result.score else result
 
     def _search(
         self, around: LocalMatcher, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
     ) -> Registration:
         """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
-        rings = int(np.ceil(min(max(reach, _STEP_M), _REACH_M) / _STEP_M))
-        offsets = _STEP_M * np.arange(-rings, rings + 1)
+        rings = int(np.ceil(min(max(reach, self.numbers.step_m), self.numbers.reach_m) / self.numbers.step_m))
+        offsets = self.numbers.step_m * np.arange(-rings, rings + 1)
         guesses = [
-            centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
+            centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in self._yaws_rad
         ]
-        return best_of(around, clouds, guesses, _REFINED, prior, 1000)
+        return best_of(around, clouds, guesses, self.numbers.refined, prior, 1000)
 
     def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
         """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""
         seconds = 1e-9 * (stamp_ns - self.last_stamp_ns)
-        if self.last_pose is None or not 0 < seconds <= TWIST_AGE_S:
+        if self.last_pose is None or not 0 < seconds <= self.numbers.twist_age_s:
             return None
         return twist_between(self.last_pose, T_map_lidar, seconds)
 
-    def _accept(self, T_map_lidar: F64, stamp_ns: int, found: F64 | None, twist: F64) -> None:
-        """The track goes on from this pose with the motion that was ``found`` to lead there, else with ``twist``."""
-        self.twist = twist if found is None else found
-        self._measured = self._measured or found is not None
+    def _accept(self, T_map_lidar: F64, stamp_ns: int, motion: F64 | None, twist: F64) -> None:
+        """The track goes on from this pose with the measured ``motion``, else with ``twist``."""
+        self.twist = twist if motion is None else motion
+        self._measured = self._measured or motion is not None
         self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
 
 

@@ -1,7 +1,7 @@
-"""Whether a pose can be trusted: what fits there, against what should fit there and what fits elsewhere.
+"""Trust in a pose: the fit of the scan there, against the fit to be expected there and the fit elsewhere.
 
-No fixed share of inliers serves all sensors and streets. Two comparisons do. How well the scan fits is divided by how
-well a scan from this very place would fit, predicted from the map's own distributions and the sensor's noise. And the
+No fixed share of inliers serves all sensors and streets. Two comparisons do. The likelihood of the scan is divided by
+the likelihood of a scan from this very place, predicted from the map's distributions and the sensor's noise. And the
 best other place, 2 to 15 m along or across the street or turned about, must fit clearly worse. Both look only at
 points that stand above the ground: the road fits itself everywhere.
 """
@@ -13,41 +13,57 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.record import record
 from mapvote.core.types import F64, Bool
 from mapvote.matching.matcher import SETTLED, LocalMatcher
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import in_rows
 
-MIN_FIT = 0.6
-"""Of what the map leads to expect, from which a pose may be voted with; docs/measurements/localisation.md says how
-often wrong poses are trusted."""
-MIN_LEAD = 0.05
-"""By how much the best other place must fit worse, in the same scale."""
-MIN_KNOWN = 0.3
-"""Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
-_POINTS = 1000
-"""Points of a scan that are used."""
-_NEAR_M, _FAR_M = 2.0, 15.0
-"""Other places are tried from here to there, along the street and across it: houses and parked cars repeat so."""
-_CELL_M = 3.0
-_ABOVE_M = 0.6
-"""Points this high above the lowest one around them stand above the ground, on any road that can be driven."""
-_SAME_PLACE_M = 1.5
-"""Two fixes nearer than this are one place; if the other fits better, the first had not settled."""
-_SETTLED_M = 0.2
-_REFINED = 3
-"""How many of the best other places are refined."""
-_QUICK_SETTLED, _QUICK_EVERY = (0.1, 0.1), 3
-"""A quick look finds other places to a centimetre, and on the way there by every third point: their fits, .3 to .5 of
-the right place's, come out .005 different in the mean and .13 at most, over three drives, for half of the work."""
-_STEP_M = 1.0
-_COARSE = 300
-"""Standing points that rank the places before any is refined."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class PoseCheck:
+    """Numbers of the check of a pose; docs/measurements/localisation.md says how often wrong poses are trusted."""
+
+    min_fit: float = 0.6
+    """Share of the expected likelihood from which a pose may be voted with."""
+    min_lead: float = 0.05
+    """Difference, in the same scale, by which the best other place must fit worse."""
+    min_known: float = 0.3
+    """Share of the standing points that must lie where the map has been: with fewer, their fit proves little."""
+    points: int = 1000
+    """Points of a scan that are used."""
+    near_m: float = 2.0
+    """Nearest of the other places tried along the street and across it: houses and parked cars repeat so."""
+    far_m: float = 15.0
+    """Farthest of these places."""
+    step_m: float = 1.0
+    """Spacing of these places."""
+    same_place_m: float = 1.5
+    """Distance within which two fixes are one place; if the other fits better, the first had not settled."""
+    settled_m: float = 0.2
+    """Distance beyond which a better fit shows that the first had not settled."""
+    refined: int = 3
+    """Best other places that are refined."""
+    quick_settled: tuple[float, float] = (0.1, 0.1)
+    """Step, of a centimetre, at which a quick check stops: fits of other places, 0.3 to 0.5 of the right place's, come
+    out 0.005 different in the mean and 0.13 at most, over three drives, for half of the work."""
+    quick_every: int = 3
+    """A quick check finds other places by one point of so many."""
+    coarse: int = 300
+    """Standing points that rank the places before any is refined."""
+    above_m: float = 0.6
+    """Height above the lowest point around it from which a point stands, on any road that can be driven."""
+    lowest_cell_m: float = 3.0
+    """Side of the cells in which the lowest point is taken."""
 
 
-def _arms() -> list[F64]:
+POSE_CHECK = PoseCheck()
+
+
+def _arms(check: PoseCheck) -> list[F64]:
     """(m, 4, 4) each: steps ahead, back, left, right, and along the street but turned about."""
-    away = np.arange(_NEAR_M - _STEP_M, _FAR_M + 0.5 * _STEP_M, _STEP_M)
+    away = np.arange(check.near_m - check.step_m, check.far_m + 0.5 * check.step_m, check.step_m)
     ways = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)
     steps = [away if yaw == 0.0 else np.concatenate([-away[::-1], away]) for _, _, yaw in ways]
     return [
@@ -56,56 +72,58 @@ def _arms() -> list[F64]:
     ]
 
 
-_ARMS = _arms()
-
-
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """The evidence for a pose."""
 
     fit: float
-    """Likelihood of the standing points over what the map leads to expect of them; about 1 at the right place."""
+    """Likelihood of the standing points over the expected one; about 1 at the right place."""
     known: float
     """Share of the standing points that lie where the map has been."""
     lead: float
-    """By how much the fit exceeds that of the best other place; below 0 that one is better."""
+    """Difference of the fit from that of the best other place; below 0 that one is better."""
     T_map_lidar_other: F64 | None
-    """The best other place, if there is any."""
+    """The best other place; None without one."""
 
 
 class Judge:
     """Looks at one scan at one pose of a map."""
 
-    def __init__(self, range_sigma_m: float, most_points: int = _POINTS) -> None:
-        self.range_sigma_m, self.most_points = range_sigma_m, most_points
+    def __init__(self, range_sigma_m: float, check: PoseCheck = POSE_CHECK) -> None:
+        self.range_sigma_m, self.check = range_sigma_m, check
+        self._arms = _arms(check)
 
     def judge(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty. ``quick``: other places are found
-        less well, for a third less work; what does not hold then should be judged again."""
+        less well, for a third less work; a pose that does not hold should be judged again."""
         few, standing, expected, known, here = self._here(around, points_lidar, T_map_lidar)
         best, lead = None, here
         for other in self._others(around, few, standing, T_map_lidar, quick):
             ahead = here - self._likelihood(around, standing, other) / expected
             away = float(np.linalg.norm(other[:2, 3] - T_map_lidar[:2, 3]))
             away = away if float(other[:2, 0] @ T_map_lidar[:2, 0]) > 0.0 else np.inf
-            if ahead < lead and (away > _SAME_PLACE_M or (ahead < 0.0 and away > _SETTLED_M)):
+            if ahead < lead and (away > self.check.same_place_m or (ahead < 0.0 and away > self.check.settled_m)):
                 best, lead = other, ahead
         return Verdict(here, known, lead, best)
 
     def fit(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64) -> float:
         """The verdict's fit alone; 0 where too little is known."""
         *_, known, here = self._here(around, points_lidar, T_map_lidar)
-        return here if known >= MIN_KNOWN else 0.0
+        return here if known >= self.check.min_known else 0.0
 
     def holds(self, verdict: Verdict) -> bool:
         """Whether the verdict confirms the pose."""
-        return verdict.fit >= MIN_FIT and verdict.known >= MIN_KNOWN and verdict.lead >= MIN_LEAD
+        return (
+            verdict.fit >= self.check.min_fit
+            and verdict.known >= self.check.min_known
+            and verdict.lead >= self.check.min_lead
+        )
 
     def _here(self, around: LocalMatcher, points_lidar: F64, T: F64) -> tuple[F64, F64, float, float, float]:
-        """(points that are looked at; those of them that stand; mean likelihood that these should have; share of them
-        where the map has been; how well they fit)."""
-        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
-        standing = few[stands_above_ground(few, T)]
+        """(points that are used; those of them that stand; mean likelihood to be expected of these; share of them where
+        the map has been; their fit)."""
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.check.points)])
+        standing = few[stands_above_ground(few, T, self.check)]
         points = standing @ T[:3, :3].T + T[:3, 3]
         mapped, near = around.expected(points, self.range_sigma_m)
         expected = 1.0
@@ -121,32 +139,32 @@ class Judge:
     def _others(self, around: LocalMatcher, few: F64, standing: F64, T: F64, quick: bool) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
-        coarse = in_rows(standing[:: max(1, len(standing) // _COARSE)])
+        coarse = in_rows(standing[:: max(1, len(standing) // self.check.coarse)])
         peaks = []
-        for arm in _ARMS:
+        for arm in self._arms:
             guesses = T @ arm
             fits = around.likelihood(coarse, guesses)
             rising = fits[1:] > fits[:-1]
             falling = np.append(fits[1:-1] >= fits[2:], True)
             peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
         peaks.sort(key=lambda peak: -peak[0])
-        unsettled = [T @ _ARMS[0][0], T @ _ARMS[1][0]]
-        on_the_way = in_rows(few[:: _QUICK_EVERY if quick else 1])
+        unsettled = [T @ self._arms[0][0], T @ self._arms[1][0]]
+        on_the_way = in_rows(few[:: self.check.quick_every if quick else 1])
         clouds = [*[on_the_way] * (len(LEVELS) - 1), in_rows(few)]
-        starts = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
-        settled = _QUICK_SETTLED if quick else SETTLED
+        starts = [*unsettled, *(guess for _, guess in peaks[: self.check.refined])]
+        settled = self.check.quick_settled if quick else SETTLED
         return [around.refine(clouds, start, settled=settled).T_map_lidar for start in starts]
 
 
-def stands_above_ground(points_lidar: F64, T_map_lidar: F64) -> Bool:
+def stands_above_ground(points_lidar: F64, T_map_lidar: F64, check: PoseCheck = POSE_CHECK) -> Bool:
     """(n,) whether each point (n, 3) lies well above the lowest one within a few metres of it, plumb."""
-    return height_above_lowest(points_lidar @ T_map_lidar[:3, :3].T) > _ABOVE_M
+    return height_above_lowest(points_lidar @ T_map_lidar[:3, :3].T, check) > check.above_m
 
 
-def height_above_lowest(points: F64) -> F64:
+def height_above_lowest(points: F64, check: PoseCheck = POSE_CHECK) -> F64:
     """(n,) height of each point (n, 3) above the lowest one within 3 to 6 m of it; -inf beyond 120 m."""
     half = 40
-    cols, rows = np.floor(points[:, :2].T / _CELL_M).astype(np.int64) + half + 1
+    cols, rows = np.floor(points[:, :2].T / check.lowest_cell_m).astype(np.int64) + half + 1
     here = np.flatnonzero((rows > 0) & (rows <= 2 * half) & (cols > 0) & (cols <= 2 * half))
     rows, cols, z = rows[here], cols[here], points[here, 2]
     low = np.full((2 * half + 2, 2 * half + 2), np.inf)

@@ -6,36 +6,59 @@ points are drops once the scan is thinned to a point a voxel, and every right po
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse, log
 from mapvote.core.kernel import kernel
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Scan
 from mapvote.core.voxels import slot_of, thin, voxel_key
 from mapvote.matching.ndt_voxels import LEVELS
 
-_ENOUGH = 20_000
-"""Points that are thinned at least: of a dense scan every third, fifth .. is used. Odd, so that no beam is left
-out where points are stored firing by firing."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class ScanPreparation:
+    """Numbers of the thinning of scans, and of the removal of rain, snow and exhaust."""
+
+    enough: int = 20_000
+    """Points that are thinned at least: a dense scan is read by every third, fifth .. point. Odd steps leave no beam
+    out where points are stored firing by firing."""
+    voxel_m: float = 0.5
+    """Side of the voxels in which drops are told from surfaces."""
+    reach_m: float = 20.0
+    """Distance up to which drops are removed: beyond, sparse surfaces look like drops, and drops are few."""
+    share: float = 0.1
+    """Share of the rays that a surface across the voxel would catch, below which its points are drops. Drops catch
+    about 0.01 where a tenth of all rays end on drops, an open crown 0.1 and more."""
+    rays: int = 40_000
+    """Rays counted, evenly through the scan."""
+    solid_angle_sr: float = 0.5 * 2.0 * float(np.pi)
+    """Solid angle that a spinning sensor's rays cover: 29 degrees of elevation all around."""
+
+
+SCAN_PREPARATION = ScanPreparation()
 
 
 def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F32]:
-    """The scan as each level wants it, (3, m): one point per voxel of the level's ``points_m``."""
+    """The scan for each level, (3, m): one point per voxel of the level's ``points_m``."""
     source = np.ascontiguousarray(points_lidar, dtype=np.float32)
     chosen = thinned(source)
     return [in_rows(source[chosen[level.points_m]]) for level in LEVELS]
 
 
 def in_rows(points_lidar: NDArray[np.floating]) -> F32:
-    """(3, n) of points (n, 3): rows of x, y and z, as the kernels want them."""
+    """(3, n) of points (n, 3): rows of x, y and z, the layout of the kernels."""
     return np.ascontiguousarray(points_lidar.T, dtype=np.float32)
 
 
-def thinned(points_lidar: F32) -> dict[float, I64]:
-    """By size, metres: indices, ascending, of one of (n, 3) points per voxel of each size that the levels want."""
+def thinned(points_lidar: F32, numbers: ScanPreparation = SCAN_PREPARATION) -> dict[float, I64]:
+    """Size of voxel, metres -> ascending indices of one of (n, 3) points per voxel, for each size of the levels."""
     sizes = sorted({level.points_m for level in LEVELS})
-    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // _ENOUGH - 1) | 1))
+    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // numbers.enough - 1) | 1))
     chosen = {sizes[0]: few}
     for size in sizes[1:]:
         few = few[thin(points_lidar.take(few, axis=0), size)]
@@ -87,50 +110,42 @@ def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
     return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
 
 
-_VOXEL_M = 0.5
-_REACH_M = 20.0
-"""Beyond, sparse surfaces and drops look alike, and drops are few: their share of all returns falls with the range."""
-_SHARE = 0.1
-"""Of the rays that a surface across the whole voxel would catch: drops catch some .01 of them where a tenth of all rays
-end on drops, an open crown .1 and more."""
-_RAYS = 40_000
-"""Looked at, evenly through the scan: enough for a share."""
-_SOLID_ANGLE = 0.5 * 2.0 * np.pi
-"""That a spinning sensor's rays cover: 29 degrees of elevation all around."""
-
-
-def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
-    """(m, 3) one point in each voxel of side ``size``, without what hangs in the air.
+def solid_sample(points_lidar: NDArray[np.floating], size: float, numbers: ScanPreparation = SCAN_PREPARATION) -> F64:
+    """(m, 3) one point in each voxel of side ``size``, without drops in the air.
 
     ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
     """
     few = points_lidar.take(thin(points_lidar, size), axis=0).astype(np.float64)
-    every = -(-len(points_lidar) // _RAYS) or 1
+    every = -(-len(points_lidar) // numbers.rays) or 1
     range2 = (few**2).sum(axis=1)
     rays = -(-len(points_lidar) // every)
-    expected = rays / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
+    expected = rays / numbers.solid_angle_sr * numbers.voxel_m**2 / np.maximum(range2, numbers.voxel_m**2)
     table = np.zeros((2, max(1024, 1 << (4 * len(few) - 1).bit_length())), dtype=np.int64)
     hits = np.empty(len(few), dtype=np.int64)
-    _hits_around(np.ascontiguousarray(points_lidar, dtype=np.float32), every, few, table[0], table[1], hits)
-    return few[(range2 > _REACH_M**2) | (hits > _SHARE * expected)]
+    points = np.ascontiguousarray(points_lidar, dtype=np.float32)
+    far2 = (numbers.reach_m + 2.0 * numbers.voxel_m) ** 2
+    _hits_around(points, every, few, numbers.voxel_m, far2, table[0], table[1], hits)
+    return few[(range2 > numbers.reach_m**2) | (hits > numbers.share * expected)]
 
 
 @kernel
-def _hits_around(points: F32, every: int, few: F64, keys: I64, counts: I64, at: I64) -> None:
-    """Into ``at`` (m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel of each of ``few``.
+def _hits_around(
+    points: F32, every: int, few: F64, voxel_m: float, far2: float, keys: I64, counts: I64, at: I64
+) -> None:
+    """Enter into ``at`` (m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel, of side ``voxel_m``,
+    of each of ``few``. Points whose squared distance exceeds ``far2`` are left out.
 
     The table (``keys``, ``counts``; zeros) holds these voxels alone, and at most a quarter of it: rays that end
     elsewhere leave it as it is.
     """
-    far2 = (_REACH_M + 2.0 * _VOXEL_M) ** 2
     for i in range(len(few)):
-        key = voxel_key(few[i, 0], few[i, 1], few[i, 2], _VOXEL_M)
+        key = voxel_key(few[i, 0], few[i, 1], few[i, 2], voxel_m)
         at[i] = slot_of(key, keys)
         keys[at[i]] = key
     for i in range(0, len(points), every):
         if points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2 > far2:
             continue
-        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], _VOXEL_M)
+        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], voxel_m)
         slot = slot_of(key, keys)
         counts[slot] += 1 if keys[slot] == key else 0
     for i in range(len(few)):
@@ -153,5 +168,5 @@ class Sample:
         return [clouds[level.points_m] for level in LEVELS]
 
     def coarse(self, twist: F64) -> list[F32]:
-        """The same, of the fewest points at every level: to try many guesses."""
+        """The clouds of the fewest points at every level: to try many guesses."""
         return [in_rows(deskewed(*self._parts[max(self._parts)], twist))] * len(LEVELS)

@@ -30,7 +30,7 @@ from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.matching.ndt_map import NdtMap
 from mapvote.matching.ndt_voxels import LEVELS
-from mapvote.matching.odometry import ACCELERATION_MPS2, Fix, Tracker
+from mapvote.matching.odometry import Fix, Tracker
 from mapvote.matching.prepare import in_rows, twist_between
 from mapvote.survey.clean_map import Mapper
 from mapvote.survey.driven_road import road_under, wrong_attitude
@@ -248,7 +248,7 @@ class Surveyor:
         age = 1e-9 * (scan.stamp_ns - before[1])
         ahead = before[0] @ exp(age * before[2])
         off = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - ahead[:3, 3]))
-        if off <= self.numbers.jump_m + 0.5 * ACCELERATION_MPS2 * age**2:
+        if off <= self.numbers.jump_m + 0.5 * tracker.numbers.acceleration_mps2 * age**2:
             return self._polished(tracker, fix, before[0], age) if prior is None else fix
         tracker.move_to(before[0], before[1], before[2], fix.registration.score)
         return replace(fix, trusted=False)

@@ -21,7 +21,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from mapvote.codec.ballot import Ballot
-from mapvote.compare.cloud_changes import REACH_CELLS, CloudChange, Kind, planes_of
+from mapvote.compare.cloud_changes import CLOUD_COMPARISON, CloudChange, Kind, planes_of
 from mapvote.compare.session_votes import vote_of_session
 from mapvote.config import Settings, choose_case
 from mapvote.core.grid import CELL_SIZE, Grid
@@ -186,7 +186,8 @@ def cast_drive(name: str, cloud: PointMap, rule: CourtRule = COURT_RULE) -> Driv
 def _surveyed(cloud: PointMap, window: Grid) -> Bool:
     """(rows, cols) cells within two of one in which the session measured ground or something that stands."""
     planes = planes_of(cloud, window)
-    return np.asarray(ndimage.maximum_filter(planes.own_ground | planes.stands, 2 * REACH_CELLS + 1, mode="constant"))
+    side = 2 * CLOUD_COMPARISON.reach_cells + 1
+    return np.asarray(ndimage.maximum_filter(planes.own_ground | planes.stands, side, mode="constant"))
 
 
 def _measured_as_far(T: F64, window: Grid, surveyed: Bool, rule: CourtRule) -> F64:
