@@ -42,8 +42,8 @@ class BrightnessRule:
         return np.unique(np.concatenate([limits, between]))
 
 
-RULE = BrightnessRule()
-_EDGES = RULE.edges
+BRIGHTNESS_RULE = BrightnessRule()
+_EDGES = BRIGHTNESS_RULE.edges
 
 
 @dataclass(slots=True)
@@ -61,7 +61,7 @@ class Brightness:
     real: bool = False
     """Whether the column has a type of reals."""
     _counts: I64 = field(default_factory=lambda: np.zeros(len(_EDGES) + 1, np.int64))
-    """Finite reals by the bin of ``RULE.edges``."""
+    """Finite reals by the bin of ``BRIGHTNESS_RULE.edges``."""
 
     @classmethod
     def of(cls, values: NDArray[Any]) -> Brightness:
@@ -91,25 +91,25 @@ class Brightness:
     @property
     def is_count(self) -> bool:
         """Whether the values are whole numbers of 8 to 16 bits, and none stands for a share of 1."""
-        return self.whole and self.highest <= RULE.scales[-1] and (not self.real or self.highest > 1.0)
+        return self.whole and self.highest <= BRIGHTNESS_RULE.scales[-1] and (not self.real or self.highest > 1.0)
 
     @property
     def above(self) -> int:
         """Reals beyond the value that means 1.0, by more than rounding."""
-        return int(self._counts[np.searchsorted(_EDGES, self.full * (1.0 + RULE.rounding)) + 1 :].sum())
+        return int(self._counts[np.searchsorted(_EDGES, self.full * (1.0 + BRIGHTNESS_RULE.rounding)) + 1 :].sum())
 
     @property
     def full(self) -> float:
         """The value that means 1.0."""
         if self.whole and (not self.real or self.highest > 1.0):
-            return next((scale for scale in RULE.scales[1:] if self.highest <= scale), self.highest)
+            return next((scale for scale in BRIGHTNESS_RULE.scales[1:] if self.highest <= scale), self.highest)
         bright = min(self._bright_end(), self.highest)
-        scale = next((s for s in RULE.scales if bright <= s * (1.0 + RULE.rounding)), bright)
-        return bright if scale > 1.0 and bright < RULE.darkest * scale else scale
+        scale = next((s for s in BRIGHTNESS_RULE.scales if bright <= s * (1.0 + BRIGHTNESS_RULE.rounding)), bright)
+        return bright if scale > 1.0 and bright < BRIGHTNESS_RULE.darkest * scale else scale
 
     def _bright_end(self) -> float:
         """What all but a few of the reals do not exceed, rounded up to the end of a bin."""
-        most = self.n - int(RULE.outliers * self.n)
+        most = self.n - int(BRIGHTNESS_RULE.outliers * self.n)
         last = int(np.searchsorted(np.cumsum(self._counts), most))
         return float(_EDGES[last]) if last < len(_EDGES) else self.highest
 

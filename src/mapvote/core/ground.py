@@ -11,6 +11,7 @@ paths lie above each other, every cell belongs to the level whose path is nearer
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,25 +19,44 @@ import numpy as np
 from mapvote.core.columns import lower_envelope
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import F32, I32, I64, U8, read_only
 
-KNOWN_M = 3.0
-"""Farther than this from any measured ground it is unknown."""
-_BRIDGED_M = 1.2
-"""Where the ground only leapt, this far from what was measured, it may yet be found lower: a yard, an underpass."""
-_GRADE = 0.15
-"""Steepest ground that counts as agreeing; anything steeper stands on the ground, metres per metre."""
-_AROUND_CELLS = 7
-_AGREEING = 0.5
-"""Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
-_BROAD_SEED = 30
-"""Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
-_FEW_TILES, _POINTS_A_TILE, _POINTS_AROUND = 64, 4000, 1000
-"""A map of more tiles than 64 and one for each 4000 points is a street with strays, or not in metres: where a tile and
-its eight neighbours hold fewer than 1000 points its ground is unknown. So memory grows with points, not with extent."""
-_NEAR_TILES = 128
-"""Planes kept, of 256 kB, while the windows around neighbouring tiles are read: three rows of them and more."""
-STEP_M = 0.5 * CELL_SIZE
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class GroundLaying:
+    """Numbers of the places from which the ground grows, and of its extent."""
+
+    known_m: float = 3.0
+    """Distance from measured ground beyond which the ground is unknown."""
+    bridged_m: float = 1.2
+    """Distance from measured ground beyond which lower ground may still be found: a yard, an underpass."""
+    grade: float = 0.15
+    """Steepest ground that counts as agreeing, metres per metre; a steeper surface stands on the ground."""
+    around_cells: int = 7
+    """Cells to each side of a cell, 2.1 m, that must agree before the ground may start from it."""
+    agreeing: float = 0.5
+    """Share of the measured ones of these cells that must agree."""
+    min_agreeing: int = 2
+    """Number of these cells that must agree."""
+    min_agreeing_off_road: int = 30
+    """The same number where a driven path has shown the ground: apart from it many points are reflections."""
+    few_tiles: int = 64
+    """Tiles that a map may have beside one for each ``points_a_tile``; more are a street with strays, or not in metres:
+    then sparse tiles have no ground, and memory grows with points, not with extent."""
+    points_a_tile: int = 4000
+    """Points that justify one more tile."""
+    points_around: int = 1000
+    """Points of a tile and its eight neighbours below which it is sparse."""
+    near_tiles: int = 128
+    """Planes kept, of 256 kB, while the windows around neighbouring tiles are read: three rows of them and more."""
+    levelled: int = 16
+    """Rounds in which the ground of a gap becomes the mean of the cells around: enough for gaps of some cells."""
+
+
+GROUND_LAYING = GroundLaying()
+GAP_STEP_M = 0.5 * CELL_SIZE
 """Unit of a gap's width: a cell is 2 units straight on, 3 across a corner (chamfer 2-3; Borgefors 1986)."""
 WIDEST = 100
 """Units: 15 m. Ground does not go on across a wider gap."""
@@ -46,69 +66,72 @@ SEED = 254
 """Gap of a cell from which it shall grow."""
 _NEAR_CELLS = 5
 """Ground this near (1.5 m) bounds how high and how low a point may be."""
-_ACROSS = np.arange(-_NEAR_CELLS, _NEAR_CELLS + 1)
-_AWAY_M = CELL_SIZE * np.sqrt((_ACROSS**2)[:, None] + _ACROSS**2)
-"""(11, 11) how far the cells near by are."""
+_AWAY_M = CELL_SIZE * np.sqrt(sum(axis**2 for axis in np.indices((2 * _NEAR_CELLS + 1,) * 2) - _NEAR_CELLS))
+"""(11, 11) distances of the cells near by."""
 _NOISE_M = 0.06
-"""Of a voxel's mean height: range and pose noise, a cobble."""
+"""Noise of a voxel's mean height: range and pose noise, a cobble."""
 _CLIMB, _FALL = 0.15, 0.5
-"""Steepest ground, metres per metre. A steeper rise is a thing that stands there; a steep fall must be a broad one."""
+"""Steepest ground, metres per metre. A steeper rise is an object; a steep fall must be a broad one."""
 _BROAD = 14
-"""Cells of the 24 around at a like height, before what lies off the expected ground is ground: a steep fall, a kerb's
+"""Cells of the 24 around at a like height, before a point off the expected ground is ground: a steep fall, a kerb's
 step up, a surface between measurements that contradict each other. Reflections make patches of 12."""
 _KERB_M = 0.2
-"""How much more than a slope a step up may rise and be ground: a kerb."""
-_PASSES = 16
-"""A gap's ground is the mean of what lies around, worked out so often: enough for gaps of some cells."""
+"""Rise of a step above a slope up to which it is ground: a kerb."""
 _MOST_AROUND = 4
-"""Of the 8 cells around: behind a kerb at least 4 lie higher, before it 3."""
+"""Cells of the 8 around that lie higher behind a kerb, at least; before it there are 3."""
 _OPEN_M = 1.0
-"""Room above what lies on a kerb: a car's underside has none."""
+"""Free height above a kerb: a car's underside has none."""
 _BEYOND_GAP = 2
-"""Cells of them that hold points at a like height, before the ground goes on beyond a gap."""
+"""Cells of the 24 around with points at a like height, before the ground goes on beyond a gap."""
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""
 
 
 def lay_ground(
-    points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights], n_points: Mapping[TileIndex, int]
+    points: Mapping[TileIndex, Heights],
+    road: Mapping[TileIndex, Heights],
+    n_points: Mapping[TileIndex, int],
+    numbers: GroundLaying = GROUND_LAYING,
 ) -> dict[TileIndex, F32]:
     """Height of the ground in every cell of every tile, (256, 256) float32 map metres, NaN where unknown.
 
-    ``n_points``: of each tile. ``road``: where vehicles drove, the height of the road under them. The ground grows
-    from there (:func:`grow`). Where it does not come to, and in maps of which nobody knows the
-    path, it starts from places that the measured cells around agree on and above which nothing rises as gently as
-    ground. Tiles are read one by one, in ascending order: of a large map only the heights are held, and no cell of
-    tiles that a few strays make (:data:`_POINTS_AROUND`).
+    ``n_points``: number of points of each tile. ``road``: the height of the road under driven paths. The ground grows
+    from there (:func:`grow`). In places that it does not reach, and in maps without a driven path, it starts from cells
+    that the measured cells around agree with and above which nothing rises as gently as ground. Tiles are read one by
+    one, in ascending order: a large map holds only its heights in memory, and no cell of sparse tiles.
     """
-    tiles = _populated(n_points)
+    # The heights of all tiles with enough points.
+    tiles = _populated(n_points, numbers)
     start, heights = _by_cell((points[tile] for tile in tiles), len(tiles))
     ground = np.full(len(tiles) * CELLS, np.nan, dtype=np.float32)
     gap = np.full(len(tiles) * CELLS, UNREACHED, dtype=np.uint8)
     neighbours = tiles_around(tiles)
+    # The ground grows from the road, then from cells that their surroundings agree with.
     for k, tile in enumerate(tiles):
         if tile in road:
             cells, z = _lowest_of_each(*road[tile])
             ground[k * CELLS + cells], gap[k * CELLS + cells] = z, SEED
     if road:
         grow(start, heights, neighbours, ground, gap)
-    _sow(start, heights, neighbours, ground, gap, _BROAD_SEED if road else 2)
+    least = numbers.min_agreeing_off_road if road else numbers.min_agreeing
+    _sow(start, heights, neighbours, ground, gap, least, numbers)
     grow(start, heights, neighbours, ground, gap)
-    ground[gap > KNOWN_M / STEP_M] = np.nan
-    settled = settle(start, heights, neighbours, ground, gap)
+    ground[gap > numbers.known_m / GAP_STEP_M] = np.nan
+    settled = settle(start, heights, neighbours, ground, gap, numbers)
     laid = dict(zip(tiles, settled.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
     unknown = read_only(np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32))
     return laid if len(tiles) == len(points) else dict.fromkeys(points, unknown) | laid
 
 
-def _populated(n_points: Mapping[TileIndex, int]) -> list[TileIndex]:
-    """The tiles whose ground is looked for, in ascending order."""
+def _populated(n_points: Mapping[TileIndex, int], numbers: GroundLaying) -> list[TileIndex]:
+    """The tiles with enough points for ground, in ascending order."""
     tiles = sorted(n_points)
-    if len(tiles) <= _FEW_TILES + sum(n_points.values()) // _POINTS_A_TILE:
+    if len(tiles) <= numbers.few_tiles + sum(n_points.values()) // numbers.points_a_tile:
         return tiles
     around = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    return [(r, c) for r, c in tiles if sum(n_points.get((r + i, c + j), 0) for i, j in around) >= _POINTS_AROUND]
+    least = numbers.points_around
+    return [(r, c) for r, c in tiles if sum(n_points.get((r + i, c + j), 0) for i, j in around) >= least]
 
 
 def _by_cell(points: Iterable[Heights], tiles: int) -> tuple[I32 | I64, F32]:
@@ -143,48 +166,53 @@ def _lowest_of_each(cells: I64, z: F32) -> Heights:
     return cells[order][first], z[order][first]
 
 
-def _sow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, least: int) -> None:
-    """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things.
+def _sow(
+    start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, least: int, numbers: GroundLaying
+) -> None:
+    """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as objects.
 
-    Arguments as :func:`grow`. What is sown here was not known before and is not called so
-    yet: no plane below changes on the way.
+    Arguments as :func:`grow`. Seeds do not count as known ground here: no plane below changes on the way.
     """
+    around_cells, grade = numbers.around_cells, numbers.grade
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)
-    near = slice(TILE_CELLS - _AROUND_CELLS, 2 * TILE_CELLS + _AROUND_CELLS)
+    near = slice(TILE_CELLS - around_cells, 2 * TILE_CELLS + around_cells)
     thirds = [slice(k * TILE_CELLS, (k + 1) * TILE_CELLS) for k in range(3)]
-    unmeasured = gap > _BRIDGED_M / STEP_M
+    unmeasured = gap > numbers.bridged_m / GAP_STEP_M
 
-    @lru_cache(maxsize=_NEAR_TILES)
+    @lru_cache(maxsize=numbers.near_tiles)
     def low(tile: int) -> F32:
         """(256, 256) the lowest point of each cell without measured ground nearby, inf where there is none."""
         first = start[tile * CELLS : (tile + 1) * CELLS + 1]
-        asked = (first[:-1] < first[1:]) & unmeasured[tile * CELLS : (tile + 1) * CELLS]
+        has_points = (first[:-1] < first[1:]) & unmeasured[tile * CELLS : (tile + 1) * CELLS]
         plane = nothing.reshape(-1).copy()
-        plane[asked] = heights[first[:-1][asked]]
+        plane[has_points] = heights[first[:-1][has_points]]
         return plane.reshape(nothing.shape)
 
-    @lru_cache(maxsize=_NEAR_TILES)
-    def known(tile: int) -> F32:
+    @lru_cache(maxsize=numbers.near_tiles)
+    def known_ground(tile: int) -> F32:
         """(256, 256) the ground that is known, inf elsewhere."""
         cells = slice(tile * CELLS, (tile + 1) * CELLS)
         return np.where(unmeasured[cells], np.inf, ground[cells]).reshape(nothing.shape)
 
-    @lru_cache(maxsize=_NEAR_TILES)
+    @lru_cache(maxsize=numbers.near_tiles)
     def supported(tile: int) -> F32:
         if not np.isfinite(low(tile)).any():
             return nothing
         around = np.block([[low(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
         out, window = np.empty_like(nothing), np.ascontiguousarray(around[near, near])
-        _support(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least, out)
+        _support(window, around_cells, grade * CELL_SIZE, numbers.agreeing, least, out)
         return out
 
+    # Supported cells that the lower envelope of all ground around does not explain as objects.
     envelope = np.empty((3 * TILE_CELLS, 3 * TILE_CELLS))
     for k in range(len(neighbours)):
         if np.isfinite(supported(k)).any():
             for i, row in enumerate(neighbours[k].tolist()):
                 for j, tile in enumerate(row):
-                    envelope[thirds[i], thirds[j]] = np.minimum(supported(tile), known(tile)) if tile >= 0 else np.inf
-            lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
+                    envelope[thirds[i], thirds[j]] = (
+                        np.minimum(supported(tile), known_ground(tile)) if tile >= 0 else np.inf
+                    )
+            lower_envelope(envelope, grade * CELL_SIZE, grade * CELL_SIZE * np.sqrt(2.0))
             lies = np.isfinite(supported(k)) & (supported(k) <= envelope[thirds[1], thirds[1]] + 0.1)
             cells = k * CELLS + np.flatnonzero(lies)
             ground[cells], gap[cells] = heights[start[cells]], SEED
@@ -192,8 +220,8 @@ def _sow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, 
 
 @kernel
 def _support(low: F32, reach: int, grade: float, share: float, least: int, out: F32) -> None:
-    """Into ``out`` ``low`` without a rim of ``reach`` cells, and without the cells (inf instead) that too few of the
-    known cells within ``reach`` agree with.
+    """Enter into ``out`` the plane ``low`` without a rim of ``reach`` cells, and without the cells (inf instead) that
+    too few of the known cells within ``reach`` agree with.
 
     Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least ``least`` cells and a
     ``share`` of them. Reflections below the road come singly or in small clusters far below all
@@ -294,7 +322,7 @@ def _continued(
     near = np.isfinite(low)
     agreed = near and low <= high  # else what was measured lies on both sides of a kerb
     if not agreed:
-        low, high = expected - _NOISE_M - _CLIMB * STEP_M * width, expected + _NOISE_M + _CLIMB * STEP_M * width
+        low, high = expected - _NOISE_M - _CLIMB * GAP_STEP_M * width, expected + _NOISE_M + _CLIMB * GAP_STEP_M * width
         steep = low
     best, falls, rises = np.nan, np.nan, np.nan
     for k in range(start[cell], start[cell + 1]):
@@ -346,7 +374,7 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
 
     ``heights[start[c]:start[c + 1]]`` are the points of flat cell c = tile * CELLS + row * TILE_CELLS + col, metres;
     ``neighbours`` (tiles, 3, 3) the tiles around each, -1 where the map has none. In place: ``ground`` (cells,) metres,
-    ``gap`` (cells,) the distance to measured ground in units of STEP_M, UNREACHED where ground did not come.
+    ``gap`` (cells,) the distance to measured ground in units of GAP_STEP_M, UNREACHED where ground did not come.
 
     Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
@@ -420,15 +448,17 @@ def _grow(
     return True
 
 
-def settle(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> F32:
-    """(cells,) the ``ground`` without the preference of the side it grew from, metres: it grows from the road, and what
-    is doubtful at a kerb came out as low as the gutter. Arguments as :func:`grow`."""
+def settle(
+    start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, numbers: GroundLaying = GROUND_LAYING
+) -> F32:
+    """(cells,) the ``ground`` without the preference of the side it grew from, metres: it grows from the road, so that
+    doubtful cells at a kerb came out as low as the gutter. Arguments as :func:`grow`."""
     settled = ground.copy()
     gaps = np.flatnonzero((gap > 0) & np.isfinite(ground))
     level = np.empty(len(gaps), np.float32)
     for _ in range(2):  # a cell between a gap and the gutter sees how high the gap lies the second time
         _raise_at_kerbs(start, heights, neighbours, ground, gap, settled.copy(), settled)
-        for _ in range(_PASSES):
+        for _ in range(numbers.levelled):
             _level(gaps, neighbours, settled, level)
             settled[gaps] = level
     return settled
@@ -438,10 +468,10 @@ def settle(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8
 def _raise_at_kerbs(
     start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, around: F32, out: F32
 ) -> None:
-    """Into ``out`` (cells,): where a cell ``around`` is up to a kerb higher, a measured cell lies at its own points
-    that are as much higher if they outnumber those at its ``ground``, and halfway if they are as many; and at the
-    mean of the cells around if a single point is all that it holds and most of them are higher. A pose error brings
-    points of the gutter into the first cell behind a kerb."""
+    """Raise measured cells behind kerbs, into ``out`` (cells,). Where a cell ``around`` is up to a kerb higher, the
+    cell lies at its own points that are as much higher if they outnumber those at its ``ground``, and halfway if they
+    are as many. A cell with a single point lies at the mean of the cells around if most of them are higher. A pose
+    error brings points of the gutter into the first cell behind a kerb."""
     for cell in range(len(ground)):
         if gap[cell] > 0:
             continue
@@ -472,8 +502,8 @@ def _raise_at_kerbs(
 
 @kernel
 def _level(cells: I64, neighbours: I32, ground: F32, out: F32) -> None:
-    """Into ``out`` (n,) the mean height of each of the ``cells`` and of those around it that are at most a kerb higher
-    or lower: over a gap between kerb and gutter the ground slopes, and is off by half the kerb at most."""
+    """Enter into ``out`` (n,) the mean height of each of the ``cells`` and of those around it that are at most a kerb
+    higher or lower: over a gap between kerb and gutter the ground slopes, and is off by half the kerb at most."""
     for k in range(len(cells)):
         cell = cells[k]
         tile, row, col = _placed(cell)

@@ -29,7 +29,7 @@ class MountRules:
     """Positions so far apart show the way ahead."""
 
 
-RULES = MountRules()
+MOUNT_RULES = MountRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +62,11 @@ class Mount:
     def in_steps(self) -> Mount:
         """The mount by roll, pitch and yaw in steps of ``MountRules.step_deg`` that is nearest: a prior knows up and
         ahead to some degrees, and matching takes care of what is left, as of any sensor's."""
-        nearest = int(np.argmax(np.einsum("nij,ij->n", _STEPS, self.C[:3, :3])))
-        return replace(self, C=poses_at([np.zeros(3)], _STEPS[nearest][None])[0])
+        nearest = int(np.argmax(np.einsum("nij,ij->n", _TURNS, self.C[:3, :3])))
+        return replace(self, C=poses_at([np.zeros(3)], _TURNS[nearest][None])[0])
 
 
-def mount_of_prior(T: F64, rules: MountRules = RULES) -> Mount | None:
+def mount_of_prior(T: F64, rules: MountRules = MOUNT_RULES) -> Mount | None:
     """The mount that poses T_map_lidar (n, 4, 4) state; None if it is the usual one, or they state none steadily."""
     # Up in the axes of the sensor: the last row of each rotation.
     ups = T[:, 2, :3]
@@ -99,7 +99,7 @@ def _rotations(step_deg: int) -> F64:
     return np.concatenate([rotations, rotations.swapaxes(1, 2)])
 
 
-_STEPS = _rotations(RULES.step_deg)
+_TURNS = _rotations(MOUNT_RULES.step_deg)
 
 
 def _ahead(T: F64, rules: MountRules) -> F64 | None:

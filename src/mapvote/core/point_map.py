@@ -23,7 +23,7 @@ from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 _EXTENT_M = 1e7
 NEAR_ORIGIN_M = 50_000.0
 """Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
-_CHUNK = 1_000_000
+_BLOCK_POINTS = 1_000_000
 """Points of one block: a large cloud is never copied as a whole."""
 KEPT_POINTS = 10_000_000
 """Maps of no more are held in memory as they are; of larger ones the tiles last used, up to so many points together."""
@@ -36,10 +36,10 @@ With it, `merge` judges strays by the scans of all surveys together."""
 
 
 class LazyTiles(Mapping[TileIndex, Tile]):
-    """As a dict of tiles, in ascending order. As long as anyone holds a tile, asking again gives the same object."""
+    """A dict of tiles, in ascending order. While a tile is held anywhere, reading it again gives the same object."""
 
     def __init__(self, load: Callable[[TileIndex], Tile], points: Mapping[TileIndex, int]) -> None:
-        """``load`` makes one tile; ``points``: of every tile of the map, how many it holds."""
+        """``load`` makes one tile; ``points``: number of points of every tile of the map."""
         self._load, self._points = load, {index: points[index] for index in sorted(points)}
         self._alive: weakref.WeakValueDictionary[TileIndex, Tile] = weakref.WeakValueDictionary()
         self._kept: OrderedDict[TileIndex, Tile] = OrderedDict()
@@ -187,8 +187,8 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     if not len(points_map):
         return
     tiles = np.empty((len(points_map), 2), dtype=np.int32)
-    for start in range(0, len(points_map), _CHUNK):
-        piece = slice(start, start + _CHUNK)
+    for start in range(0, len(points_map), _BLOCK_POINTS):
+        piece = slice(start, start + _BLOCK_POINTS)
         rows, cols = lattice.cells_of(points_map[piece])
         tiles[piece, 0], tiles[piece, 1] = rows // TILE_CELLS, cols // TILE_CELLS
     number = _numbered(tiles)
@@ -246,8 +246,8 @@ def map_from_points(
         raise MapvoteError(f"a map needs points: got an array of shape {points.shape}, expected (n, 3) with n > 0")
     lattice = lattice or lattice_of(points)
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
-    for start in range(0, len(points), _CHUNK):
-        piece = np.ascontiguousarray(points[start : start + _CHUNK], dtype=np.float64)
+    for start in range(0, len(points), _BLOCK_POINTS):
+        piece = np.ascontiguousarray(points[start : start + _BLOCK_POINTS], dtype=np.float64)
         check_extent(piece, start)
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
@@ -273,14 +273,11 @@ def check_extent(points: F64, before: int = 0) -> None:
         )
 
 
-_OPEN = 0.2
-"""Of a foreign campus map without ground 12 % of the cells look like open ground, of clouds with it 49 % and more."""
-
-
-def has_open_ground(point_map: PointMap) -> bool:
-    """Whether a fifth of the cells that hold points hold ground and nothing that stands on it. Of a map whose ground
-    was cut out, the feet of walls are taken for ground, but hardly anything else is. Of a map larger than memory the
-    largest tiles tell."""
+def has_open_ground(point_map: PointMap, min_share: float = 0.2) -> bool:
+    """Whether more than ``min_share`` of the cells with points hold ground and no obstacle. In a map whose ground was
+    cut out the feet of walls are taken for ground, but hardly anything else: 12 % of the cells of a foreign campus map
+    without ground look open, 49 % and more of clouds with it. A map larger than memory is judged by its largest tiles.
+    """
     ground, any_point = 0, 0
     tiles = point_map.tiles
     for tile in map(tiles.__getitem__, tiles.largest(9) if isinstance(tiles, LazyTiles) else tiles):
@@ -289,7 +286,7 @@ def has_open_ground(point_map: PointMap) -> bool:
         stands[tile.cells[tile.columns[1]]] = True
         any_point += int(held.sum())
         ground += int((held & ~stands & np.isfinite(tile.ground_z.reshape(-1))).sum())
-    return ground > _OPEN * any_point
+    return ground > min_share * any_point
 
 
 def all_points(point_map: PointMap) -> F64:

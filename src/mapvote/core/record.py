@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 Record = TypeVar("Record", bound=type)
-_MARK = "\n@record("
-_OF_VOTES = "\n@record(votes=True)"
+_DECORATOR = "\n@record("
+_DECORATOR_OF_VOTES = "\n@record(votes=True)"
 _declared: dict[str, tuple[type, bool]] = {}
 
 
@@ -69,7 +69,7 @@ def numbers(*, votes: bool = False, packages: tuple[str, ...] = ("mapvote", "map
 @cache
 def modules_with_records(packages: tuple[str, ...], *, votes: bool = False) -> list[str]:
     """The modules whose source declares a record: no other is imported to find them."""
-    mark = _OF_VOTES if votes else _MARK
+    mark = _DECORATOR_OF_VOTES if votes else _DECORATOR
     names = []
     for package in packages:
         spec = find_spec(package)
@@ -116,7 +116,7 @@ def _sentences(cls: type) -> dict[str, str]:
     assert isinstance(body, ast.ClassDef)
     meanings = {}
     for statement, after in zip(body.body, body.body[1:], strict=False):
-        told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and told:
+        has_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and has_text:
             meanings[statement.target.id] = " ".join(str(after.value.value).split())  # type: ignore[attr-defined]
     return meanings

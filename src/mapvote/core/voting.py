@@ -18,11 +18,11 @@ from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState, read_
 VOTE_UNIT = 16
 """One vote in the units of a tally: Eq. (1) is rounded to sixteenths."""
 _CACHED_CELLS = 2048
-_BYTE_MAX, _AT_ONCE = 255, 4
+_BYTE_MAX, _VOTERS_AT_ONCE = 255, 4
 """Voters whose votes a byte can count; that are counted in one pass."""
 _TALLIES: dict[Any, DTypeLike] = {np.dtype(np.uint8): np.uint8, np.dtype(np.uint16): np.uint16}
 _UO, _UE, _CO, _CE, _UN = (int(state) for state in CellState)
-_OPEN = 254
+_UNDECIDED_YET = 254
 """A cell that is not decided yet: no state, and not NO_VOTE."""
 
 
@@ -83,9 +83,9 @@ def _decide_cells(tally: I32, backers: I32, abstain: bool, min_votes: int, state
     for c in range(len(states)):  # most cells have no vote, or only votes for empty: tested in vectors
         empty, more = ues[c], uos[c] | cos[c] | ces[c] | uns[c]
         s = _UE if empty != 0 else NO_VOTE
-        states[c] = _OPEN if more != 0 else s
+        states[c] = _UNDECIDED_YET if more != 0 else s
     for c in range(len(states)):
-        if states[c] == _OPEN:
+        if states[c] == _UNDECIDED_YET:
             uo, ue, co = np.int64(uos[c]), np.int64(ues[c]), np.int64(cos[c])
             s = verdict(uo, ue, co, np.int64(ces[c]), np.int64(uns[c]), abstain)
             states[c] = _UN if s in (_CO, _CE) and backers[s, c] < min_votes else s
@@ -129,9 +129,9 @@ def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
     for start in range(0, len(voters), _BYTE_MAX):
         counts = tally if tally.dtype == np.uint8 else np.zeros(shape, dtype=np.uint8)
         batch = voters[start : start + _BYTE_MAX]
-        for first in range(0, len(batch), _AT_ONCE):
-            some = batch[first : first + _AT_ONCE]
-            count_states(*some, *[silent] * (_AT_ONCE - len(some)), counts)
+        for first in range(0, len(batch), _VOTERS_AT_ONCE):
+            some = batch[first : first + _VOTERS_AT_ONCE]
+            count_states(*some, *[silent] * (_VOTERS_AT_ONCE - len(some)), counts)
         if counts is tally:
             tally *= np.uint8(VOTE_UNIT)
         else:

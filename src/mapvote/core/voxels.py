@@ -13,7 +13,7 @@ from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, read_only
 
-_MIDDLE = 1 << 20
+_OFFSET = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
 
 BESIDE = (1 << 42, 1 << 21, 1)
@@ -30,7 +30,7 @@ def packed_key(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
 def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
     """The key of the voxel of side ``size`` that holds (x, y, z)."""
     ix, iy, iz = np.floor(x / size), np.floor(y / size), np.floor(z / size)
-    return packed_key(np.int64(ix) + _MIDDLE, np.int64(iy) + _MIDDLE, np.int64(iz) + _MIDDLE)
+    return packed_key(np.int64(ix) + _OFFSET, np.int64(iy) + _OFFSET, np.int64(iz) + _OFFSET)
 
 
 @inlined
@@ -201,7 +201,7 @@ class VoxelCloud:
 @kernel
 def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> int:
     """Fill ``keys`` (n,). Returns the index of the first of the points (n, 3) that lies beyond all keys, or -1."""
-    reach = float(_MIDDLE) * size
+    reach = float(_OFFSET) * size
     beyond = -1
     for i in range(len(points)):
         x, y, z = points[i, 0] - x0, points[i, 1] - y0, points[i, 2]
@@ -221,7 +221,7 @@ def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float =
     if beyond >= 0:
         x, y, z = points[beyond]
         raise MapvoteError(
-            f"a point at ({x:.1f}, {y:.1f}, {z:.1f}) is farther than {1e-3 * _MIDDLE * size:.0f} km from the corner of "
+            f"a point at ({x:.1f}, {y:.1f}, {z:.1f}) is farther than {1e-3 * _OFFSET * size:.0f} km from the corner of "
             f"the map's lattice ({x0:.1f}, {y0:.1f}): leave the point out, or begin the lattice near the points"
         )
     return keys
@@ -235,7 +235,7 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 @kernel
 def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) -> None:
     """The key (m,) of every ``every``-th of the points (n, 3), in voxels of side ``size``."""
-    scale, middle, step = 1.0 / size, float(_MIDDLE), np.uint64(every)
+    scale, middle, step = 1.0 / size, float(_OFFSET), np.uint64(every)
     for j in range(np.uint64(0), np.uint64(len(keys))):  # int32 vectorises, and holds what is within reach
         i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.

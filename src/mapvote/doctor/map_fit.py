@@ -18,7 +18,7 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, cut_tiles
-from mapvote.core.sensor_height import LEVEL_M, check_heights
+from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Progress, Severity
@@ -399,7 +399,7 @@ def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:
     if not -0.5 < height.median_m < 6.0:
         what = f"the sensor is {height.median_m:.1f} m above the map's ground"
         yield Finding("error", what, "the map's ground lies wrong under this drive: build it anew")
-    elif abs(height.worst_off_m) > LEVEL_M + 3.0 * drive.prior_sigma_m:
+    elif abs(height.worst_off_m) > height.level_m + 3.0 * drive.prior_sigma_m:
         mend = "if the prior's heights are sound, so much is wrong with the map's ground: build it anew from its drives"
         yield Finding("warning", f"by the prior, {height.complaint}", mend)
     else:

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
 from mapvote.core.record import record
-from mapvote.core.sensor_height import UNKNOWN, Heights
+from mapvote.core.sensor_height import NO_HEIGHTS, Heights
 from mapvote.core.types import F64, I64, PRECISE_PRIOR_M, Bool, Drive
 from mapvote.survey.driven_road import WrongAttitude
 
@@ -52,7 +52,7 @@ class DriveTrack:
     """Scans at which the track began anew because nothing fitted: there only priors tie the map together."""
     sigma_m: F64
     """(n,) standard deviation of each settled position in the frame of the priors, NaN without any."""
-    heights: Heights = UNKNOWN
+    heights: Heights = NO_HEIGHTS
     """Heights of the sensor over the map's ground."""
     wrong_attitude: WrongAttitude | None = None
     """The error of the precise attitude that the prior states: the drive is built with a coarser one."""
