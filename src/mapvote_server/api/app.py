@@ -17,6 +17,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import desk_routes, event_routes, operator_routes, page_routes, vehicle_routes
 from mapvote_server.api.event_routes import deliver
+from mapvote_server.api.openapi import describe_keys, not_allowed
 from mapvote_server.api.proxies import Proxies
 from mapvote_server.api.schemas import unreadable, unusable
 from mapvote_server.api.security import Guard, Hosts, Watch
@@ -74,6 +75,8 @@ def create_app(
         app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
     app.add_exception_handler(RequestValidationError, unusable)
+    app.add_exception_handler(405, not_allowed)
+    describe_keys(app)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(parts, opened=opened, owner=owner)
     app.add_middleware(Watch, hosts=hosts, guard=guard, proxies=Proxies(parts.settings.server.proxies), parts=parts)
     return app

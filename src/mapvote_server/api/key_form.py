@@ -21,7 +21,7 @@ from mapvote_server.errors import Unauthorised
 PATH = "/key"
 """Where the form is sent."""
 STYLE = "/viewer/key.css"
-_COOKIE = "mapvote_key"
+COOKIE = "mapvote_key"
 _PAGES = ("/", "/docs")
 _MOST_BYTES = 4096
 
@@ -30,7 +30,7 @@ def key_in_cookie(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
     """The key that the form has left with the browser."""
     sent = next((value.decode("latin-1") for name, value in headers if name == b"cookie"), "")
     try:
-        found = SimpleCookie(sent).get(_COOKIE)
+        found = SimpleCookie(sent).get(COOKIE)
     except CookieError:
         return None
     return found.value if found else None
@@ -82,5 +82,5 @@ async def key_sent(scope: Scope, receive: Receive) -> str:
 def welcome(scope: Scope, key: str) -> Response:
     """To the page, with the cookie."""
     response = Response(status_code=303, headers={"Location": "./", "Cache-Control": "no-store"})
-    response.set_cookie(_COOKIE, key, httponly=True, samesite="strict", secure=scope["scheme"] == "https")
+    response.set_cookie(COOKIE, key, httponly=True, samesite="strict", secure=scope["scheme"] == "https")
     return response

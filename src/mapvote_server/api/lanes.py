@@ -36,7 +36,7 @@ class Queues:
     """Limits of the lanes for one key."""
 
     waiting: int = 32
-    """Requests of one key that wait in a lane; more are refused."""
+    """Requests of one key that wait in a lane with a time limit; more are refused."""
     answer_slack_s: float = 0.5
     """A client is answered this long after the time limit, even if the thread has not noticed it yet."""
     names_kept: int = 10_000
@@ -134,7 +134,8 @@ class Lane:
     def _check(self, name: str | None) -> None:
         if name is not None and self._budget is not None:
             self._budget.check(name)
-        if name is not None and len(self._waiting.get(name, ())) >= QUEUES.waiting:
+        limited = self._limit_s is not None and name is not None
+        if limited and len(self._waiting.get(name, ())) >= QUEUES.waiting:
             raise TooMany(f"{QUEUES.waiting} requests of {name!r} wait already: wait until these are answered")
 
     async def _turn(self, name: str | None) -> None:

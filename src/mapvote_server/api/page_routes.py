@@ -17,6 +17,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
 from mapvote.shapes.packed_cloud import N_LEVELS
+from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -108,7 +109,7 @@ def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: Table
 def packed(request: Request, data: bytes, cache: str) -> Response:
     """Bytes, compressed where the client takes it."""
     headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
-    if "zstd" in request.headers.get("accept-encoding", ""):
+    if takes_zstd(request):
         data, headers["Content-Encoding"] = compress(data, 1), "zstd"
     return Response(data, media_type="application/octet-stream", headers=headers)
 
@@ -145,7 +146,7 @@ async def asset(request: Request, name: str) -> Response:
     headers = {"Cache-Control": "no-cache", "ETag": found.tag, "Vary": "Accept-Encoding"}
     if request.headers.get("if-none-match") == found.tag:
         return Response(status_code=304, headers=headers)
-    if "zstd" in request.headers.get("accept-encoding", ""):
+    if takes_zstd(request):
         return Response(found.packed, media_type=found.kind, headers=headers | {"Content-Encoding": "zstd"})
     return Response(found.plain, media_type=found.kind, headers=headers)
 

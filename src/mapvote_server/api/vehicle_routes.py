@@ -14,6 +14,7 @@ from fastapi.routing import APIRoute
 from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.shapes.geojson import utc
+from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -93,7 +94,7 @@ async def plane(request: Request, digest: Digest) -> Response:
     data = await parts.vehicle.run(parts.store.blob, digest)
     if request.headers.get("if-none-match") == f'"{digest}"':
         return Response(status_code=304, headers=headers)
-    if "zstd" in request.headers.get("accept-encoding", ""):
+    if takes_zstd(request):
         headers["Content-Encoding"] = "zstd"
     else:
         data = unpack_bytes(data, MAX_PLANE_BYTES, "tile plane")

@@ -3,7 +3,7 @@
     store = Store.open("sqlite:///street.db")          # or Store.create(url, point_map)
     store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
 
-What changes it lies beside it: ``admission`` and ``ballots``, ``publish``, ``replay``, ``reviews``, ``keys``,
+What changes it lies beside it: ``admission``, ``votes``, ``publish``, ``rollback``, ``reviews``, ``keys``,
 ``policy``. What explains it is in :mod:`mapvote_server.questions`.
 """
 

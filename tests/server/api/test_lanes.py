@@ -33,21 +33,23 @@ def as_key(name: str | None, work: Callable[[], Awaitable[object]]) -> asyncio.T
 def test_a_key_that_asks_forty_times_holds_one_thread_and_another_key_does_not_wait_for_it() -> None:
     order: list[str] = []
     most = [0, 0]
+    gate = threading.Event()
 
     def busy(name: str) -> None:
         most[0] += 1
         most[1] = max(most)
-        time.sleep(0.005)
+        gate.wait(10.0)
         most[0] -= 1
         order.append(name)
 
     async def story() -> None:
         lane = Lane("questions", 1, each=1)
         greedy = [as_key("greedy", lambda: lane.run(busy, "greedy")) for _ in range(30)]
-        await asyncio.sleep(0.001)
-        await as_key("honest", lambda: lane.run(busy, "honest"))
+        honest = as_key("honest", lambda: lane.run(busy, "honest"))
+        await asyncio.sleep(0.01)  # all of them are in line now
+        gate.set()
+        await asyncio.gather(honest, *greedy)
         assert order.index("honest") <= 2
-        await asyncio.gather(*greedy)
         lane.close()
 
     asyncio.run(story())
@@ -94,7 +96,7 @@ def test_more_requests_of_one_key_than_may_wait_are_refused_at_once() -> None:
     gate = threading.Event()
 
     async def story() -> None:
-        lane = Lane("questions", 1, each=1)
+        lane = Lane("questions", 1, each=1, limit_s=60.0)
         held = [as_key("greedy", lambda: lane.run(gate.wait, 10.0)) for _ in range(QUEUES.waiting + 1)]
         await asyncio.sleep(0.01)
         with pytest.raises(TooMany, match="wait already"):

@@ -1,0 +1,114 @@
+"""What the API declares of itself: keys, limits, methods, encodings, ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.exc import OperationalError
+
+from mapvote_server.api.app import create_app
+from mapvote_server.errors import Unavailable
+from mapvote_server.store.database import Database, _clear_errors
+from stores import NewStore
+
+
+@pytest.fixture
+def client(new_store: NewStore) -> Iterator[TestClient]:
+    with TestClient(create_app(new_store(), opened=True), base_url="http://localhost") as client:
+        yield client
+
+
+def test_the_document_says_how_a_key_is_sent_and_that_every_route_may_be_refused_for_a_while(
+    client: TestClient,
+) -> None:
+    document = client.get("/openapi.json").json()
+    schemes = document["components"]["securitySchemes"]
+    assert {scheme["type"] for scheme in schemes.values()} == {"http", "apiKey"}
+    assert [name for entry in document["security"] for name in entry] == list(schemes)
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            assert {"401", "429"} <= set(operation["responses"]), (method, path)
+            assert ({} in operation.get("security", ())) == (path in ("/livez", "/readyz")), (method, path)
+
+
+@pytest.mark.parametrize(
+    ("path", "allow"),
+    [
+        ("/v1/keys", "GET, POST"),
+        ("/v1/publish", "DELETE, GET, POST"),
+        ("/v1/ballots/a/d", "DELETE, PUT"),
+        (f"/v1/tiles/{'0' * 64}", "GET, PUT"),
+        ("/v1/map", "GET"),
+    ],
+)
+def test_a_405_names_every_method_of_the_path(client: TestClient, path: str, allow: str) -> None:
+    answer = client.request("OPTIONS", path)
+    assert (answer.status_code, answer.headers["allow"]) == (405, allow)
+    assert allow in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("accepted", "zstd"),
+    [
+        ("zstd", True),
+        ("gzip, ZSTD;q=0.5", True),
+        ("zstd;q=0", False),
+        ("gzip, zstd; q=0.0", False),
+        ("zstd;q=x", False),
+        ("xzstd", False),
+        ("", False),
+    ],
+)
+def test_zstd_is_sent_to_who_takes_it(client: TestClient, accepted: str, zstd: bool) -> None:
+    plane = client.get("/v1/map").json()["tiles"]["0,0"]["points"]
+    for path in ("/viewer/app.js", f"/v1/tiles/{plane}", "/v1/clouds/overview", "/v1/evidence/0/0"):
+        answer = client.get(path, headers={"Accept-Encoding": accepted})
+        assert (answer.headers.get("content-encoding") == "zstd") is zstd, path
+
+
+@pytest.mark.parametrize("number", ["-5", "0", "-1", str(1 << 31)])
+def test_a_number_that_no_version_can_have_is_422_wherever_it_stands(client: TestClient, number: str) -> None:
+    for path in (
+        f"/v1/changes?from={number}",
+        f"/v1/changes?from=1&to={number}",
+        f"/v1/changes/page?from={number}",
+        f"/v1/map?since={number}",
+        f"/v1/map/versions/{number}",
+        f"/v1/clouds/changed?from={number}&to=1",
+        f"/v1/clouds/overview?version={number}",
+    ):
+        assert client.get(path).status_code == 422, path
+    assert client.post("/v1/rollback", json={"to": int(number)}).status_code == 422
+
+
+@pytest.mark.parametrize("path", ["keys", "keys/rotate", "keys/revoke"])
+@pytest.mark.parametrize("name", ["", "../x", "a b", "a" * 65, ".a"])
+def test_a_name_that_cannot_be_one_is_422_by_its_pattern(client: TestClient, path: str, name: str) -> None:
+    answer = client.post(f"/v1/{path}", json={"name": name})
+    assert (answer.status_code, "pattern" in answer.json()["detail"]) == (422, True)
+
+
+@pytest.mark.parametrize(
+    ("reason", "says"),
+    [
+        ("attempt to write a readonly database", "mount the disk writable"),
+        ("cannot execute INSERT in a read-only transaction", "mount the disk writable"),
+        ("database or disk is full", "free space"),
+        ("database is locked", "try again"),
+    ],
+)
+def test_a_store_that_cannot_be_written_says_what_helps(reason: str, says: str) -> None:
+    with pytest.raises(Unavailable, match=says) as refused, _clear_errors():
+        raise OperationalError("INSERT", {}, Exception(reason))
+    assert ("try again" in str(refused.value)) == ("read" not in reason)
+
+
+def test_a_file_that_is_read_only_is_told_so(tmp_path: Path) -> None:
+    database = Database(f"sqlite:///file:{tmp_path / 's.db'}?mode=ro&uri=true")
+    Database(f"sqlite:///{tmp_path / 's.db'}").make_private_file()
+    with pytest.raises(Unavailable, match="mount the disk writable"), database.writing() as connection:
+        connection.exec_driver_sql("CREATE TABLE t (a)")
+    database.close()
