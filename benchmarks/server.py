@@ -1,37 +1,28 @@
-"""A real server process on loopback, with keys, under three kinds of load.
+"""A real server process on loopback, with keys, under two kinds of load (attacks: hostile.py).
 
     python benchmarks/server.py load --seconds 20          # ballots a second, each durable before its answer
     python benchmarks/server.py readers --tiles 1000       # one publish while a hundred clients read the manifest
-    python benchmarks/server.py hostile --only-all         # an honest vehicle among hostile clients
     .. --database postgresql
 
 ``load``: every connection is a vehicle that sends one ballot of about 20 kB after another and waits for each answer;
 afterwards every acknowledged ballot is looked up in the store.
 ``readers``: waits are those of answers that were on their way while it published, or up to 2 s after: the new manifest
 is made then. Every manifest must be wholly of one version. Then 64 operators publish at once: exactly one may win.
-``hostile``: in a process of their own, everything at once or each alone: 48 clients that ask for the most expensive
-reads, 30 uploads that announce 10 MB and send a byte a second, 1,100 connections that never finish their headers and
-come back a second after they are cut, 8 clients with wrong keys, 8 whose headers have 40 MB each. Meanwhile one vehicle
-sends a ballot every 100 ms, and somebody asks for /healthz as often. Ends with 1 if, with everything at once, one
-ballot in a hundred waits longer than 1 s or one look at the health longer than 100 ms, or if any is refused.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import gc
 import json
-import multiprocessing
 import os
 import random
-import resource
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,7 +41,6 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote_server.store import schema
 from mapvote_server.store.keys import ROLES, issue
-from mapvote_server.store.publish import publish
 from mapvote_server.store.store import Store
 from postgres_cluster import cluster_for
 from stores import send
@@ -60,7 +50,6 @@ Answer = tuple[int, bytes]
 Row = dict[str, Any]
 LIMITS = "[server]\nballots_per_minute = 1e9\ndrives_a_day = 1000000000\n"
 HEIGHTS = [0.45, 0.75, 1.05]
-MOST_BALLOT_S, MOST_HEALTH_S = 1.0, 0.1
 
 
 # One harness --------------------------------------------------------------------------------------------------------
@@ -250,171 +239,16 @@ def readers(options: argparse.Namespace) -> Row:
     return {"tiles": options.tiles, "readers": options.readers} | found | {"64_publishers": dict(answers)}
 
 
-# Hostile ------------------------------------------------------------------------------------------------------------
-
-TILES = [(row, col) for row in range(6) for col in range(6)]
-CELLS = [(r, c) for r in range(4, 252, 8) for c in range(4, 252, 8)]
-ANSWERS: Counter[str] = Counter()
-HERE: set[int] = set()
-"""Half-open connections that have been made once."""
-
-
-def history(store: Store) -> None:
-    """Ten vehicles that saw half of the pillars gone, in a second version: something to look at at length."""
-    point_map, rng = store.point_map(), np.random.default_rng(1)
-    gone = {tile: [cell for cell in CELLS if rng.random() < 0.5] for tile in TILES}
-    says = {
-        tile: Say(states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY))
-        for tile, cells in gone.items()
-    }
-    for i in range(10):
-        send(store, make_ballot(point_map, says, f"v{i}", "d", time.time_ns()))
-    publish(store, override=True)
-
-
-async def expensive_read(address: Address, keys: dict[str, str], turn: int) -> None:
-    turn += sum(ANSWERS.values())
-    x, y = 76.8 * (turn % 6) + 3.1, 3.1
-    paths = ["/v1/changes?from=1&to=2", f"/v1/cells?x={x}&y={y}", "/v1/coverage", "/v1/vehicles", "/v1/map/versions"]
-    status, _ = await ask(address, "GET", paths[turn % len(paths)], keys["reviewer"])
-    ANSWERS[f"read {status}"] += 1
-
-
-async def stalled_upload(address: Address, keys: dict[str, str], turn: int) -> None:
-    vehicle = f"bad{turn % 8}"
-    _, writer = await asyncio.open_connection(*address)
-    head = f"PUT /v1/ballots/{vehicle}/s{turn} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {keys[vehicle]}\r\n"
-    writer.write(f"{head}Content-Length: 10000000\r\n\r\n".encode() + bytes(100_000))
-    try:
-        while True:
-            writer.write(b"x")
-            await writer.drain()
-            await asyncio.sleep(1.0)
-    finally:
-        writer.close()
-
-
-async def half_open(address: Address, keys: dict[str, str], turn: int) -> None:
-    await asyncio.sleep(1.0 if turn in HERE else 4.0 * turn / HOSTILE["half-open"][0])
-    HERE.add(turn)
-    reader, writer = await asyncio.open_connection(*address)
-    writer.write(b"GET /v1/map HTTP/1.1\r\nHost: localhost\r\nX-Never: ")
-    try:
-        await reader.read()
-    finally:
-        writer.close()
-
-
-async def wrong_key(address: Address, keys: dict[str, str], turn: int) -> None:
-    await ask(address, "GET", "/v1/map", f"wrong-{turn}-{time.monotonic_ns()}")
-
-
-async def large_head(address: Address, keys: dict[str, str], turn: int) -> None:
-    reader, writer = await asyncio.open_connection(*address)
-    try:
-        writer.write(b"GET /v1/map HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
-        for _ in range(40):
-            writer.write(b"a" * 1_000_000)
-            await writer.drain()
-        await reader.read(100)
-    finally:
-        writer.close()
-
-
-HOSTILE: dict[str, tuple[int, Callable[[Address, dict[str, str], int], Awaitable[None]]]] = {
-    "reads": (48, expensive_read),
-    "uploads": (30, stalled_upload),
-    "half-open": (1100, half_open),
-    "wrong keys": (8, wrong_key),
-    "heads": (8, large_head),
-}
-"""Number of clients, and what each does for ever."""
-
-
-def attack(address: Address, keys: dict[str, str], kinds: set[str]) -> None:
-    """The process of those who attack, until it is killed."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard if hard != resource.RLIM_INFINITY else 1 << 16, hard))
-
-    async def again(kind: str, turn: int) -> None:
-        while True:
-            with suppress(OSError, IndexError, ValueError):
-                await HOSTILE[kind][1](address, keys, turn)
-            await asyncio.sleep(0.001)
-
-    async def everybody() -> None:
-        await asyncio.gather(*(again(kind, turn) for kind in kinds for turn in range(HOSTILE[kind][0])))
-
-    asyncio.run(everybody())
-
-
-async def honest(at: Site, ballot: Ballot, seconds: float, prefix: str) -> tuple[Row, list[str]]:
-    """A ballot and a look at the health every 100 ms: (waits, refusals)."""
-    waits: dict[str, list[float]] = {"ballot": [], "healthz": []}
-    refused, end, key = list[str](), time.perf_counter() + seconds, at.keys["honest"]
-
-    async def every(name: str, request: Callable[[int], Awaitable[Answer]]) -> None:
-        turn = 0
-        while time.perf_counter() < end:
-            turn, start = turn + 1, time.perf_counter()
-            try:
-                status, content = await asyncio.wait_for(request(turn), 30.0)
-            except (OSError, IndexError, TimeoutError) as error:
-                status, content = 0, repr(error).encode()
-            waits[name].append(time.perf_counter() - start)
-            if status not in (200, 201):
-                refused.append(f"{status} {content[:200]!r}")
-            await asyncio.sleep(max(0.0, 0.1 - waits[name][-1]))
-
-    def vote(turn: int) -> Awaitable[Answer]:
-        path, body = as_drive(ballot, "honest", f"{prefix}{turn}")
-        return ask(at.address, "PUT", path, key, body)
-
-    await asyncio.gather(every("ballot", vote), every("healthz", lambda _: ask(at.address, "GET", "/healthz", key)))
-    return percentiles("ballot", waits["ballot"]) | percentiles("healthz", waits["healthz"]), refused
-
-
-def hostile(options: argparse.Namespace) -> Row:
-    """Every row of the table, on one server; the last is everything at once."""
-    every, row = set(HOSTILE), Row()
-    vehicles = ["honest", *(f"bad{i}" for i in range(8))]
-    with site(options.database, pillars(TILES, CELLS), history, vehicles) as at:
-        store = Store.open(at.url)
-        ballot = typical_ballot(store.point_map())
-        store.close()
-        gc.freeze()  # a collection here would look like a wait there
-        asyncio.run(honest(at, ballot, 3.0, "warm"))
-        for kinds in [every] if options.only_all else [set[str](), *({kind} for kind in sorted(every)), every]:
-            process = multiprocessing.get_context("spawn").Process(target=attack, args=(at.address, at.keys, kinds))
-            process.start()
-            try:
-                time.sleep(5.0)  # the attack unfolds
-                prefix = "".join(sorted(kind[0] for kind in kinds)) or "n"
-                waits, refused = asyncio.run(honest(at, ballot, options.seconds, prefix))
-                if kinds and not process.is_alive():
-                    raise SystemExit("the attackers gave up: nothing was measured")
-            finally:
-                process.kill()
-                process.join()
-            row = {"hostile": ", ".join(sorted(kinds)) or "nobody", "refused": refused[:3]} | waits
-            print(json.dumps(row), flush=True)
-    late = row["ballot_p99_ms"] > 1e3 * MOST_BALLOT_S or row["healthz_p99_ms"] > 1e3 * MOST_HEALTH_S
-    if row["refused"] or late:
-        raise SystemExit("an honest vehicle was kept waiting, or refused")
-    return {"cores": len(os.sched_getaffinity(0))}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["load", "readers", "hostile"])
+    parser.add_argument("what", choices=["load", "readers"])
     parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--connections", type=int, default=24)
     parser.add_argument("--tiles", type=int, default=1000)
     parser.add_argument("--readers", type=int, default=100)
-    parser.add_argument("--only-all", action="store_true", help="hostile: only everything at once")
     options = parser.parse_args()
-    measure = {"load": load, "readers": readers, "hostile": hostile}[options.what]
+    measure = {"load": load, "readers": readers}[options.what]
     print(json.dumps({"what": options.what, "database": options.database} | measure(options)))
 
 
