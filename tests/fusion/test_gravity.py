@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,10 +16,13 @@ from scipy.spatial import ConvexHull
 
 from hand_made import SHAPE, Cell, Say, make_ballot, make_map, make_tile, states_plane, wall, words_plane
 from mapvote.codec.ballot import Ballot
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Memory
 from mapvote.core.types import CellState
+from mapvote.fusion import fuse
 from mapvote.fusion.fuse import update_map
 from mapvote.fusion.gravity import GRAVITY, Fallen, Remains, fall_across, fall_within
 
@@ -242,6 +246,47 @@ def test_the_order_of_ballots_decides_nothing() -> None:
     one, other = (update_map(point_map, some, ROUND)[0] for some in (ballots, ballots[::-1]))
     assert left(one) == left(other) == {}
     assert all((one.tiles[index].points == other.tiles[index].points).all() for index in one.tiles)
+
+
+@pytest.mark.parametrize("by", [place for place in PLACES if place not in ((0, 0), (2, 195))])
+def test_a_tile_after_a_fall_is_what_its_votes_and_the_fall_give(by: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The short way takes what falls over the border from the tile as it is; the long way fuses the tile again."""
+    point_map = street(moved(sets(SIDES, BACK, ROOF), by))
+    point_map = replace(point_map, version=3)
+    ballots = [ballot(point_map, name, moved(SIDES, by)) for name in "abc"]
+    short_map, short = update_map(point_map, ballots, ROUND)
+    refused = []
+    monkeypatch.setattr(fuse, "fall_besides", lambda *given: refused.append(given))
+    long_map, long = update_map(point_map, ballots, ROUND)
+    assert refused, "the house lies across a border"
+    assert set(short) == set(long)
+    for index, decision in long.items():
+        for plane in ("states", "edits", "tally"):
+            assert (getattr(short[index], plane) == getattr(decision, plane)).all(), plane
+        assert (short[index].added, short[index].deleted) == (decision.added, decision.deleted)
+        assert (short[index].fell.cells == decision.fell.cells).all()
+        assert (short[index].fell.words == decision.fell.words).all()
+        assert (short[index].fell.beside == decision.fell.beside).all()
+        assert pack_tile(short_map.tile(index))[0] == pack_tile(long_map.tile(index))[0]
+
+
+def test_what_vehicles_built_is_fused_again_when_it_falls_because_its_stay_is_counted() -> None:
+    by = (0, 199)
+    rest, gone = moved(sets(SIDES, BACK), by), moved(SIDES, by)
+    point_map = replace(street(rest), version=3)
+    tiles = dict(point_map.tiles)
+    for index, tile in tiles.items():
+        cells = np.unique(tile.cells)
+        values = np.zeros((4, len(cells)), dtype=np.uint32)
+        values[:2] = [[2], [5]]
+        tiles[index] = tile.but(memory=Memory(cells, values))
+    point_map = replace(point_map, tiles=tiles)
+    updated, _ = update_map(point_map, [ballot(point_map, name, gone) for name in "ab"], ROUND)
+    assert left(updated) == {}
+    for tile in updated.tiles.values():
+        assert tile.memory is not None
+        assert (tile.memory.values[1] == 0).all(), "nothing stands there any more"
+        assert (tile.memory.values[2] == 1).all(), "one object came and went"
 
 
 # Random groups against scipy's labels -------------------------------------------------------------------------------

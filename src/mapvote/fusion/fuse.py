@@ -225,8 +225,30 @@ def _let_fall(
     left = remains_of(tile, edited, decided.edits, waits)
     fell, missing = fall_within(tile.index, left)
     fell = fell if fallen is None else fell.joined(fallen)
-    if not len(fell.cells):
-        return (replace(decided, undecided=left) if missing else decided), edited, 0
+    decided = replace(decided, undecided=left if missing else None)
+    return _without(fell, decided, tile, edited, left) if len(fell.cells) else (decided, edited, 0)
+
+
+def fall_besides(
+    decided: Decision, tile: Tile, edited: Tile, fallen: Fallen, version: int
+) -> tuple[Decision, Tile] | None:
+    """What :func:`fuse_tile` makes of a tile if it is given ``fallen`` too, from what it made without: ``decided`` and
+    ``edited``, of a tile that other tiles decide.
+
+    None if votes are needed again: to say how long something stood that vehicles had put there, and that falls now.
+    """
+    assert decided.undecided is not None
+    memory = edited.memory or Memory.none()
+    if (memory.at(fallen.cells)[1] > 0).any():
+        return None
+    decided, fewer, more = _without(decided.fell.joined(fallen), decided, tile, edited, decided.undecided)
+    decided = replace(decided, deleted=decided.deleted + more)
+    return decided, fewer.but(memory=memory.with_changed(fallen.cells, version))
+
+
+def _without(fell: Fallen, decided: Decision, tile: Tile, edited: Tile, left: Remains) -> tuple[Decision, Tile, int]:
+    """(the decision, the tile ``edited``, without all that ``fell``, how many points that were); ``left``: the remains
+    of the edited tile."""
     plane = fell.plane()
     edited, deleted = delete_points(edited, plane)
     left = replace(left, rest=left.rest & ~plane)
@@ -237,8 +259,8 @@ def _let_fall(
     states = decided.states.copy()
     told = without_spilled_in(emptied, edits, tile) if len(decided.odds.cells) else edits
     states.reshape(-1)[emptied] = told.reshape(-1)[emptied]
-    decided = replace(decided, fell=fell, states=states, edits=edits, undecided=left if missing else None)
-    return decided, edited, deleted
+    undecided = None if decided.undecided is None else left
+    return replace(decided, fell=fell, states=states, edits=edits, undecided=undecided), edited, deleted
 
 
 def hear(
@@ -405,7 +427,14 @@ def update_map(
         fuse(index)
     undecided = {index: one.undecided for index, one in decisions.items() if one.undecided is not None}
     for index, fallen in fall_across(undecided, remains_at).items():
-        fuse(index, fallen)
+        tile = point_map.tile(index)
+        after_fall = None
+        if index in undecided:
+            after_fall = fall_besides(decisions[index], tile, changed.get(index, tile), fallen, version)
+        if after_fall is None:
+            fuse(index, fallen)
+        else:
+            decisions[index], changed[index] = after_fall
     if point_map.version is not None and changed:
         point_map = replace(point_map, version=version)
     return replace(point_map, tiles=with_changed(point_map.tiles, changed)), decisions

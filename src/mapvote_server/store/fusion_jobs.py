@@ -37,7 +37,7 @@ from mapvote.fusion.decision_record import (
     pack_tally,
     packed_cells,
 )
-from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.fuse import Decision, fall_besides, fuse_tile
 from mapvote.fusion.gravity import Fallen, Remains, fall_across, remains_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote, voter_of
@@ -113,7 +113,42 @@ class Fused:
         return cls(index, None, 0, 0, 0, 0, None, {}, _NO_CELLS, _NO_CELLS, 0, None, damaged)
 
 
-def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
+@dataclass(frozen=True, slots=True)
+class Open:
+    """A tile that others decide: not packed yet, since more of it may fall."""
+
+    task: Task
+    tile: Tile
+    edited: Tile
+    decision: Decision
+    standings: bytes
+    """Packed."""
+    damaged: Sequence[Damage] = ()
+
+    @property
+    def index(self) -> TileIndex:
+        """Of its tile."""
+        return self.tile.index
+
+    @property
+    def undecided(self) -> Remains | None:
+        """Its remains."""
+        return self.decision.undecided
+
+    def packed(self) -> Fused:
+        """The tile as it is."""
+        return replace(_packed(self.task, self.tile, self.edited, self.decision, self.standings), damaged=self.damaged)
+
+    def after(self, fallen: Fallen) -> Fused | None:
+        """The tile after more has fallen; None if it must be fused again."""
+        after_fall = fall_besides(self.decision, self.tile, self.edited, fallen, self.task.version)
+        if after_fall is None:
+            return None
+        decision, edited = after_fall
+        return replace(self, decision=decision, edited=edited).packed()
+
+
+def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused | Open]:
     """Read the votes that count on some tiles of a row, in one round, decide, edit. Pure but for reading the database.
 
     Damaged ballots are left out and named; a damaged tile stays as it is and is named. In another process, where there
@@ -125,7 +160,7 @@ def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list
         return [_fuse_sound(connection, task, polled) for task in tasks]
 
 
-def _fuse_sound(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
+def _fuse_sound(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open:
     """One tile, without what is damaged."""
     damaged: list[Damage] = []
     while True:
@@ -148,7 +183,7 @@ def _plane_of(task: Task, error: str) -> str:
     return next((digest for digest in task.tile.planes().values() if digest[:12] in error), task.tile.points)
 
 
-def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
+def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open:
     tile = _tile(connection, task)
     judged = judged_on(connection, tile, task.asked, task.misread, polled)
     votes = [one.vote for one in judged if one.vote is not None]
@@ -164,6 +199,13 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     decision, edited = fuse_tile(
         tile, votes, rule, settings, task.version, recent, reviewed=reviewed, fallen=task.fallen
     )
+    standings = pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings))
+    if decision.undecided is not None:
+        return Open(task, tile, edited, decision, standings)
+    return _packed(task, tile, edited, decision, standings)
+
+
+def _packed(task: Task, tile: Tile, edited: Tile, decision: Decision, standings: bytes) -> Fused:
     noise = np.flatnonzero(decision.states != decision.edits)
     stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
@@ -176,7 +218,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
             pack_plane(decision.states, 1),  # quick rather than small
             pack_tally(decision.tally),
             pack_agreed(decision.odds, decision.states),
-            pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings)),
+            standings,
             pack_edit_votes(decision.edit_votes),
             pack_fell(decision.fell),
         ),
@@ -250,7 +292,7 @@ class Watched(Executor):
             self._report(done, sum(sizes))
 
 
-def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
+def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused | Open]:
     """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another."""
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
@@ -258,13 +300,31 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     size = min(_GROUP, max(1, len(tasks) // _ROUND)) if executor else _GROUP
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
-    return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
+    done: list[Fused | Open] = []
+    unpacked = 0
+    for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
+        if isinstance(fused, Open):
+            unpacked += 1
+        done.append(fused.packed() if isinstance(fused, Open) and unpacked > _SITES else fused)
+    return done
 
 
-def fallen_across(
-    alone: Mapping[TileIndex, Fused], task_of: Callable[[TileIndex], Task], database: Database
-) -> dict[TileIndex, Fused]:
-    """The tiles in which more falls than each tile of a round decides ``alone``, fused again.
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """The tiles of a round after all has fallen."""
+
+    tiles: Mapping[TileIndex, Fused]
+    """Those of the round, and those around in which something fell."""
+    alone: Mapping[TileIndex, Fused]
+    """Those of the round that were packed as each is without its neighbours."""
+    fell: Collection[TileIndex]
+    """Those in which more fell than each tile decides alone."""
+
+
+def settled(
+    alone: Mapping[TileIndex, Fused | Open], task_of: Callable[[TileIndex], Task], database: Database
+) -> Settled:
+    """The round of tiles that were each fused ``alone``, after what falls over their borders.
 
     ``task_of`` gives the task of any tile: those around the round's tiles are fused too where they decide.
     """
@@ -274,15 +334,31 @@ def fallen_across(
     def remains_at(index: TileIndex) -> Remains:
         task = task_of(index)
         fused = alone[index] if index in alone else fuse_stored([task], database)[0]
+        if fused.undecided is not None:
+            return fused.undecided
+        assert isinstance(fused, Fused)
         with database.reading() as connection:
             return _solid() if fused.record is None else _remains_after(_tile(connection, task), fused, fused.record)
 
     fallen = fall_across(undecided, remains_at)
-    return {i: fuse_stored([replace(task_of(i), fallen=fell)], database)[0] for i, fell in fallen.items()}
+    packed = {index: fused for index, fused in alone.items() if isinstance(fused, Fused)}
+    tiles: dict[TileIndex, Fused] = dict(packed)
+    tiles |= {index: one.packed() for index, one in alone.items() if isinstance(one, Open) and index not in fallen}
+    for index, more in fallen.items():
+        one = alone.get(index)
+        after_fall = one.after(more) if isinstance(one, Open) else None
+        tiles[index] = after_fall or _fused_with(more, task_of(index), database)
+    return Settled(tiles, packed, fallen.keys())
+
+
+def _fused_with(fallen: Fallen, task: Task, database: Database) -> Fused:
+    """The tile of a task, fused again with what falls besides."""
+    fused = fuse_stored([replace(task, fallen=fallen)], database)[0]
+    return fused.packed() if isinstance(fused, Open) else fused
 
 
 _SITES = 32
-"""Most tiles that are kept while groups are followed, 2 MB each."""
+"""Most tiles that are kept while groups are followed, 2 MB each, and most that are kept open, about 6 MB each."""
 
 
 def _remains_after(before: Tile, fused: Fused, record: Record) -> Remains:

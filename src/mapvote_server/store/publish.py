@@ -31,7 +31,7 @@ from mapvote_server.errors import Conflict, Held
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of, insert_rows
 from mapvote_server.store.doubts import Doubts, doubts_about
-from mapvote_server.store.fusion_jobs import Fused, Task, edited_tile, fallen_across, fuse_round
+from mapvote_server.store.fusion_jobs import Fused, Task, edited_tile, fuse_round, settled
 from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote_server.store.policy import GatePolicy
 from mapvote_server.store.queries import (
@@ -223,7 +223,8 @@ class Round:
     beside: Mapping[TileIndex, Fused]
     """All other tiles with votes, for what waits there; none unless they were asked for."""
     alone: Mapping[TileIndex, Fused]
-    """Both as each tile is without its neighbours: of what falls, only what the tile decides alone."""
+    """Both as each tile is without its neighbours: of what falls, only what the tile decides alone. Tiles that others
+    decide are missing: the next round fuses them again."""
     every: bool
     """Whether ``beside`` was asked for."""
 
@@ -307,11 +308,10 @@ def _decide(
         with store.database.reading() as connection:
             return Task(url, store.lattice.tile(index), made, tile_of(connection, newest.number, index), asked)
 
-    fell = fallen_across(alone, task_of, store.database)
-    found = alone | fell
-    decided = {index: found[index] for index in sorted({*dirty, *fell})}
-    beside = {index: found[index] for index in wanted if index not in decided}
-    return Round(newest, asked, until, decided, beside, alone, every)
+    done = settled(alone, task_of, store.database)
+    decided = {index: done.tiles[index] for index in sorted({*dirty, *done.fell})}
+    beside = {index: done.tiles[index] for index in wanted if index not in decided}
+    return Round(newest, asked, until, decided, beside, done.alone, every)
 
 
 def _holds(store: Store, known: Round, now: int) -> bool:

@@ -28,7 +28,7 @@ from mapvote.fusion.fuse import differing
 from mapvote_server.errors import Conflict, NotFound
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of
-from mapvote_server.store.fusion_jobs import Task, fallen_across, fuse_round
+from mapvote_server.store.fusion_jobs import Task, fuse_round, settled
 from mapvote_server.store.publish import Outcome, write_version
 from mapvote_server.store.queries import (
     Version,
@@ -183,8 +183,8 @@ def _fused(store: Store, version: Version, before: _State, history: _History, ex
         return Task(url, tile.window, version.number, tile, asked, misread)
 
     alone = {fused.index: fused for fused in fuse_round(list(map(task_of, standing)), store.database, executor)}
-    fused = alone | fallen_across(alone, task_of, store.database)
-    edited = {f.index: _Content(f.tile, True) for f in fused.values() if f.hashes and f.tile is not None}
+    fused = settled(alone, task_of, store.database).tiles.values()
+    edited = {f.index: _Content(f.tile, True) for f in fused if f.hashes and f.tile is not None}
     return _State(before.root, {**before.edited, **edited})
 
 
