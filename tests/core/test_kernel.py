@@ -9,6 +9,7 @@ import importlib
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numba
@@ -107,13 +108,14 @@ def test_a_file_that_a_power_failure_cut_off_is_replaced(package: Path, kept: st
 
 
 @pytest.fixture
-def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Nothing may be written to but the temporary folder."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)  # is put back
+    before = numba.config.CACHE_DIR
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    return tmp_path
+    yield tmp_path
+    numba.config.CACHE_DIR = before
 
 
 def test_the_last_resort_is_a_folder_of_the_user_that_nobody_else_may_write_to(

@@ -25,7 +25,7 @@ from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.codec.planes import FRAME_HEAD, compress
 from mapvote.codec.tile_planes import check_plane, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.point_map import PointMap, made_in_turn
+from mapvote.core.point_map import MAP_SIZES, PointMap, made_in_turn
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import write_whole
@@ -45,7 +45,8 @@ class MapClient:
     """One vehicle's line to one server.
 
     ``home`` holds planes of tiles by hash, of all servers (``cache_bytes`` at most, beside what the map last fetched
-    needs), and for each server the newest manifest and the spool of unsent ballots.
+    needs), and for each server the newest manifest and the spool of unsent ballots. ``kept_points``: points of the
+    largest map that is held in memory whole.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class MapClient:
         attempts: int = 4,
         timeout_s: float = 30.0,
         cache_bytes: int = 4_000_000_000,
+        kept_points: int = MAP_SIZES.kept_points,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
@@ -64,6 +66,7 @@ class MapClient:
         self._planes, self._spool = home / "planes", _Spool(home, url)
         self._kept_manifest = _server_folder(home, url) / "manifest.json"
         self._cache_bytes = cache_bytes
+        self._kept_points = kept_points
         self.version: int | None = None
         """Version of the map last fetched."""
 
@@ -94,7 +97,7 @@ class MapClient:
         wanted = {tile_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
             wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
-        tiles = made_in_turn(lambda index: self.tile(lattice.tile(index), wanted[index]), wanted)
+        tiles = made_in_turn(lambda index: self.tile(lattice.tile(index), wanted[index]), wanted, self._kept_points)
         self._bound_cache({digest for planes in wanted.values() for digest in planes.planes().values()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)

@@ -17,17 +17,28 @@ from numpy.typing import NDArray
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.ground import lay_ground
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 
-_EXTENT_M = 1e7
-NEAR_ORIGIN_M = 50_000.0
-"""Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
-_BLOCK_POINTS = 1_000_000
-"""Points of one block: a large cloud is never copied as a whole."""
-KEPT_POINTS = 10_000_000
-"""Maps of no more are held in memory as they are; of larger ones the tiles last used, up to so many points together."""
 
+@record()
+@dataclass(frozen=True, slots=True)
+class MapSizes:
+    """Limits of a map's extent and of its memory."""
+
+    extent_m: float = 1e7
+    """Largest coordinate of a point."""
+    near_origin_m: float = 50_000.0
+    """Largest coordinate of maps that share the lattice at (0, 0); farther ones (UTM) get one of their own."""
+    block_points: int = 1_000_000
+    """Points of one block: a large cloud is never copied as a whole."""
+    kept_points: int = 10_000_000
+    """Points of the largest map that is held in memory whole. A larger map holds its tiles last used, up to so many
+    points together."""
+
+
+MAP_SIZES = MapSizes()
 SOURCES = "sources"
 """The field of a merged map's points: bit k of each is set where the k-th map has a point in its voxel."""
 SCANS = "scans"
@@ -38,9 +49,17 @@ With it, `merge` judges strays by the scans of all surveys together."""
 class LazyTiles(Mapping[TileIndex, Tile]):
     """A dict of tiles, in ascending order. While a tile is held anywhere, reading it again gives the same object."""
 
-    def __init__(self, load: Callable[[TileIndex], Tile], points: Mapping[TileIndex, int]) -> None:
-        """``load`` makes one tile; ``points``: number of points of every tile of the map."""
-        self._load, self._points = load, {index: points[index] for index in sorted(points)}
+    def __init__(
+        self,
+        load: Callable[[TileIndex], Tile],
+        points: Mapping[TileIndex, int],
+        kept_points: int = MAP_SIZES.kept_points,
+    ) -> None:
+        """``load`` makes one tile; ``points``: number of points of every tile of the map; ``kept_points``: see
+        :class:`MapSizes`."""
+        self._load = load
+        self._points = {index: points[index] for index in sorted(points)}
+        self.kept_points = kept_points
         self._alive: weakref.WeakValueDictionary[TileIndex, Tile] = weakref.WeakValueDictionary()
         self._kept: OrderedDict[TileIndex, Tile] = OrderedDict()
         self._held, self._lock = 0, RLock()
@@ -81,7 +100,7 @@ class LazyTiles(Mapping[TileIndex, Tile]):
                 self._held += self._points[index]
                 self._kept[index] = tile
             self._kept.move_to_end(index)
-            while self._held > KEPT_POINTS and len(self._kept) > 1:
+            while self._held > self.kept_points and len(self._kept) > 1:
                 self._held -= self._points[self._kept.popitem(last=False)[0]]
         return tile
 
@@ -95,18 +114,15 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         return len(self._points)
 
 
-def is_small(n_points: int) -> bool:
-    """Whether the tiles of a map of so many points are held in memory as they are."""
-    return n_points <= KEPT_POINTS
-
-
 def in_memory_if_small(tiles: LazyTiles) -> Mapping[TileIndex, Tile]:
     """All tiles made at once, unless there are too many points for that."""
-    return dict(tiles) if is_small(tiles.n_points) else tiles
+    return dict(tiles) if tiles.n_points <= tiles.kept_points else tiles
 
 
-def made_in_turn(load: Callable[[TileIndex], Tile], indices: Iterable[TileIndex]) -> Mapping[TileIndex, Tile]:
-    """Every tile made once, and all held unless there are too many points for that."""
+def made_in_turn(
+    load: Callable[[TileIndex], Tile], indices: Iterable[TileIndex], kept_points: int = MAP_SIZES.kept_points
+) -> Mapping[TileIndex, Tile]:
+    """Every tile made once, and all held unless they have more points than ``kept_points``."""
     made: dict[TileIndex, Tile] = {}
     points: dict[TileIndex, int] = {}
     total = 0
@@ -114,11 +130,11 @@ def made_in_turn(load: Callable[[TileIndex], Tile], indices: Iterable[TileIndex]
         tile = load(index)
         points[index] = len(tile.points)
         total += len(tile.points)
-        if is_small(total):
+        if total <= kept_points:
             made[index] = tile
         else:
             made.clear()
-    return made if is_small(total) else LazyTiles(load, points)
+    return made if total <= kept_points else LazyTiles(load, points, kept_points)
 
 
 def with_changed(tiles: Mapping[TileIndex, Tile], changed: Mapping[TileIndex, Tile]) -> Mapping[TileIndex, Tile]:
@@ -126,7 +142,7 @@ def with_changed(tiles: Mapping[TileIndex, Tile], changed: Mapping[TileIndex, Ti
     if not isinstance(tiles, LazyTiles):
         return dict(sorted({**tiles, **changed}.items()))
     points = tiles.points_of | {index: len(tile.points) for index, tile in changed.items()}
-    return LazyTiles(lambda index: changed[index] if index in changed else tiles[index], points)
+    return LazyTiles(lambda index: changed[index] if index in changed else tiles[index], points, tiles.kept_points)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -187,8 +203,8 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     if not len(points_map):
         return
     tiles = np.empty((len(points_map), 2), dtype=np.int32)
-    for start in range(0, len(points_map), _BLOCK_POINTS):
-        piece = slice(start, start + _BLOCK_POINTS)
+    for start in range(0, len(points_map), MAP_SIZES.block_points):
+        piece = slice(start, start + MAP_SIZES.block_points)
         rows, cols = lattice.cells_of(points_map[piece])
         tiles[piece, 0], tiles[piece, 1] = rows // TILE_CELLS, cols // TILE_CELLS
     number = _numbered(tiles)
@@ -218,7 +234,7 @@ def lattice_of(points: NDArray[np.floating]) -> Lattice:
     them: the keys of voxels reach 314 km."""
     low = points[:, :2].min(axis=0).astype(np.float64)
     high = points[:, :2].max(axis=0).astype(np.float64)
-    if max(np.abs(low).max(), np.abs(high).max()) < NEAR_ORIGIN_M:
+    if max(np.abs(low).max(), np.abs(high).max()) < MAP_SIZES.near_origin_m:
         return Lattice()
     side = TILE_CELLS * CELL_SIZE
     x0, y0 = np.floor(low / side) * side
@@ -246,8 +262,8 @@ def map_from_points(
         raise MapvoteError(f"a map needs points: got an array of shape {points.shape}, expected (n, 3) with n > 0")
     lattice = lattice or lattice_of(points)
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
-    for start in range(0, len(points), _BLOCK_POINTS):
-        piece = np.ascontiguousarray(points[start : start + _BLOCK_POINTS], dtype=np.float64)
+    for start in range(0, len(points), MAP_SIZES.block_points):
+        piece = np.ascontiguousarray(points[start : start + MAP_SIZES.block_points], dtype=np.float64)
         check_extent(piece, start)
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
@@ -265,7 +281,7 @@ def map_from_points(
 
 def check_extent(points: F64, before: int = 0) -> None:
     """MapvoteError if some of the points (n, 3), before which came others, are not finite or beyond 10,000 km."""
-    bad = ~(np.abs(points) < _EXTENT_M).all(axis=1)
+    bad = ~(np.abs(points) < MAP_SIZES.extent_m).all(axis=1)
     if bad.any():
         raise MapvoteError(
             f"{int(bad.sum())} of {len(points)} map points are not finite or beyond 10,000 km "

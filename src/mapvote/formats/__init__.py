@@ -82,15 +82,15 @@ def open_drive_on(point_map: PointMap | None, path: Path | str, **said: Unpack[S
     return open_drive(path, **said)
 
 
-def read_map(path: Path | str, look: Look | None = None) -> PointMap:
+def read_map(path: Path | str, look: Look | None = None, *, sizes: ReadSizes = READ_SIZES) -> PointMap:
     """A map of any known format. A format that has only points gets its ground measured and a map_id from its content.
 
-    ``look`` gets the points before the ground is computed. Raises MapvoteError if there is no map at ``path`` or it is
-    damaged.
+    ``look`` gets the points before the ground is computed. ``sizes``: points held in memory. Raises MapvoteError if
+    there is no map at ``path`` or it is damaged.
     """
     path = Path(path)
     if is_map_folder(path):
-        point_map = read_map_folder(path)
+        point_map = read_map_folder(path, sizes)
         if look is not None and UNCHECKED not in point_map.georeference:
             tiles = sorted(point_map.tiles)
             look(
@@ -99,7 +99,7 @@ def read_map(path: Path | str, look: Look | None = None) -> PointMap:
             )
         return point_map
     sound = without_marked(path, stream_cloud(path))
-    return map_of(str(path), in_map_metres(str(path), sound), look=look)
+    return map_of(str(path), in_map_metres(str(path), sound), look=look, sizes=sizes)
 
 
 def stream_cloud(path: Path | str) -> Iterator[Cloud]:

@@ -22,7 +22,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import DIGESTS, Manifest, TileHashes, digests_of, shown
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Lattice, TileIndex
-from mapvote.core.point_map import LazyTiles, PointMap, is_small
+from mapvote.core.point_map import MAP_SIZES, LazyTiles, PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote_server.errors import Unavailable
@@ -245,17 +245,18 @@ class Store:
             hashes = tile_of(connection, number, index)
             return None if hashes is None else load_tile(connection, self.lattice.tile(index), hashes)
 
-    def point_map(self, number: int | None = None) -> PointMap:
-        """A whole version; of one larger than memory tiles are read when they are asked for: keep the store open."""
+    def point_map(self, number: int | None = None, *, kept_points: int = MAP_SIZES.kept_points) -> PointMap:
+        """A whole version. A version with more points than ``kept_points`` reads its tiles when they are used: keep the
+        store open."""
         with self.database.reading() as connection:
             number = version_of(connection, number).number
             hashes = tiles_of(connection, number)
             points = points_of(connection, hashes)
             tiles: Mapping[TileIndex, Tile]
-            if is_small(sum(points.values())):
+            if sum(points.values()) <= kept_points:
                 tiles = {index: load_tile(connection, self.lattice.tile(index), h) for index, h in hashes.items()}
             else:
-                tiles = LazyTiles(lambda index: self._load(index, hashes[index]), points)
+                tiles = LazyTiles(lambda index: self._load(index, hashes[index]), points, kept_points)
         return PointMap(self.map_id, self.lattice, tiles, self.georeference, (), number, self.surveyed_ns)
 
     def _load(self, index: TileIndex, hashes: TileHashes) -> Tile:

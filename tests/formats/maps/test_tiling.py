@@ -78,18 +78,18 @@ def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPat
     assert sum(map(len, seen)) == 2 * len(points)
 
 
-SMALL = ReadSizes(block=700, in_memory_bytes=1)
+SMALL = ReadSizes(block=700, in_memory_bytes=1, kept_points=1500)
+"""Every map counts as larger than memory."""
 
 
 @pytest.fixture
-def large(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything counts as larger than memory."""
-    monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", 1500)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are read in small blocks."""
     for name, stream in (("PCD file", stream_pcd), ("PLY file", stream_ply)):
         monkeypatch.setitem(MAPS, name, replace(MAPS[name], stream=partial(stream, sizes=SMALL)))
 
 
-@pytest.mark.usefixtures("large")
+@pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize(
     ("suffix", "out"),
     [(".pcd", "a.las"), (".ply", "a.laz"), (" ascii.pcd", "a.ply"), (".laz", "a.pcd"), (".las", "a")],
@@ -119,7 +119,6 @@ def test_a_map_larger_than_memory_is_the_same_map_and_leaves_as_the_same_file(
     assert {p.name for p in tmp_path.iterdir()} == {file.name, "lazy", "small", "out of lazy", "out of small"}
 
 
-@pytest.mark.usefixtures("large")
 def test_a_tile_that_somebody_holds_is_not_made_again(tmp_path: Path) -> None:
     points, fields = street(4)
     made = map_of("it", [Cloud(points, fields=fields)], sizes=SMALL)
@@ -130,11 +129,10 @@ def test_a_tile_that_somebody_holds_is_not_made_again(tmp_path: Path) -> None:
     assert made.tiles.get((7, 7)) is None
 
 
-@pytest.mark.usefixtures("large")
 def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) -> None:
     points, fields = street(7)
     write_map(map_of("it", [Cloud(points, fields=fields)]), tmp_path / "m")
-    opened = read_map(tmp_path / "m")
+    opened = read_map(tmp_path / "m", sizes=SMALL)
     assert isinstance(opened.tiles, LazyTiles)
     built = Say(states_plane({(5, 5): CellState.CHANGED_OCCUPIED}), new_points=wall([(5, 5)], [0.45, 0.75]))
     after, _ = update_map(opened, [make_ballot(opened, {(0, 0): built})], FuseSettings(min_votes=1))
@@ -146,14 +144,13 @@ def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) 
     assert len(now.keys() - before.keys()) == 3, "points and fields of one tile, and what it remembers"
 
 
-@pytest.mark.usefixtures("large")
 def test_a_large_map_with_a_damaged_tile_is_refused_when_it_is_opened(tmp_path: Path) -> None:
     points, _ = street(8)
     write_map(map_of("it", [Cloud(points)]), tmp_path / "m")
     plane = read_manifest(tmp_path / "m").tiles["0,0"].points
     (tmp_path / "m/planes" / plane).write_bytes(pack_plane(np.zeros((4, 3), np.float32)))
     with pytest.raises(MapvoteError, match=f"tile plane {plane[:12]} is not what its hash says"):
-        read_map(tmp_path / "m")
+        read_map(tmp_path / "m", sizes=SMALL)
 
 
 def test_a_file_that_is_cut_off_late_leaves_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

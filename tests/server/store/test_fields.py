@@ -175,8 +175,8 @@ def test_what_holds_no_fields_is_one_clear_error(damaged: bytes) -> None:
         unpack_fields(damaged, 2, "tile")
 
 
-def client_of(app: TestClient, home: Path) -> MapClient:
-    client = MapClient("http://localhost", home=home)
+def client_of(app: TestClient, home: Path, **more: Any) -> MapClient:
+    client = MapClient("http://localhost", home=home, **more)
     client._server._http = app
     return client
 
@@ -210,16 +210,15 @@ def test_vehicles_and_exports_get_them_and_of_a_map_without_nothing_is_told(tmp_
 
 
 def test_of_a_map_larger_than_memory_tiles_are_read_one_by_one_and_the_files_are_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     store = Store.create(f"sqlite:///{tmp_path / 'a.db'}", street(), POLICY)
     vote(store)
     found = []
     for limit, kind in ((10_000_000, dict), (100, LazyTiles)):
-        monkeypatch.setattr("mapvote.core.point_map.KEPT_POINTS", limit)
         with TestClient(create_app(store, opened=True), base_url="http://localhost") as app:
-            client = client_of(app, tmp_path / f"home{limit}")
-            maps = store.point_map(), client.fetch()
+            client = client_of(app, tmp_path / f"home{limit}", kept_points=limit)
+            maps = store.point_map(kept_points=limit), client.fetch()
             change = follow_once(client, tmp_path / f"follow{limit}", None, 3)
         assert all(type(point_map.tiles) is kind for point_map in maps)
         assert all(all_carried(point_map) == all_carried(street()) for point_map in maps)

@@ -5,7 +5,10 @@ Nothing older than this schema was ever released, so the tests add a revision af
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -23,6 +26,7 @@ from mapvote.cli import app
 from mapvote.core.types import MapvoteError
 from mapvote_server.store import migrate, schema
 from mapvote_server.store.database import Database
+from mapvote_server.store.migrate import HISTORY, History
 from mapvote_server.store.store import Store
 
 NEXT = """
@@ -46,14 +50,12 @@ def old_store(database_url: str) -> str:
 
 
 @pytest.fixture
-def next_release(old_store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The same, beside a program that has one more revision."""
+def next_release(tmp_path: Path) -> History:
+    """The revisions of a program that has one more."""
     revisions = tmp_path / "migrations"
-    shutil.copytree(migrate.REVISIONS, revisions)
-    (revisions / "versions" / "next.py").write_text(NEXT.format(before=migrate.HEAD))
-    monkeypatch.setattr(migrate, "REVISIONS", revisions)
-    monkeypatch.setattr(migrate, "HEAD", "0002")
-    return old_store
+    shutil.copytree(HISTORY.folder, revisions)
+    (revisions / "versions" / "next.py").write_text(NEXT.format(before=HISTORY.head))
+    return History("0002", revisions)
 
 
 @contextmanager
@@ -80,8 +82,8 @@ def content(url: str) -> dict[str, list[dict[str, Any]]]:
 
 @pytest.mark.contract
 def test_the_tables_are_those_that_the_code_describes_by_one_line_of_revisions(old_store: str) -> None:
-    scripts = ScriptDirectory(str(migrate.REVISIONS))
-    assert (scripts.get_heads(), len(scripts.get_bases())) == ([migrate.HEAD], 1)
+    scripts = ScriptDirectory(str(HISTORY.folder))
+    assert (scripts.get_heads(), len(scripts.get_bases())) == ([HISTORY.head], 1)
     engine = sa.create_engine(old_store)
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), schema.metadata) == []
@@ -94,32 +96,65 @@ def test_the_tables_are_those_that_the_code_describes_by_one_line_of_revisions(o
     engine.dispose()
 
 
-def test_an_older_store_is_refused_until_it_is_upgraded_and_nothing_is_lost(next_release: str) -> None:
-    before, refusal = content(next_release), r"schema 0001 of an older mapvote.*mapvote serve STORE --upgrade"
-    with pytest.raises(MapvoteError, match=refusal):
-        Store.open(next_release)
-    with pytest.raises(MapvoteError, match=refusal):
-        Store.create(next_release, two_walls())
-    for says in ("schema 0001 is now 0002", "nothing to do"):
-        done = CliRunner().invoke(app, ["serve", next_release, "--upgrade"], catch_exceptions=False)
-        assert done.exit_code == 0
-        assert says in done.output
-    Store.open(next_release).close()
-    assert content(next_release) == before
+def test_an_older_store_is_refused_until_it_is_upgraded_and_nothing_is_lost(
+    old_store: str, next_release: History
+) -> None:
+    before = content(old_store)
+    with database_at(old_store) as database:
+        with (
+            database.reading() as connection,
+            pytest.raises(MapvoteError, match=r"schema 0001 of an older mapvote.*mapvote serve STORE --upgrade"),
+        ):
+            migrate.check(connection, next_release)
+        assert migrate.upgrade(database, next_release) == ("0001", "0002")
+        assert migrate.upgrade(database, next_release) == ("0002", "0002")
+        with database.reading() as connection:
+            migrate.check(connection, next_release)
+    after = content(old_store)
+    assert all(row.pop("colour") == 7 for row in after["ballots"])
+    assert after == before
 
 
-def test_an_upgrade_that_fails_leaves_the_old_store(next_release: str) -> None:
-    before = content(next_release)
-    with database_at(next_release) as database:
+@pytest.mark.slow
+def test_the_next_release_refuses_an_older_store_and_serve_upgrades_it(old_store: str, tmp_path: Path) -> None:
+    """The next release is a copy of the server's package with one more revision."""
+    package = tmp_path / "release" / "mapvote_server"
+    shutil.copytree(HISTORY.folder.parents[1], package)
+    (package / "store/migrations/versions/next.py").write_text(NEXT.format(before=HISTORY.head))
+    module = package / "store/migrate.py"
+    module.write_text(module.read_text().replace(f'head: str = "{HISTORY.head}"', 'head: str = "0002"'))
+    paths = os.pathsep.join([str(package.parent), str(HISTORY.folder.parents[2])])
+
+    def next_mapvote(*arguments: str) -> str:
+        command = [sys.executable, "-m", "mapvote", *arguments]
+        done = subprocess.run(command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
+        return done.stdout + done.stderr
+
+    refusal = "schema 0001 of an older mapvote, this one works with 0002: stop the server"
+    assert refusal in " ".join(next_mapvote("log", old_store).split())
+    assert "schema 0001 is now 0002" in next_mapvote("serve", old_store, "--upgrade")
+    assert "schema 0002: nothing to do" in next_mapvote("serve", old_store, "--upgrade")
+    assert "import" in next_mapvote("log", old_store)
+
+
+def test_serve_upgrade_says_that_a_store_of_this_schema_needs_nothing(old_store: str) -> None:
+    done = CliRunner().invoke(app, ["serve", old_store, "--upgrade"], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert f"schema {HISTORY.head}: nothing to do" in done.output
+
+
+def test_an_upgrade_that_fails_leaves_the_old_store(old_store: str, next_release: History) -> None:
+    before = content(old_store)
+    with database_at(old_store) as database:
         with suppress(ZeroDivisionError), database.writing() as connection:
-            migrate.run_migrations(connection)
-            assert migrate.revision_of(connection) == migrate.HEAD
+            migrate.run_migrations(connection, next_release)
+            assert migrate.revision_of(connection) == "0002"
             raise ZeroDivisionError
         with database.reading() as connection:
             assert migrate.revision_of(connection) == "0001"
             columns = {column["name"] for column in sa.inspect(connection).get_columns("ballots")}
     assert "colour" not in columns
-    assert content(next_release) == before
+    assert content(old_store) == before
 
 
 def test_what_holds_no_store_or_one_of_a_newer_mapvote_is_refused_and_left_alone(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.brightness import Brightness
+from mapvote.core.point_map import MAP_SIZES
 from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
@@ -28,6 +29,8 @@ class ReadSizes:
     """Points by which degrees are told from metres, and points in a block of a temporary file."""
     in_memory_bytes: int = 64 << 20
     """Bytes up to which a temporary file stays in memory."""
+    kept_points: int = MAP_SIZES.kept_points
+    """Points of the largest map that is held in memory whole."""
 
 
 READ_SIZES = ReadSizes()

@@ -22,6 +22,7 @@ from mapvote.core.point_map import LazyTiles, PointMap, in_memory_if_small
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
+from mapvote.formats.maps.cloud import READ_SIZES, ReadSizes
 from mapvote.formats.reading import first_bytes, read_whole
 
 MANIFEST = "manifest.json"
@@ -104,7 +105,7 @@ def read_manifest(path: Path) -> FolderManifest:
     return manifest
 
 
-def read_map_folder(path: Path) -> PointMap:
+def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
     """The map, every plane verified against the manifest. MapvoteError names the first tile that is not whole.
 
     Of a map larger than memory all planes are verified now, and each tile is read when it is asked for.
@@ -126,7 +127,7 @@ def read_map_folder(path: Path) -> PointMap:
     for index, hashes in named.items():
         with _whole(path, index):
             n_points[index] = points_in_plane(first_bytes(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
-    tiles = in_memory_if_small(LazyTiles(load, n_points))
+    tiles = in_memory_if_small(LazyTiles(load, n_points, sizes.kept_points))
     for index, hashes in named.items() if isinstance(tiles, LazyTiles) else ():
         with _whole(path, index):
             for name, frame in _planes(path, hashes).items():

@@ -161,7 +161,7 @@ def map_of(
         parts.cut(block)
     taken.spill.close()
     ground = lay_ground(parts.heights(), parts.heights(of_ground=True), parts.points)
-    tiles = in_memory_if_small(LazyTiles(lambda index: parts.tile(index, ground[index]), parts.points))
+    tiles = in_memory_if_small(LazyTiles(lambda i: parts.tile(i, ground[i]), parts.points, sizes.kept_points))
     return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.georeference())
 
 
