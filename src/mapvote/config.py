@@ -22,7 +22,7 @@ from mapvote.core.types import MapvoteError
 
 
 def cache_folder() -> Path:
-    """What can be made or fetched again lies here: $XDG_CACHE_HOME/mapvote, else ~/.cache/mapvote."""
+    """The folder of files that can be made or fetched again: $XDG_CACHE_HOME/mapvote, else ~/.cache/mapvote."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapvote"
 
 
@@ -345,7 +345,7 @@ def load_settings(path: Path | str | None = None, env: Mapping[str, str] | None 
 def load_with_sources(
     path: Path | str | None = None, env: Mapping[str, str] | None = None
 ) -> tuple[Settings, dict[str, str]]:
-    """As :func:`load_settings`, and by "section.key" where each value that is not a default came from."""
+    """(the settings of :func:`load_settings`, the source of each value that is not a default by "section.key")."""
     values: dict[str, dict[str, Any]] = {}
     sources: dict[str, str] = {}
     for section, key, value, source in (*_from_file(path), *_from_env(os.environ if env is None else env)):

@@ -149,7 +149,8 @@ class Vehicle:
                 self._new_points.gather(seen, self._voter.observe(seen))
 
     def ballot(self, only: Collection[TileIndex] | None = None) -> Ballot:
-        """What the scans that have voted so far say: of all the drive after :meth:`finish`. Asking changes nothing.
+        """The ballot of the scans that have voted so far; after :meth:`finish`, of the whole drive. The state does not
+        change.
 
         ``only``: of these tiles, so that the ballot of a drive that goes on can be kept piece by piece. Raises
         MapvoteError if no scan has voted.

@@ -261,6 +261,6 @@ def demo(
     console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps")
     console.print(f"  {place}/tables.txt, results.json, pictures/")
     console.print(f"  {escape(drives_sentence(story, evaluation.scene.folder))}")
-    console.print("\n[bold]What to try next[/]")
+    console.print("\n[bold]Next steps[/]")
     text = commands(evaluation, out, story.kept)
     console.print(escape("".join(f"  {line}\n" for line in text.splitlines())))

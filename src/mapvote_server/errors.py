@@ -1,4 +1,4 @@
-"""What the server refuses, by reason. The app's one table turns each class into a status code."""
+"""Refusals of the server, by reason. One table of the app maps each class to a status code."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_one_stage_costs_more_bytes_than_two_and_surfaces_find_what_changed(corn
 
 def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> None:
     text = tables.as_text(corner.result)
-    for shown in ("Table II", "Table III", "Table IV", "case 5", "surfaces", "0.850", "0.645", "What the map is for"):
+    for shown in ("Table II", "Table III", "Table IV", "case 5", "surfaces", "0.850", "0.645", "Purpose of the map"):
         assert shown in text
 
 

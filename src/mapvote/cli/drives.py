@@ -114,7 +114,7 @@ def _tell(report: BuildReport, out: Path) -> None:
 
 
 def _frame(report: BuildReport) -> str:
-    """What the priors did to the map, in a sentence."""
+    """One sentence on the effect of the priors on the map."""
     import numpy as np
 
     sigma_m = max(float(np.median(track.sigma_m)) for track in report.tracks)

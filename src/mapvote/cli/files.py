@@ -128,7 +128,7 @@ def doctor(
         if where is not None:
             with waiting(f"reading {where}"):
                 served = is_url(where) or is_store(where)
-                # What is wrong with a map in files is reported beside what is wrong with the drive.
+                # Faults of a map in files are reported beside the faults of the drive.
                 point_map = open_map.enter_context(map_at(where, key_file)) if served else read_map(where)
         if is_store(path):
             with waiting("reading every byte"):

@@ -1,4 +1,4 @@
-"""What every verb shows in the same way: a mistake in one line, tables, and how far it is while one waits.
+"""Output that all verbs share: errors of one line, tables, and progress.
 
 Whatever comes from users and files is shown as it is: rich takes square brackets in plain strings for its markup.
 Progress goes to stderr, so that stdout can be piped.

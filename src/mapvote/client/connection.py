@@ -103,7 +103,7 @@ class Connection:
             raise Unreachable(f"{self.url}: {error or type(error).__name__}") from error
 
     def ask_json(self, method: str, path: str, *, json: object = None) -> Any:
-        """What a server answers, decoded. MapvoteError also if that is no JSON."""
+        """A server's answer, decoded. MapvoteError also if it is no JSON."""
         try:
             return self.ask(method, path, json=json).json()
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""What a vehicle needs of the server: the newest map, and a way to send a ballot that loses nothing.
+"""The vehicle's side of a server: it fetches the newest map, and sends ballots without losing one.
 
 client = MapClient("https://maps.example.org", key=..., home=Path("~/.cache/mapvote").expanduser())
 point_map = client.fetch()
@@ -213,7 +213,7 @@ class MapClient:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
     def kept_manifest(self) -> Manifest | None:
-        """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
+        """The manifest that :meth:`manifest` returned last, without a request; None if none is kept."""
         try:
             return _DECODER.decode(read_whole(self._kept_manifest))
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):

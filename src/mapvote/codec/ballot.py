@@ -240,7 +240,7 @@ def unpack_tally(data: bytes) -> U16:
 
 
 MAX_ATTRIBUTE_BYTES = 16
-"""Of all attributes of a new point together."""
+"""Largest size of all attributes of a new point together."""
 
 
 def unpack_offer(new_points: bytes | None, fields: bytes | None) -> tuple[F32 | None, dict[str, Values]]:
@@ -262,8 +262,8 @@ def unpack_offer(new_points: bytes | None, fields: bytes | None) -> tuple[F32 | 
 
 
 def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
-    """Of the changed cells of ``states`` (256, 256); None if it does not say. MapvoteError if damaged, not one for each
-    changed cell, nothing that a vehicle says, or without states."""
+    """Log-odds of the changed cells of ``states`` (256, 256); None if the ballot states none. MapvoteError if damaged,
+    not one for each changed cell, nothing that a vehicle says, or without states."""
     if odds is None:
         return None
     if states is None:

@@ -28,13 +28,13 @@ class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
     """SHA-256 of the planes of one tile; None for a plane that it has not."""
 
     points: PlaneHash
-    """What ballots name as their base."""
+    """The digest that ballots name as their base."""
     ground: PlaneHash
     free: PlaneHash | None
     memory: PlaneHash | None = None
-    """What a server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
+    """The server's memory of the tile. It is no part of the map: tiles that differ only in it are equal."""
     fields: PlaneHash | None = None
-    """What the points carry besides their place."""
+    """Attributes of the points."""
 
     @classmethod
     def none(cls) -> TileHashes:
@@ -73,11 +73,12 @@ class Manifest(msgspec.Struct, omit_defaults=True, kw_only=True):
     georeference: dict[str, str]
     tiles: dict[TileKey, TileHashes]
     digest: str
-    """Of all tiles of the version, also where only some are listed: 64 hexadecimal digits of :func:`digests_of`."""
+    """Digest of all tiles of the version, also where only some are listed: 64 hexadecimal digits of
+    :func:`digests_of`."""
     removed: list[TileKey]
     """Tiles that the other version has and this one has not."""
     fields_digest: str = ""
-    """Of the fields of their points; "" where there are none."""
+    """Digest of the fields of their points; "" where there are none."""
 
     def is_whole(self) -> bool:
         """Whether these are all tiles of the version, and as the server has them."""
@@ -96,11 +97,11 @@ class Manifest(msgspec.Struct, omit_defaults=True, kw_only=True):
 
 
 def digests_of(tiles: Iterable[tuple[str, TileHashes]]) -> tuple[int, int]:
-    """Of tiles by "row,col", and of the fields of those that have any: the sum, modulo :data:`DIGESTS`, of a SHA-256
-    for each tile, of its key and its planes' hashes, "-" for none.
+    """Two digests: of the tiles by "row,col", and of the fields of the tiles that have any. Each is the sum, modulo
+    :data:`DIGESTS`, of one SHA-256 per tile, over its key and its planes' hashes ("-" for none).
 
-    Who keeps a manifest up to date by what changed can tell whether it still is the server's; so can the server, at
-    little cost: sums of what changed can be added and taken away.
+    A client that updates its manifest by changes can check it against the server's digest. The server updates the
+    digest at little cost: sums of changed tiles are added and subtracted.
     """
     whole = fields = 0
     for key, h in tiles:

@@ -1,8 +1,8 @@
 """Planes of a tile <-> bytes: raw and little-endian under zstd, sizes checked before anything is allocated.
 
-Of column words only those that are not zero, for masks and free space mark few of a tile's 65,536 cells. As bytes lie
-the ways from each cell to the next as two planes of bytes, then the words as eight: bytes that mean the same lie
-together, which packs a fifth smaller than the words as they are.
+A plane of column words holds only the words that are not zero: masks and free space mark few of a tile's 65,536 cells.
+The steps from each cell to the next are stored as two planes of bytes, then the words as eight. Bytes of equal meaning
+lie together, which packs a fifth smaller than whole words.
 """
 
 from __future__ import annotations

@@ -26,15 +26,15 @@ MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
 
 
 def base_hash(tile: Tile | None) -> str:
-    """What a ballot names as its base: SHA-256 of a tile's points, "" where the map has none. Free space learned later
-    changes no published point (docs/decisions/data.md)."""
+    """The digest that a ballot names as its base: SHA-256 of a tile's points, "" where the map has none. Free space
+    learned later changes no published point (docs/decisions/data.md)."""
     return "" if tile is None else hashlib.sha256(raw_plane(tile.points, "<f4")).hexdigest()
 
 
 def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) -> tuple[TileHashes, dict[str, bytes]]:
     """A tile's hashes and its planes by hash, each one zstd frame of little-endian C-order values.
 
-    Of a tile ``edited_from`` another, only the planes that the other does not have: the ground is never edited.
+    A tile ``edited_from`` another gives only the planes that the other lacks: the ground is never edited.
     """
     blobs: dict[str, bytes] = {}
     old, known = edited_from or (None, TileHashes.none())

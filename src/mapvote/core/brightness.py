@@ -48,7 +48,7 @@ _EDGES = BRIGHTNESS_RULE.edges
 
 @dataclass(slots=True)
 class Brightness:
-    """What values of one column there are, counted piece by piece."""
+    """Statistics of the values of one column, counted piece by piece."""
 
     n: int = 0
     """Finite values."""
@@ -108,7 +108,7 @@ class Brightness:
         return bright if scale > 1.0 and bright < BRIGHTNESS_RULE.darkest * scale else scale
 
     def _bright_end(self) -> float:
-        """What all but a few of the reals do not exceed, rounded up to the end of a bin."""
+        """The value that all but a few of the reals do not exceed, rounded up to the end of a bin."""
         most = self.n - int(BRIGHTNESS_RULE.outliers * self.n)
         last = int(np.searchsorted(np.cumsum(self._counts), most))
         return float(_EDGES[last]) if last < len(_EDGES) else self.highest

@@ -111,8 +111,8 @@ def span_of(word: np.uint64) -> np.uint64:
 
 
 def flat_cells(window: Grid, points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(n,) row * cols + col of points (n, 3) from the window's corner, metres; the outermost cells take what rounding
-    moved. As :meth:`Grid.indices_of` of :meth:`Grid.to_map` has them, to the last bit."""
+    """(n,) row * cols + col of points (n, 3) from the window's corner, metres; the outermost cells take points that
+    rounding moved out. The result equals :meth:`Grid.indices_of` of :meth:`Grid.to_map` bit for bit."""
     corner = window.x0, window.y0, window.lattice.x0, window.lattice.y0
     flat = np.empty(len(points), dtype=np.int64)
     cloud = read_only(np.ascontiguousarray(points))
@@ -162,7 +162,7 @@ def lower_envelope(z: F64, straight: float, diagonal: float) -> None:
 
 @inlined
 def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None:
-    """What a row takes from the one beside it: no cell waits for another, so the compiler makes vectors of it."""
+    """Lower one row by the row beside it. No cell depends on another, so the compiler vectorises the loop."""
     last = len(row) - 1
     for c in range(last + 1):
         row[c] = min(row[c], beside[c] + straight)

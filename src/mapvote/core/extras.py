@@ -41,7 +41,7 @@ def require_for(file: Path, where: str) -> None:
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install for a module that was not found, by mapvote's own metadata; None if no extra has it."""
+    """The command that installs a missing module, by mapvote's own metadata; None if no extra has it."""
     module = (error.name or "").partition(".")[0]
     try:
         requirements = metadata.requires("mapvote") or []

@@ -225,13 +225,13 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10 = map(np.float32, (
     9.09088713343650656196e-02, -7.69187620504482999495e-02, 6.66107313738753120669e-02, -5.83357013379057348645e-02,
     4.97687799461593236017e-02, -3.65315727442169155270e-02, 1.62858201153657823623e-02,
 ))  # fmt: skip
-"""Of 1 - arctan(u) / u by powers of u squared. An index into a tuple would be compiled for each place."""
+"""Coefficients of 1 - arctan(u) / u by powers of u squared. An index into a tuple would be compiled for each place."""
 _H0, _H1, _H2, _H3 = map(np.float32, (0.46364760398864746, 0.7853981256484985, 0.9827936887741089, 1.570796251296997))
 """arctan of 1/2, 1, 3/2 and infinity, as near as float32 is below them."""
 _L0, _L1, _L2, _L3 = map(
     np.float32, (5.01215824399992e-09, 3.774894707930798e-08, 3.447321716976148e-08, 7.549789415861596e-08)
 )
-"""What is left of each."""
+"""The remainder of each."""
 _PI, _PI_LEFT, _HALF_PI = np.float32(np.pi), np.float32(-8.7422776573e-08), np.float32(np.pi / 2.0)
 _AT_INFINITY = np.float32(_H3 + _L3)
 _B0, _B1, _B2, _B3, _B4 = map(np.float32, (0.4375, 0.6875, 1.1875, 2.4375, 2.0**25))

@@ -1,11 +1,11 @@
 """The ground: the surface that vehicles drive on. It grows from where it is known: cell by cell over what was measured,
 across gaps by what lies around them.
 
-Known first is the road under the driven path, or the places of a map that all measurements around agree on. From
-there the surface goes on to the nearest point of each neighbouring cell, as long as it climbs and falls as ground does.
-What lies below a surface so found is a reflection, what lies above it stands on it: neither is ever asked. Measured
-cells are entered before gaps and narrow gaps before wide ones, so a way round is taken before a leap. Where driven
-paths lie above each other, every cell belongs to the level whose path is nearer, and a cell under both to the lower.
+Known first is the road under the driven path, or the places of a map that all measurements around agree on. From there
+the surface goes on to the nearest point of each neighbouring cell, as long as it climbs and falls as ground does.
+Points below such a surface are reflections, points above it stand on it: neither kind is examined again. Measured cells
+are entered before gaps and narrow gaps before wide ones, so a way round is taken before a leap. Where driven paths lie
+above each other, every cell belongs to the level whose path is nearer, and a cell under both to the lower.
 """
 
 from __future__ import annotations

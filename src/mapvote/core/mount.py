@@ -17,7 +17,7 @@ from mapvote.core.types import F64, Drive, Scan
 
 @dataclass(frozen=True, slots=True)
 class MountRules:
-    """What counts as a mount."""
+    """Limits of a mount."""
 
     usual_deg: float = 20.0
     """A sensor that leans or is turned by no more is taken in its own axes."""
@@ -39,7 +39,7 @@ class Mount:
     C: F64
     """(4, 4) turns points to x ahead, y left, z up."""
     lean_deg: float
-    """Of the sensor's z axis from the vertical."""
+    """Angle of the sensor's z axis from the vertical."""
 
     def turned(self, drive: Drive) -> Drive:
         """The same drive, as a sensor in the usual axes would have recorded it."""

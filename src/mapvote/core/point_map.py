@@ -82,7 +82,7 @@ class LazyTiles(Mapping[TileIndex, Tile]):
 
     @property
     def n_points(self) -> int:
-        """Of all tiles together; none is made for it."""
+        """Points of all tiles together; no tile is made to count them."""
         return sum(self._points.values())
 
     def largest(self, n: int) -> list[TileIndex]:
@@ -166,14 +166,14 @@ class PointMap:
 
     @property
     def n_points(self) -> int:
-        """Of all tiles together."""
+        """Points of all tiles together."""
         if isinstance(self.tiles, LazyTiles):
             return self.tiles.n_points
         return sum(len(tile.points) for tile in self.tiles.values())
 
     @property
     def field_names(self) -> list[str]:
-        """Of the fields that its points have; of a map larger than memory, those of its largest tiles."""
+        """Names of the fields of its points; a map larger than memory names those of its largest tiles."""
         asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
         return sorted({name for index in asked for name in self.tiles[index].fields})
 

@@ -65,5 +65,5 @@ SENSORS: dict[str, Sensor] = {
 }
 """Models by name: those that scans are recognised as."""
 NAMED = SENSORS | {"beams128": Sensor("beams128", _even(15.0, -25.0, 128), 0.2)}
-"""What a drive or a scenario may name: these, and 128 beams over the field of view that several makes have. No scan is
-recognised as that one: it is nobody's, and so dense that the rings of others lie on its beams."""
+"""Sensors that a drive or a scenario may name: these, and 128 beams over the field of view of several makes. No scan is
+recognised as that one: it is no real sensor, and its beams are so dense that the rings of others lie on them."""

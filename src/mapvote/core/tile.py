@@ -17,19 +17,19 @@ from mapvote.core.points import Fields, point_fields
 from mapvote.core.types import F32, F64, I32, I64, U32, U64, Bool, check_array, read_only
 
 PLANES = 4
-"""Of a tile's memory."""
+"""Planes of a tile's memory."""
 _FOLLOWS_FROM: dict[str, set[str]] = {
     "cells": {"points"},
     "base": {"ground_z"},
     "columns": {"points", "ground_z"},
     "obstacle_words": {"points", "ground_z"},
 }
-"""What a tile works out once, and the planes that it follows from."""
+"""Values that a tile computes once, and the planes that they follow from."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """Of the cells of which there is anything to remember, for they are few; of all others every value is zero."""
+    """Memory of the cells that have any, for they are few; in all others every value is zero."""
 
     cells: I64
     """(n,) flat, ascending."""
@@ -38,7 +38,7 @@ class Memory:
 
     @classmethod
     def none(cls) -> Memory:
-        """Of a tile that is as it was surveyed."""
+        """The memory of a tile that never changed since its survey."""
         return cls(np.empty(0, dtype=np.int64), np.empty((PLANES, 0), dtype=np.uint32))
 
     @classmethod
@@ -154,7 +154,7 @@ class Tile:
         return cls(window, np.empty((0, 3), dtype=np.float32), np.full(window.shape, np.nan, dtype=np.float32))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """What was worked out does not travel to other processes."""
+        """Computed values are not sent to other processes."""
         return Tile, (self.window, self.points, self.ground_z, self.free, self.memory, self.fields)
 
     def but(self, **planes: Any) -> Tile:

@@ -36,8 +36,8 @@ class MapvoteError(Exception):
 
 
 def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
-    """The array itself, or a view of it, read-only. What a file's bytes are seen as is so anyway: all of
-    one kind, they need one compilation of a kernel, not one each."""
+    """The array itself, or a view of it, read-only. Views of a file's bytes are read-only anyway. If all arrays are, a
+    kernel is compiled once instead of once for each kind."""
     if not array.flags.writeable:
         return array
     view = array.view()
@@ -113,7 +113,8 @@ class Scan:
     """(3,) where its rays begin, in the frame of the points; None at (0, 0, 0), as with the vehicle's first LiDAR."""
 
     others: tuple[tuple[int, F64], ...] = ()
-    """Of a sweep of several LiDARs: from which point on the next LiDAR's follow, and where (3,) their rays begin."""
+    """Parts of a sweep of several LiDARs: the index from which the next LiDAR's points follow, and the origin (3,) of
+    their rays."""
     times: TimesTold | None = None
     """How ``time_s`` is known, if it was read; of a sweep, of the LiDAR that says least."""
 
@@ -225,7 +226,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class PosePrior:
-    """What is believed of a pose before looking: independent errors of position and rotation."""
+    """Prior information on a pose: independent errors of position and rotation."""
 
     T_map_lidar: F64
     sigma_m: float
@@ -236,7 +237,7 @@ class PosePrior:
 
     @classmethod
     def of(cls, drive: Drive, i: int) -> PosePrior | None:
-        """What ``drive`` brings for its scan ``i``, if anything."""
+        """The prior of scan ``i`` of ``drive``, if it has one."""
         if drive.T_map_lidar_prior is None:
             return None
         return cls(drive.T_map_lidar_prior[i], drive.prior_sigma_m, float(np.radians(drive.prior_sigma_deg)))

@@ -17,7 +17,7 @@ _OFFSET = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
 
 BESIDE = (1 << 42, 1 << 21, 1)
-"""What the key of the next voxel along x, y and z is larger by."""
+"""Steps of the key to the next voxel along x, y and z."""
 
 
 @inlined
@@ -245,7 +245,7 @@ def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) 
 
 def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
     """Indices (m,) of the first of (n, 3) points in each voxel of side ``size``, ascending. Within 2^20 voxels of 0.
-    Of a dense scan, only every ``every``-th point may be used.
+    ``every``: use only every so many-th point of a dense scan.
 
     Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
     """

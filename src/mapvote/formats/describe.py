@@ -1,4 +1,4 @@
-"""What is in this file: a title and rows of text for a map, a drive or a ballot."""
+"""Description of a file: a title and rows of text for a map, a drive or a ballot."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _map(point_map: PointMap) -> Rows:
 
 
 def _sources(point_map: PointMap) -> Rows:
-    """Of a merged map which points came from which map, in the order in which they were given to merge."""
+    """Points of a merged map by the map that they came from, in the order in which the maps were given to merge."""
     columns = [tile.fields[SOURCES] for tile in point_map.tiles.values() if SOURCES in tile.fields]
     if not columns:
         return []

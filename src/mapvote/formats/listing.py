@@ -27,8 +27,8 @@ def below(folder: Path, name: str, said_by: Path) -> Path:
 
 
 def entry(folder: Path, name: str) -> Path:
-    """What lies at ``folder``/``name`` ("times.txt", "gps/ins.csv"), the exact name before one in another case; that
-    path itself if nothing does."""
+    """The file at ``folder``/``name`` ("times.txt", "gps/ins.csv"), the exact name before one in another case; that
+    path itself if there is none."""
     place = folder / name
     if place.exists():
         return place

@@ -16,7 +16,7 @@ import yaml
 from mapvote.core.types import MapvoteError
 
 MOST_BYTES = 4_000_000_000
-"""Of a file that is read whole."""
+"""Largest file that is read whole."""
 
 
 def read_whole(file: Path, most: int = MOST_BYTES) -> bytes:

@@ -33,7 +33,7 @@ class MapFormat:
 
 @dataclass(frozen=True, slots=True)
 class MapWriter:
-    """What ``mapvote export`` writes under a suffix."""
+    """A format that ``mapvote export`` writes under a suffix."""
 
     name: str
     write: Callable[[Path, CloudPieces], None]

@@ -58,7 +58,7 @@ class MapAround(Protocol):
     """A finished map of any size, laid out around a vehicle that moves."""
 
     def __call__(self, position: F64) -> LocalMatcher:
-        """The part around a position (3,), map metres. What was returned earlier is not to be used any longer."""
+        """The part around a position (3,), map metres. A part that was returned earlier becomes invalid."""
         ...
 
     def prepare(self, position: F64) -> None:

@@ -19,7 +19,7 @@ from mapvote.core.types import F32, F64, I32, I64
 from mapvote.matching.ndt_voxels import SEVEN, Vector, Window, holds, voxel_of
 
 COVARIANCE_SCALE = 5.0
-"""What neighbouring residuals have in common, calibrated so that normalised squared errors average 6."""
+"""Factor for the correlation of neighbouring residuals, calibrated so that normalised squared errors average 6."""
 INLIER_E = 7.81
 """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
 CUTOFF_E = 25.0
@@ -35,7 +35,7 @@ _UNPAIRED = np.int32(-(1 << 30))
 
 
 class Room(NamedTuple):
-    """What an alignment of n points writes into: an allocation in a kernel takes 50 ms to compile."""
+    """Buffers of an alignment of n points: an allocation in a kernel takes 50 ms to compile."""
 
     of: F32
     """(7, 9, n) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its precision xx, xy,
@@ -131,7 +131,7 @@ def _likelihood(e: np.float32) -> np.float32:
 
 @fast_math
 def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
-    """Of the j-th partner of point i, which lies at (x, y, z) from the origin: (e, w C, w C u) with u the point from
+    """The j-th partner of point i, which lies at (x, y, z) from the origin, as (e, w C, w C u) with u the point from
     the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
     x, y, z = x - of[j, 0, i], y - of[j, 1, i], z - of[j, 2, i]
     c00, c01, c02, c11, c12, c22 = of[j, 3, i], of[j, 4, i], of[j, 5, i], of[j, 6, i], of[j, 7, i], of[j, 8, i]
@@ -363,8 +363,8 @@ def align(
     Returns (mean likelihood, share of inliers, iterations, has it converged), and fills ``covariance`` (6, 6). A
     direction that nothing fixes gets a small curvature, hence a large variance and no step, instead of a singular
     matrix. ``most`` steps are taken; one shorter than ``tolerance_m``, 20 m away too, has converged. ``map_variance``
-    (6,): what the map itself is off by. What was believed of the pose, T_prior (4, 4), is weighed against the scan by
-    their information: ``prior`` (6, 6), zeros without one.
+    (6,): variance of the map's own errors. The prior pose T_prior (4, 4) is weighed against the scan by its information
+    ``prior`` (6, 6), zeros without one.
     """
     H, M, H_inv, information = room.matrices[0], room.matrices[1], room.matrices[2], room.matrices[3]
     left, half, both = room.matrices[4], room.matrices[5], room.matrices[6]

@@ -259,7 +259,7 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
     """Add the voxels (m,) of points that are not in ``voxels`` yet. ``voxels`` must have a row left for each.
 
     Returns (the new number of rows, how many of ``shared`` (m,) are filled): rows that both have, to :func:`refresh`.
-    What lies outside ``window`` is left out.
+    Voxels outside ``window`` are left out.
     """
     rows, lowest = window.rows, window.lowest
     n_shared = 0

@@ -71,7 +71,7 @@ class Samples(NamedTuple):
 
 
 class LookCounts(NamedTuple):
-    """What scans observed at each place, (m,) each."""
+    """Observations of scans at each place, (m,) each."""
 
     free: I32
     """Scans that saw through it."""

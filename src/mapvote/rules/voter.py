@@ -1,4 +1,4 @@
-"""What a change rule gives of each tile: its votes, and the points of what may be new.
+"""Votes of a change rule on each tile, and the points of possible new objects.
 
 They are kept tile by tile, so that memory follows the road, not its length in scans.
 """
@@ -218,8 +218,8 @@ class NewPoints:
         return every[first[np.argsort(keys[first])]]
 
     def by_tile(self) -> Callable[[TileIndex], F64]:
-        """What gives the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 3 + k) with the k
-        attributes of ``names`` as in ballots. Those of all tiles of a long drive are never held together."""
+        """Reader of the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 3 + k) with the k attributes of
+        ``names`` as in ballots. The points of all tiles of a long drive are never held together."""
         rest = self._of_tiles(self._one_a_voxel([*self._short(), *self._waiting]))
 
         def of_tile(tile: TileIndex) -> F64:

@@ -35,7 +35,7 @@ KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
 Decided = tuple[Record, Sequence[tuple[int, U8]]]
-"""What one version decided about one tile; and of every ballot that counted (end_ns, (256, 256) states)."""
+"""The decision of one version on one tile, and (end_ns, (256, 256) states) of every ballot that counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,7 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
         others[row] = edits.against[edit]
         agrees = said == states
         agrees[row] = True
-        # What that version says of the cell replaces what earlier ones said.
+        # That version's statement on the cell replaces those of earlier versions.
         votes = np.where(agrees, counted, votes)
         against = np.where(agrees, others, against)
         versions = np.where(agrees, decision.version, versions)

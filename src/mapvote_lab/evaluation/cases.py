@@ -1,4 +1,4 @@
-"""What is compared: the paper's five cases (paper V), the same under other rules of sight, and ``surfaces``.
+"""Cases of the comparison: the paper's five (paper V), the same under other rules of sight, and ``surfaces``.
 
 All of them are settings of the one rule. A vehicle casts a ballot by each; the server's rule then decides, and the
 decided cells are scored.

@@ -90,7 +90,7 @@ COURT_RULE = CourtRule()
 
 @dataclass(frozen=True, slots=True)
 class CourtScore:
-    """What one method published."""
+    """Changes that one method published."""
 
     method: str
     left: int
@@ -99,13 +99,13 @@ class CourtScore:
     added: tuple[int, int]
     """Points in the boxes of the structure and of the thing that came."""
     found: int
-    """Of the three: the car lost half of its points, or 50 points came."""
+    """How many of the three changes are found: the car lost half of its points, or 50 points came."""
     elsewhere: tuple[int, int]
     """Points deleted and added outside of the boxes."""
     others: tuple[float, ...]
     """Areas of the objects above 2 m2 outside of the boxes, m2."""
     false: tuple[float, ...]
-    """Of these, those that no session's cloud shows."""
+    """Areas of these objects that no session's cloud shows, m2."""
 
 
 @dataclass(frozen=True, slots=True)

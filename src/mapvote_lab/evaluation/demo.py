@@ -69,7 +69,7 @@ Picture = tuple[Path, str]
 
 @dataclass(frozen=True, slots=True)
 class Story:
-    """What the demo found, for the last lines on the terminal and the first on the page."""
+    """Results of the demo, for the last lines on the terminal and the first on the page."""
 
     deleted: int
     added: int
@@ -116,7 +116,7 @@ def report_page(
             pictures=[drawn[area.name.replace(" ", "_")] for area, _, _ in story.areas],
         ),
         ReportSection(
-            "What a vehicle sees and how it votes",
+            "View and votes of one vehicle",
             [
                 "A scan falls onto a grid of 0.3 m cells, 80 m wide. Each cell is unchanged, changed or "
                 "undetermined; an occupied cell's vote weighs more the more points it holds. Over the drive the "
@@ -125,7 +125,7 @@ def report_page(
             [drawn["scan"], drawn["local_grid"], drawn["vote_curve"]],
         ),
         ReportSection(
-            "What the server decided",
+            "Decisions of the server",
             [
                 "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
                 f"version {story.published.version} of the map, which the vehicles then download. Undetermined and "
@@ -137,7 +137,7 @@ def report_page(
         _how_good(evaluation.result, drawn),
         beside_the_paper(evaluation.result),
         ReportSection(
-            "What to try next",
+            "Next steps",
             [f"Maps, tables and pictures are beside this page. {drives_sentence(story, evaluation.scene.folder)}"],
             commands=commands(evaluation, out, story.kept),
         ),
@@ -173,7 +173,7 @@ def _rest_facts(result: EvaluationResult) -> list[tuple[str, str]]:
 def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSection:
     scans = sum(place.scans for place in evaluation.result.localisation.values())
     return ReportSection(
-        "What happened",
+        "Results",
         [
             f"A survey vehicle mapped {evaluation.window.cols * CELL_SIZE:.0f} m of a simulated street. Then buildings "
             f"were built and demolished. {len(evaluation.drives)} vehicles drove by, {scans} scans in all; each found "
@@ -243,7 +243,7 @@ def draw_scans(scene: Scene, path: Path) -> Picture:
     middle = scene.true_poses(scene.drive_names("v")[0])[:, :3, 3].mean(axis=0)
     camera = figures.Camera((float(middle[0]), float(middle[1]), 0.0), 62.0, 205.0, 40.0)
     save(figures.draw(panels, camera, legend=[("moving", Colour.MOVING)], size_m=0.12), path)
-    return path, "What the LiDARs measured before and after the change, at the true poses; bodies that move in orange."
+    return path, "Points of the LiDARs before and after the change, at the true poses; bodies that move in orange."
 
 
 def _measured(scene: Scene, name: str, step: int = 4) -> tuple[F64, Bool, float]:
@@ -261,7 +261,7 @@ def _measured(scene: Scene, name: str, step: int = 4) -> tuple[F64, Bool, float]
 
 
 def commands(evaluation: Evaluation, out: Path, kept: bool) -> str:
-    """What to type next, on this demo's files and on one's own."""
+    """Commands to type next, on this demo's files and on one's own."""
     own = (
         "# your own: KITTI folders, PCD folders or ROS 2 bags\n"
         "mapvote demo MY_DRIVE                   # this report, of a street that you recorded\n"
@@ -379,7 +379,7 @@ def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tupl
     used = len(street.recording)
     return [
         ReportSection(
-            "What happened",
+            "Results",
             [
                 f"{used} of the {length} scans were read. Blocks of 12 scans became the map; the blocks between them "
                 "are three vehicles, every third scan each.",
@@ -388,7 +388,7 @@ def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tupl
             pictures,
         ),
         ReportSection(
-            "What to try next",
+            "Next steps",
             commands=(
                 f"mapvote doctor {folder}\n"
                 f"mapvote evaluate real {folder} --out bench    # more bodies, wrong priors, rain; takes minutes\n"
@@ -462,7 +462,7 @@ def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:
 
 
 def changed_areas(store: Path, version: int) -> list[Cutout]:
-    """What the server's round changed, cut out of the map."""
+    """Changes of the server's round, cut out of the map."""
     opened = Store.open(url_of(str(store)))
     try:
         return cutouts_between(opened, 1, version, changes_between(opened, 1, version)) if version > 1 else []

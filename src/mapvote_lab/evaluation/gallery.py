@@ -96,7 +96,7 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     yield "scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."
     yield "local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."
     yield "vote_curve", figures.vote_curve(v.a, v.b, v.k, n_min), "Votes of an occupied cell, Eq. (1): Figure 4."
-    caption = "What the server decided, cell by cell; yellow in the truth: unscored."
+    caption = "Decisions of the server, cell by cell; yellow in the truth: unscored."
     yield "states", figures.cell_states(panels, evaluation.window, outlines=outlines), caption
     yield "table_iv", figures.score_bars(shown, names), "Table IV as bars, the paper's figures beside ours."
     if evaluation.best == "surfaces":
@@ -182,7 +182,7 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
 
 
 def _local_grid(evaluation: Evaluation, index: int) -> Figure:
-    """What one scan alone makes of the local grid under the paper's rule, and what the whole drive made of it."""
+    """The local grid by one scan alone under the paper's rule, and by the whole drive."""
     first = evaluation.drives[0]
     scene, name = evaluation.scene, first.vehicle
     drive = scene.drive(name)

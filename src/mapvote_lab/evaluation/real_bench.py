@@ -171,7 +171,7 @@ def _new(street: Street, thing: Thing) -> Asked:
 
 
 def _gone(street: Street, thing: Thing, points: Sequence[F64], still: Bool) -> Asked:
-    """What had stood at ``points``, but for the cells in which something stands ``still`` (rows, cols)."""
+    """Cells of objects that stood at ``points``, without the cells in which something stands ``still`` (rows, cols)."""
     kind = thing.kind if thing.goes is not None else f"{thing.kind} gone"
     kind = f"{kind}, old side" if thing.goes is not None and len(thing.comes) else kind
     return Asked(kind, CellState.CHANGED_EMPTY, _cells(street, points) & street.mapped & ~still, _rays(points))
@@ -194,7 +194,7 @@ def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
 
 
 def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
-    """What ``states`` (rows, cols) say of the things, by kind in the order in which they were asked."""
+    """Outcome of the ``states`` (rows, cols) for the objects, by kind in the order in which they were asked."""
     out = []
     for kind in dict.fromkeys(a.kind for a in asked):
         these = [a for a in asked if a.kind == kind and a.cells.any()]
@@ -248,7 +248,7 @@ class Ground:
     worst_off_m: float
     off_share: float
     occupied_share: float
-    """Of the cells under the driven line: the map holds an obstacle there, at any height."""
+    """Share of the cells under the driven line in which the map holds an obstacle, at any height."""
 
 
 @dataclass

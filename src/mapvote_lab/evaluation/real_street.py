@@ -126,7 +126,7 @@ class RealRun:
     """Cells in or next to which something moved, by the filter on the map's and the vehicles' scans."""
     reports: Sequence[DriveReport]
     error_m: F64
-    """Of every scan that was localised, against the reference in the map's frame."""
+    """Error of every scan that was localised, against the reference in the map's frame."""
     prior_error_m: F64
     scans: int
 
@@ -137,7 +137,7 @@ class RealRun:
 
     @property
     def lost_share(self) -> float:
-        """Of the scans: abstained."""
+        """Share of the scans that abstained."""
         return 1.0 - len(self.error_m) / self.scans
 
     def changed_share(self, case: str, *, with_movers: bool, of_mapped: bool = False) -> float:

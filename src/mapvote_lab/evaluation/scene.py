@@ -51,7 +51,7 @@ from mapvote_lab.simulation.processes import processes
 from mapvote_lab.simulation.scenario import load_scenario
 
 _DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/scan_folder.py")
-"""What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
+"""Sources that the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives valid."""
 _MAP_FROM = ("core", "codec", "formats", "matching", "perception", "rules", "survey")
 BALLOTS_FROM = (
     *_MAP_FROM, "vehicle.py", "evaluation/scene.py",
@@ -99,7 +99,7 @@ class Scene:
 
     @property
     def work(self) -> Path:
-        """What was made of the drives with these settings."""
+        """Results of the drives with these settings."""
         s = self.settings
         settings = [part.model_dump_json() for part in (s.ndt, s.moving, s.mapping)]
         key = key_of(sources_digest(_MAP_FROM), *settings, self.poses)
@@ -207,7 +207,7 @@ class SharedPass:
         return observations
 
     def ballot(self, case: Case) -> Ballot:
-        """What the vehicle says by one of its cases. MapvoteError if no scan has voted."""
+        """The vehicle's ballot by one of its cases. MapvoteError if no scan has voted."""
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
@@ -217,7 +217,7 @@ class SharedPass:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """What one vehicle brought home."""
+    """Result of one vehicle's drive."""
 
     vehicle: str
     ballots: dict[str, Ballot]

@@ -33,7 +33,7 @@ NEIGHBOURS = np.ones((3, 3), dtype=np.bool_)
 @record()
 @dataclass(frozen=True, slots=True)
 class ScoreRule:
-    """What counts as an object, as found, and as visible."""
+    """Limits of an object, of a found one, and of a visible one."""
 
     least_object_m2: float = 1.0
     """Area from which a group of changed cells is an object, square metres."""
@@ -419,7 +419,7 @@ class MapShift(msgspec.Struct, frozen=True):
 
 
 class Cost(msgspec.Struct, frozen=True):
-    """Of one method on a vehicle."""
+    """Run time of one method on a vehicle."""
 
     beams: int
     ms_per_scan: float

@@ -255,7 +255,7 @@ def _rests(rests: ObjectRests | None) -> list[str]:
 def _localisation_tables(result: EvaluationResult) -> Iterator[Sheet]:
     of_title = {
         "Localisation against the true poses, in the map's frame": result.localisation,
-        "What the map is for: one vehicle's scans within 30 m of a change": result.changed_areas,
+        "Purpose of the map: one vehicle's scans within 30 m of a change": result.changed_areas,
     }
     headings = ["", "scans", "localised", "median", "99 %", "largest", "median angle"]
     for title, errors in of_title.items():

@@ -113,7 +113,7 @@ def _stage(scenario: Scenario, seed: int) -> Stage:
 
 @lru_cache(maxsize=1)
 def _street(scenario: Scenario, seed: int, drive: int) -> tuple[Caster, Traffic]:
-    """What stands and what moves during one drive."""
+    """Static and moving objects of one drive."""
     stage = _stage(scenario, seed)
     route = stage.routes[drive]
     still = Caster(*stage.world.mesh(stage.world.standing(route.vehicle)))

@@ -48,7 +48,7 @@ FLAW_SIZES = FlawSizes()
 
 @dataclass(frozen=True)
 class Kinds:
-    """What each object id is made of, (objects,)."""
+    """Material of each object id, (objects,)."""
 
     glazed: Bool
     painted: Bool
@@ -57,7 +57,7 @@ class Kinds:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays of one revolution truly met; arrays (rays,)."""
+    """True hits of the rays of one revolution; arrays (rays,)."""
 
     ranges: F32
     objects: I32
@@ -118,7 +118,7 @@ def reflected(
 ) -> tuple[I64, F32]:  # fmt: skip
     """(indices, ranges) of at most ``wanted`` rays of those that met a ``smooth`` surface (rays,): the range over it.
 
-    ``casters``: of what stands, of what moves. What the mirror shows is what stands.
+    ``casters``: of static and of moving objects. A mirror shows static objects only.
     """
     chosen = rng.permutation(np.flatnonzero(smooth))[: 4 * wanted]
     indices, ranges = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.float32)]

@@ -51,7 +51,7 @@ class Clutter(_Table):
 
 
 class Flaws(_Table):
-    """What the LiDAR gives besides the truth (simulation/flaws.py). Nothing of it: all shares 0."""
+    """False returns of the LiDAR (simulation/flaws.py). All shares 0: none."""
 
     reflection_share: float = Field(
         default=0.001,

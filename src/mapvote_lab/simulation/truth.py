@@ -1,4 +1,4 @@
-"""What really changed, from the simulator alone (docs/decisions/truth.md): two definitions, cell by cell.
+"""True changes, from the simulator alone (docs/decisions/truth.md): two definitions, cell by cell.
 
 **strict** comes from a noise-free survey: dense rays from the true poses of all drives, into the street
 before and the street after. A cell gained if a built body's surface lies in it where nothing was before, and
@@ -76,7 +76,7 @@ TRUTH_RULE = TruthRule()
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What the drives recorded of bodies that stand still, cell by cell."""
+    """Records of the drives on static bodies, cell by cell."""
 
     survey: I32
     """(roles, rows, cols) points of the survey drives."""

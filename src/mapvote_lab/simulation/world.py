@@ -94,7 +94,7 @@ def make_terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
 
 
 class Role(IntEnum):
-    """What a body means for the truth (docs/decisions/truth.md)."""
+    """Role of a body in the truth (docs/decisions/truth.md)."""
 
     KEPT = 0
     ADDED = 1

@@ -70,7 +70,7 @@ class Receipt:
 
 
 class RoundNow:
-    """What the newest version and the policy ask of ballots, as of the last :meth:`catch_up`."""
+    """Demands of the newest version and the policy on ballots, as of the last :meth:`catch_up`."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -145,9 +145,9 @@ class Intake:
         self._store, self._quota = store, quota
         self._used: dict[str, _Used] = {}
         self._round = RoundNow(store)
-        """Of the thread that writes."""
+        """State of the thread that writes."""
         self._early = RoundNow(store)
-        """Of the threads that examine, under this lock."""
+        """State of the threads that examine, under this lock."""
         self._early_lock = Lock()
         self._lowest_m: dict[str, float] = {}
         """Lowest ground of a tile, by its plane's hash."""
@@ -284,8 +284,8 @@ class Intake:
         return None if used is None else _exceeded(self._quota, used, one)
 
     def _count_in(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
-        """The refusal of a ballot that is too much of its vehicle; None lets it through and counts it. What a vehicle
-        has used is counted in the store once an hour and before a refusal, in between from what was let through."""
+        """The refusal of a ballot that exceeds its vehicle's budget; None admits and counts it. A vehicle's use is
+        counted in the store once an hour and before a refusal; in between, admitted ballots are added."""
         if self._quota is None:
             return None
         vehicle = one.ballot.vehicle

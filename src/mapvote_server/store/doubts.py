@@ -1,8 +1,8 @@
-"""What an operator should know about the voters of a round: the rules decide it, and yet it may be an attack.
+"""Warnings on the voters of a round: the rules decide it, and yet it may be an attack.
 
 A change is decided by the latest vehicles, or by all since some moment. So k liars who drive last can undo what more
 vehicles said before, and as many strangers as the quorum asks for can change everything. Real changes look the same. So
-the desk and the log tell of them, and the policy can hold such a version for somebody to look at.
+the desk and the log warn of them, and the policy can hold such a version for an operator.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mapvote_server.store.votes import Electorate, recent_votes
 
 @dataclass(frozen=True, slots=True)
 class Doubts:
-    """Of one round; cells are those that a publish would change."""
+    """Doubts on one round; cells are those that a publish would change."""
 
     overturned: int = 0
     """Cells of which at least as many vehicles said otherwise as vote for the change."""

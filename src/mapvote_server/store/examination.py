@@ -29,13 +29,13 @@ MISFIT_SLACK_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Votes:
-    """What admission needs of a ballot's votes on one tile."""
+    """Facts of a ballot's votes on one tile, for admission."""
 
     tile: TileIndex
     spoken: bytes
     """The cells that it votes on: 65536 bits, row by row."""
     heights_m: tuple[float, float] | None
-    """Of its lowest and highest new point, map metres; None: it brings none."""
+    """Heights of its lowest and highest new point, map metres; None: it has none."""
     stored: tuple[Any, ...] = field(repr=False)
     """Base, planes and sum, as the last columns of ``ballot_tiles``."""
 

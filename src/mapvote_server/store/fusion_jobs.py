@@ -68,7 +68,7 @@ class Task:
     misread: Mapping[int, Bool] | None = None
     """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
     fallen: Fallen | None = None
-    """What falls besides, as the tiles around decide."""
+    """Points that lose their support, by the decisions of the tiles around."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class Fused:
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because their probability of a false deletion exceeds the budget."""
     fell: Fallen = field(default_factory=Fallen.none)
-    """What fell with a demolished object, see :class:`mapvote.fusion.fuse.Decision`, as are the next three."""
+    """Points that fell with a demolished object, see :class:`mapvote.fusion.fuse.Decision`; so are the next three."""
     waits: I64 = field(default_factory=lambda: _NO_CELLS)
     undecided: Remains | None = None
     noise: tuple[I64, U8] = field(default_factory=lambda: (_NO_CELLS, np.empty(0, np.uint8)))

@@ -90,8 +90,8 @@ def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float
 def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = False) -> tuple[int, int]:
     """Revoke every key of a name: (keys, ballots that count no more). NotFound if it has no valid key.
 
-    Who is trusted no longer was not to be trusted before: its standing ballots count no more, unless ``keep_votes``.
-    What was published of them stays (:func:`mapvote_server.store.rollback.replay` takes that out too).
+    Revoking a key also withdraws its holder's unpublished ballots, unless ``keep_votes``. Published votes stay
+    (:func:`mapvote_server.store.rollback.replay` removes them too).
     """
     k, now = schema.keys, store.clock()
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))

@@ -43,7 +43,7 @@ def _too_far(tile: TileIndex) -> MapvoteError:
 
 
 def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """As :func:`refuse_far_tiles`, by the cells on which a ballot votes."""
+    """The check of :func:`refuse_far_tiles`, by the cells on which a ballot votes."""
     for votes in said:
         if touched(votes.tile, map_tiles):
             continue  # the whole tile is within reach

@@ -1,9 +1,9 @@
-"""New versions: what a publish would make now, and the publish.
+"""New versions: the round that a publish would make now, and the publish.
 
 A round follows from the newest version, the ballots, the reviews, the policy and one reading of the clock. It holds
 until an event comes that can change it or, with a minimum age, until the next vote is old enough. It is decided once:
 desk, dry run, picture, review and publish share one :class:`Round`. It is decided on a snapshot, before the transaction
-that writes it. Of several publishers exactly one wins; the others get Conflict.
+that writes it. If several publish at once, exactly one wins; the others get Conflict.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Outcome:
     """Why the policy would hold it back, or what the operator overrode."""
     fused: Sequence[Fused] = field(default=(), repr=False)
     doubts: Sequence[str] = ()
-    """What an operator should know about the voters (store/doubts.py)."""
+    """Warnings on the voters (store/doubts.py)."""
 
 
 def preview(
@@ -238,7 +238,7 @@ _doubts: WeakKeyDictionary[Round, Doubts] = WeakKeyDictionary()
 
 
 def doubts_of(store: Store, found: Round) -> Doubts:
-    """What an operator should know about the voters of a round; worked out once."""
+    """Warnings on the voters of a round; computed once."""
     if found not in _doubts:
         every = [*found.decided.values(), *found.beside.values()]
         _doubts[found] = doubts_about(store, found.newest.number, found.asked, found.changed, every)
@@ -267,7 +267,7 @@ def _latest_of(store: Store) -> _Latest:
 def round_at(
     store: Store, now: int, settings: FuseSettings | None = None, executor: Executor | None = None, every: bool = False
 ) -> Round:
-    """The round as of ``now``, by the store's clock. Of many threads that ask, one decides it.
+    """The round as of ``now``, by the store's clock. One thread decides it; other threads wait for the result.
 
     ``settings`` take the place of the policy's ``fuse``, in simulations; such a round is not kept. ``every``: fuse all
     tiles with votes, for what waits there.

@@ -179,7 +179,7 @@ def log_event(connection: sa.Connection, at_ns: int, kind: str, actor: str, deta
 
 
 def end_votes(connection: sa.Connection, vehicle: str, seq: int) -> int:
-    """A vehicle's standing ballots count no more, by the event ``seq``; how many. What versions made of them stays."""
+    """Withdraw a vehicle's standing ballots by the event ``seq``; returns their number. Published versions stay."""
     b = schema.ballots
     standing = b.update().where(b.c.vehicle == vehicle, b.c.gone_seq.is_(None))
     return int(connection.execute(standing.values(gone_seq=seq)).rowcount)

@@ -30,7 +30,7 @@ from mapvote_server.store.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Cleared:
-    """What was deleted, or would be."""
+    """Rows that were deleted, or would be."""
 
     oldest: int
     """The oldest version that is kept."""

@@ -3,8 +3,8 @@
     store = Store.open("sqlite:///street.db")          # or Store.create(url, point_map)
     store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
 
-What changes it lies beside it: ``admission``, ``votes``, ``publish``, ``rollback``, ``reviews``, ``keys``,
-``policy``. What explains it is in :mod:`mapvote_server.questions`.
+The modules beside it change it: ``admission``, ``votes``, ``publish``, ``rollback``, ``reviews``, ``keys``, ``policy``.
+:mod:`mapvote_server.questions` explains it.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class Store:
         return changed, sorted(then.keys() - now.keys())
 
     def _digest(self, connection: sa.Connection, number: int) -> tuple[int, int]:
-        """Of a version: what is known of the last one before it, and what changed since."""
+        """A version as the last known one before it, and the changes since."""
         before = max((known for known in self._digests if known <= number), default=None)
         if before is None:
             self._digests[number] = _digests_of(tiles_of(connection, number))

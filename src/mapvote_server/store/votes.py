@@ -290,7 +290,7 @@ def recent_votes(
 
 
 def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
-    """What ``read`` gives without the ballots that are set aside, and those that turn out to be damaged on the way."""
+    """Result of ``read`` without the ballots that are set aside, and without those found damaged on the way."""
     asked = replace(asked, set_aside=frozenset({*asked.set_aside, *ballots_aside(connection)}))
     while True:
         try:
@@ -371,10 +371,10 @@ def read_votes(
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
-    """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
+    """Withdraw votes before publication: one drive of a vehicle, all its drives, or (None) every vehicle's. Returns the
+    number of ballots.
 
-    NotFound if there is none. What earlier versions made of them stays: see
-    :func:`mapvote_server.store.rollback.replay`.
+    NotFound if there is none. Earlier versions keep them: see :func:`mapvote_server.store.rollback.replay`.
     """
     b = schema.ballots
     whose = f"{vehicle or '*'}/{drive or '*'}"

@@ -49,7 +49,7 @@ class MapFrame:
     """"local", "EPSG:n", WKT, or "ENU latitude longitude height"."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     heights: str = ""
-    """What z counts from, e.g. "EGM2008 height", where a file states it."""
+    """Vertical datum, e.g. "EGM2008 height", where a file states it."""
     projector: str = ""
     """The text of Autoware's map_projector_info.yaml, where the map has one."""
     refusal: str = ""
@@ -60,7 +60,7 @@ class MapFrame:
         return self.crs == LOCAL
 
     def georeference(self) -> dict[str, str]:
-        """As free text that a PointMap carries through import, update, publish and export."""
+        """The frame as free text, which a PointMap carries through import, update, publish and export."""
         texts = {"crs": self.crs, "heights": self.heights, "map_projector_info.yaml": self.projector}
         if any(self.offset_m):
             texts["offset"] = ",".join(repr(v) for v in self.offset_m)
@@ -369,7 +369,7 @@ def _as_yaml(about: dict[str, Any]) -> str:
 
 
 def frame_wanted(crs: str | None, projector: str | None) -> MapFrame | None:
-    """What ``--crs`` or ``--projector`` ask for; None if neither does. MapvoteError if both do."""
+    """The frame of ``--crs`` or ``--projector``; None without either. MapvoteError if both do."""
     if crs is not None and projector is not None:
         raise MapvoteError("--crs and --projector both name the frame; give one of them")
     if projector is not None:

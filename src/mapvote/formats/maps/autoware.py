@@ -114,8 +114,8 @@ def _frame(path: Path) -> MapFrame:
 def write_autoware(path: Path, cloud: Cloud | CloudPieces) -> None:
     """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
-    Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
-    cloud's frame (:func:`mapvote.formats.geo.frame.autoware_frame` chooses one that it has).
+    Intensity is the only field that is written. MapvoteError if Autoware has no projector for the cloud's frame
+    (:func:`mapvote.formats.geo.frame.autoware_frame` chooses one that it has).
     """
     clouds = CloudPieces.of(cloud)
     projector = projector_of(clouds.frame)
@@ -172,7 +172,7 @@ class _Laid(msgspec.Struct):
     version: int
     tiles: list[Annotated[str, msgspec.Meta(pattern=rf"^{FOLLOWED.pattern}\Z")]]
     map_id: str = ""
-    """Of the map; "" where the caller did not name it."""
+    """Identifier of the map; "" where the caller did not name it."""
 
 
 _HISTORY = msgspec.json.Decoder(list[_Laid])
@@ -180,7 +180,7 @@ _HISTORY = msgspec.json.Decoder(list[_Laid])
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What laying a version did to the folder."""
+    """Changes to the folder by one version."""
 
     version: int
     tiles: int

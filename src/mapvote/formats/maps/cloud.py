@@ -55,7 +55,7 @@ class Cloud:
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Columns (n,) of :func:`kept_fields`, with the values and in the type that the file has."""
     gps_times: str = ""
-    """What ``gps_time`` counts from, "week" or "adjusted standard"; empty if the file does not say."""
+    """Epoch of ``gps_time``: "week" or "adjusted standard"; empty if the file does not say."""
 
     def where(self, chosen: Bool) -> Cloud:
         """Those of its points that are ``chosen`` (n,), with their fields."""
@@ -78,11 +78,11 @@ class CloudPieces:
     brightness: Mapping[str, Brightness]
     """Values of intensity, and of the three colours together."""
     gps_times: str
-    """As of the pieces; of times that nobody named, what their size tells."""
+    """Epoch that the pieces state; where none does, the one that the size of the times tells."""
 
     @classmethod
     def of(cls, cloud: Cloud | CloudPieces) -> CloudPieces:
-        """What is in memory already, as one piece."""
+        """One piece of points that are in memory already."""
         return cloud if isinstance(cloud, CloudPieces) else cls.gathered(lambda: iter([cloud]), cloud.frame)
 
     @classmethod
@@ -160,7 +160,8 @@ def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
 
 
 def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
-    """As :func:`xyz`, but a view of ``table`` where they are float32 side by side, as nearly every LiDAR has them."""
+    """The result of :func:`xyz`, as a view of ``table`` where its coordinates are adjacent float32, as in nearly every
+    LiDAR's clouds."""
     names = table.dtype.names or ()
     found = known_fields(names)
     missing = [axis for axis in "xyz" if axis not in found]

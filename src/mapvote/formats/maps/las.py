@@ -109,7 +109,7 @@ def _only(piece: Cloud, brought: Sequence[str]) -> Cloud:
 
 
 def _beside(laspy: Any, path: Path, *, extra: bool) -> Iterator[Cloud]:
-    """What a LAS file holds."""
+    """Facts of a LAS file."""
     with laspy.open(path) as file:
         head = read_head(file, extra=extra)
         yield from _clouds(path, head, read_pieces(file, head))
@@ -179,7 +179,7 @@ def _known(where: str, crs: str) -> str:
 
 
 def _apart(path: Path, *, extra: bool) -> Iterator[Cloud]:
-    """What the file holds, read by a process of its own, which a damaged LAZ file may end; ValueError if it does."""
+    """Content of the file, read by a process of its own, which a damaged LAZ file may end; ValueError if it does."""
     command = [sys.executable, laz_subprocess.__file__, str(path), *(["extra"] if extra else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
@@ -240,7 +240,7 @@ def _check_counts(path: Path) -> bool:
         raise MapvoteError(
             f"{path}: not a whole LAS or LAZ file (its header promises more than it holds); copy it again"
         )
-    # Of LAS the size tells how many points there are; of LAZ the header's own count by return may.
+    # The size of a LAS file tells how many points there are; the header's count by return may tell it for LAZ.
     if compressed:
         returns = sum(
             struct.unpack_from("<15Q", header, 255) if version >= 4 else struct.unpack_from("<5I", header, 111)

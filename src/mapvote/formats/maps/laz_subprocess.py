@@ -124,7 +124,7 @@ def read_pieces(file: Any, head: Head, points_a_piece: int = 1_000_000) -> Itera
 
 def points_in_chunks(path: str, start: int) -> int | None:
     """Points that a LAZ file holds; None if its chunks do not tell, or LASzip's record is damaged. Chunks of varying
-    size say how many points each holds. Of equal chunks all but the last are full, and in the point formats from 6 on
+    size say how many points each holds. If chunks are equal, all but the last are full; in the point formats from 6 on
     the last one counts its own.
 
     ``start``: where the point data begin. LASzip's VLR: 12 chunk size, 32 number of items, from 34 on type and size of

@@ -108,7 +108,7 @@ def read_manifest(path: Path) -> FolderManifest:
 def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
     """The map, every plane verified against the manifest. MapvoteError names the first tile that is not whole.
 
-    Of a map larger than memory all planes are verified now, and each tile is read when it is asked for.
+    A map larger than memory has all its planes verified now; each tile is read when it is used.
     """
     manifest = read_manifest(path)
     try:

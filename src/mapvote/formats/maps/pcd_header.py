@@ -2,7 +2,7 @@
 
 PCL splits the lines at tabs and blanks, skips comments, ignores VERSION, takes letters of TYPE in both cases, and drops
 a field with COUNT 0, which old drivers write between the fields of a point. Lines that older versions of the format
-lack have defaults. What is no PCD file is refused with its line, the cause and the mend.
+lack have defaults. A file that is no PCD is refused with its line, the cause and the mend.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class PcdField:
 
 @dataclass(frozen=True, slots=True)
 class PcdHeader:
-    """What the lines up to DATA say."""
+    """Content of the lines up to DATA."""
 
     fields: tuple[PcdField, ...]
     width: int

@@ -1,8 +1,8 @@
-"""From the pieces of a cloud to a map: what is in memory is a piece, a tile, and the heights of all points.
+"""From the pieces of a cloud to a map. Memory holds one piece, one tile, and the heights of all points.
 
-Twice over the disk: points as they come, for only then is known where the map lies and which fields all pieces have;
-then by tile. The ground needs all heights at once, because it grows from tile to tile. What lies on disk meanwhile has
-no name there, and is gone with the process, however that ends.
+Points are written to disk twice: first as they come, because the place of the map and the fields of all pieces are
+known only at the end; then by tile. The ground needs all heights at once, because it grows from tile to tile. The
+temporary files have no name, and vanish with the process, however it ends.
 """
 
 from __future__ import annotations
@@ -137,9 +137,9 @@ def map_of(
     """The map of a cloud in pieces: tiles cut, ground computed, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
 
-    ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
-    ``look`` gets the points before tiles are cut and the ground is computed.
-    MapvoteError if the cloud is empty or more than ``most_bad`` of it is not finite.
+    ``folder``: where temporary files may lie. A map larger than memory reads its tiles from them. ``look`` gets the
+    points before tiles are cut and the ground is computed. MapvoteError if the cloud is empty or more than ``most_bad``
+    of it is not finite.
     """
     taken = _Taken(where, Spill(folder, sizes), most_bad)
     for piece in pieces:
@@ -201,7 +201,7 @@ class _Taken:
             self.spill.add({name: column[start : start + READ_SIZES.piece] for name, column in columns.items()})
 
     def georeference(self) -> dict[str, str]:
-        """What the map says of its coordinates and times."""
+        """The georeference of the map: its coordinates and times."""
         times = {GPS_TIMES: self.gps_times} if self.gps_times else {}
         return self.frame.georeference() | times
 
@@ -220,7 +220,8 @@ class _Taken:
         return lattice_of(np.array([self._low, self._high]))
 
     def blocks(self) -> Iterator[Columns]:
-        """What was taken, in order: the fields that all pieces have, each in one type. Flags only if one is set."""
+        """Blocks of points in their order, with the fields that all pieces have, each in one type. Flags only if one is
+        set."""
         names = [name for name in (_XYZ, *kept_fields()) if all(name in kinds for kinds in self._kinds)]
         if not self.flagged and "las_flags" in names:
             names.remove("las_flags")
@@ -260,7 +261,7 @@ class _Parts:
         return Tile(self._lattice.tile(index), points, ground_z, fields=columns)
 
     def heights(self, *, of_ground: bool = False) -> Mapping[TileIndex, Heights]:
-        """Of all points, or of those that the file classifies as ground, if it does."""
+        """Heights of all points, or of those that the file classifies as ground, if it does."""
 
         def ask(index: TileIndex) -> Heights:
             columns = self.read(index)
