@@ -2,6 +2,7 @@
 
     python benchmarks/live.py drive DRIVE MAP --rate 1   # share of scans that voted, latency from sending to vote
     python benchmarks/live.py kills DRIVE MAP --kills 50 # kill -9 at random moments, in half of them without a server
+    python benchmarks/live.py priors DRIVE MAP           # scans that vote by each kind of prior, without DDS
 
 DRIVE is one that ``mapvote simulate`` wrote, MAP what ``mapvote build`` made of its surveys. For kills the drive goes
 round and round with stamps that go on; at the end of a lap the vehicle leaps back to the start, where some scans are
@@ -26,12 +27,22 @@ from pathlib import Path
 
 import numpy as np
 
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.types import F64, I64, PosePrior
+from mapvote.formats import open_drive, read_map
+from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at
+from mapvote.formats.drives.trajectory import read_poses
+from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.dds import Network
 from mapvote.live.play import opened
+from mapvote.vehicle import Vehicle
 
 sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder, whose live.py would hide tests/live
 from live.loopback_dds import LOOPBACK, own_domain  # noqa: E402
 from live_server import mapvote  # noqa: E402
+from odometry_errors import odometry  # noqa: E402
+
+OWN_FRAME = from_xyz_rpy(100.0, 50.0, 0.0, 0.0, 0.0, 0.6)
 
 
 def laps(domain: int, drive: str, shown: Path) -> None:
@@ -152,9 +163,51 @@ def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: st
     print(f"CPU of drive: {after.children_user - before.children_user:.1f} s user, start and kernels included")
 
 
+def noisy_fixes(poses: F64, stamps_ns: I64, every: int, sigma_m: float) -> Fixes:
+    """Satellite fixes of every ``every``-th of the poses (n, 4, 4), with independent errors; their heights count from
+    an ellipsoid 40 m below the map's."""
+    noise = np.random.default_rng(0).normal(0.0, sigma_m, (len(poses), 3))
+    frame = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
+    lonlat = frame.to_lonlat(poses[:, :3, 3] + noise + [0.0, 0.0, 40.0])
+    covariances = np.tile(np.diag([sigma_m**2] * 3).ravel(), (len(poses), 1))
+    return fixes_of(stamps_ns[::every], lonlat[::every], covariances[::every], frame)
+
+
+def priors(drive_path: str, map_path: str) -> None:
+    """Scans that vote, and the largest error of those, by odometry in a frame of its own, without a prior and by fixes
+    of 2 m at 1 Hz."""
+    drive = open_drive(Path(drive_path))
+    point_map = read_map(Path(map_path))
+    poses = read_poses(Path(drive_path).parent / "truth" / Path(drive_path).name / "poses.txt")
+    fixes = noisy_fixes(poses, drive.stamps_ns, 10, 2.0)
+    kinds: dict[str, list[F64 | PosePrior | None]] = {
+        "odometry turned and shifted, drifting by 2 %": list(odometry(poses, OWN_FRAME @ poses[0], drift=0.02)),
+        "no prior": [None] * len(drive),
+        "GNSS, 2 m, 1 Hz": [prior_at(fixes, int(stamp_ns), np.eye(4)) for stamp_ns in drive.stamps_ns],
+    }
+    for name, told in kinds.items():
+        vehicle = Vehicle("car", drive.sensor, point_map)
+        if name.startswith("odometry"):
+            vehicle.expect_own_frame()
+        start_s = time.process_time()
+        for i, prior in enumerate(told):
+            vehicle.observe(drive.read_scan(i), prior)
+        vehicle.finish()
+        report = vehicle.report
+        voted = np.setdiff1d(np.arange(len(drive)), report.lost)
+        off_m = np.linalg.norm(np.array(report.T_map_lidar)[voted, :3, 3] - poses[voted, :3, 3], axis=1)
+        misfit_m = report.prior_misfit_m()
+        told_misfit = "" if misfit_m is None else f"; off the prior by {misfit_m:.3f} m (median)"
+        print(
+            f"{name}: {len(voted)} of {len(drive)} scans voted, at most {off_m.max(initial=0.0):.3f} m off the truth"
+            f"{told_misfit}; {time.process_time() - start_s:.0f} s of CPU",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["drive", "kills", "laps"])
+    parser.add_argument("what", choices=["drive", "kills", "laps", "priors"])
     parser.add_argument("paths", nargs="*")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--rate", type=float, default=1.0)
@@ -166,6 +219,7 @@ def main() -> None:
     runs = {
         "drive": lambda: play_and_drive(*o.paths, o.rate, o.sensor, o.core),
         "kills": lambda: kills(*o.paths, o.kills, o.longest),
+        "priors": lambda: priors(*o.paths),
         "laps": lambda: laps(o.domain, o.paths[0], Path(o.paths[1])),
     }
     runs[o.what]()

@@ -105,12 +105,15 @@ class Vehicle:
         """How many scans of the report have voted or are lost; those after them still wait."""
         return self._frontend.done
 
-    def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
+    def observe(self, scan: Scan, prior: F64 | PosePrior | None = None) -> None:
         """One scan: localise, find what moves, see, vote. Its vote waits up to a second until it is known what moved.
+
+        ``prior``: T_map_lidar (4, 4), with the standard deviations of the vehicle's priors, or a prior with its own.
 
         Raises MapvoteError once the drive has ended.
         """
-        prior = None if T_map_lidar_prior is None else PosePrior(T_map_lidar_prior, *self._prior_sigmas)
+        if prior is not None and not isinstance(prior, PosePrior):
+            prior = PosePrior(prior, *self._prior_sigmas)
         self._vote(self._frontend.observe(scan, prior))
 
     def finish(self) -> None:
@@ -298,13 +301,14 @@ def vote_drive(
     report has its own again.
     """
     prior = drive.T_map_lidar_prior
-    mount = mount_of_prior(prior) if localise is None and prior is not None else None
+    states_attitude = prior is not None and drive.prior_sigmas is None
+    mount = mount_of_prior(prior) if localise is None and prior is not None and states_attitude else None
     if mount is not None:
         mount = mount.in_steps()
         drive = _upright(drive, mount)
     vehicle = vehicle_on(drive, point_map, settings, localise=localise)
     for i, scan in enumerate(drive):
-        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+        vehicle.observe(scan, PosePrior.of(drive, i))
         if progress:
             progress(i + 1, len(drive))
     vehicle.finish()
@@ -351,7 +355,7 @@ def vote_in_stretches(
     vehicle.drive_id = stretch_name(drive.drive_id, number)
     road = RoadDriven(cuts)
     for i, scan in enumerate(drive):
-        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+        vehicle.observe(scan, PosePrior.of(drive, i))
         if progress:
             progress(i + 1, len(drive))
         if road.is_full(vehicle.report, vehicle.done):

@@ -20,6 +20,8 @@ from mapvote.live.dds import Network, PublishedTopic
 from mapvote.live.messages import (
     CLOCK,
     CLOUD,
+    GNSS,
+    IMU,
     ODOMETRY,
     POSE,
     POSE_WITH_COVARIANCE,
@@ -347,3 +349,22 @@ def test_the_page_of_the_voice_says_nothing_while_nothing_lacks(tmp_path: Path) 
     assert lines == []
     voice.lacks("a LiDAR")
     assert lines == ["waiting: a LiDAR"]
+
+
+@pytest.mark.parametrize("on_earth", [True, False])
+def test_fixes_are_taken_if_no_pose_is_sent_and_the_map_has_a_place_on_earth(domain: int, on_earth: bool) -> None:
+    sender = Sender(domain, ("/points", CLOUD), ("/fix", GNSS), ("/imu", IMU))
+    network = Network(domain)
+    until(lambda: len(network.published()) == 3)
+    said = Said(9)
+    chosen = choose_topics(network, Wish(on_earth=on_earth), said.voice, lambda: False)
+    assert chosen is not None
+    if on_earth:
+        assert chosen.odometry is not None
+        assert chosen.imu is not None
+        assert (chosen.odometry.topic, chosen.imu.topic) == ("/fix", "/imu")
+        assert "begins with the fixes of /fix" in said.lines[0]
+    else:
+        assert (chosen.odometry, chosen.imu) == (None, None)
+        assert "begins without it" in said.lines[0]
+    del sender

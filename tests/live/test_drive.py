@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bag_recorder import START, Recorder
@@ -22,9 +23,12 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
 from mapvote.formats import open_drive, read_map, write_map
-from mapvote.live.messages import BASE_FRAME, CLOUD, ODOMETRY, TF
+from mapvote.formats.drives.frames import BASE_FRAME
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, TF
 from mapvote.live.play import cloud_message, frames_message, odometry_message
 from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
+from receiver_messages import fix_message, imu_message
 from streets import path, street, sweep, twist_of
 
 pytest.importorskip("cyclonedds")
@@ -102,6 +106,48 @@ def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_
     drive = f"--map {tmp_path}/map --vehicle car --name day --every-m 12"
     try:
         said = type_in(f"mapvote drive {drive} --idle 60 --out {tmp_path}/live --domain {domain}")
+    finally:
+        player.wait(120)
+    offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
+    ballots = {
+        folder: {f.name: f.read_bytes() for f in (tmp_path / folder).iterdir()} for folder in ("live", "offline")
+    }
+    assert f"{SCANS} of {SCANS} scans voted" in said, said + offline
+    assert len(ballots["live"]) >= 2
+    assert ballots["live"] == ballots["offline"], said + offline
+
+
+@pytest.mark.slow
+def test_a_vehicle_with_satellite_fixes_and_an_imu_alone_votes_with_every_scan_live_and_recorded_alike(
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fixes of 2 m at 1 Hz, whose heights count from an ellipsoid; an IMU at 50 Hz that does not know north."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    frame = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
+    noise = np.random.default_rng(4).normal(0.0, 2.0, (SCANS, 3))
+    recorder, poses = Recorder(tmp_path / "bag"), path(SCANS)
+    recorder.write_raw("/tf_static", TF, START, frames_message(START, {"lidar": np.eye(4)}))
+    for i, T in enumerate(poses):
+        ns = START + i * 100_000_000
+        for k in range(5):
+            at_ns = ns + k * 20_000_000
+            yaw_rad = float(np.arctan2(T[1, 0], T[0, 0])) + 1.0
+            recorder.write_raw("/imu", IMU, at_ns, imu_message(at_ns, yaw_rad))
+        if i % 10 == 0:
+            place = frame.to_lonlat((T[:3, 3] + noise[i] + [0.0, 0.0, 47.0])[None])[0]
+            recorder.write_raw("/fix", GNSS, ns, fix_message(ns, place, sigma_m=2.0))
+        scan = sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns)
+        recorder.write_raw("/lidar", CLOUD, ns, cloud_message(Scan(ns, scan.points), "lidar"))
+    recorder.bag.close()
+    town = replace(map_from_points(street(1)), georeference=frame.georeference())
+    write_map(town, tmp_path / "map")
+    for folder in ("live", "offline"):
+        (tmp_path / folder).mkdir()
+    play = f"play {tmp_path}/bag --domain {domain} --rate 0.2 --wait 600"
+    player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
+    drive = f"--map {tmp_path}/map --vehicle car --name day --sensor hdl32e --every-m 12"
+    try:
+        said = type_in(f"mapvote drive {drive} --odometry /fix --idle 60 --out {tmp_path}/live --domain {domain}")
     finally:
         player.wait(120)
     offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")

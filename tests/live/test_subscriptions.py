@@ -15,10 +15,11 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
+from mapvote.formats.drives.frames import matrix_of
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr, matrix_of
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.road_map import OneMap

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log
+from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, PosePrior
-from mapvote.formats.drives.rosbag import is_map_frame
+from mapvote.formats.drives.frames import is_map_frame
 from mapvote.matching.prior_frame import PriorFrame, distance_to
 from mapvote.vehicle import Vehicle
+from odometry_errors import odometry
 from streets import drive_along, path, street
 
 SCANS = 45
@@ -24,19 +24,6 @@ SCANS = 45
 @cache
 def town() -> PointMap:
     return map_from_points(street(1))
-
-
-def odometry(poses: F64, T_odom_start: F64, drift: float = 0.0) -> F64:
-    """(n, 4, 4) what odometry says of these poses: it begins at T_odom_start and drifts by a share of the road, and
-    turns a hundredth of that share each metre."""
-    out = [T_odom_start]
-    for before, after in pairwise(poses):
-        step = log(inverse(before) @ after)
-        road_m = np.linalg.norm(step[:3])
-        step[:3] *= 1.0 + drift
-        step[5] += 0.01 * drift * road_m
-        out.append(out[-1] @ exp(step))
-    return np.array(out)
 
 
 def drive(prior: F64 | None, poses: F64, *, in_map: bool = False) -> tuple[Vehicle, int, float]:

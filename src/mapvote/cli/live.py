@@ -83,7 +83,7 @@ def drive(
         str | None,
         typer.Option(
             metavar="TOPIC",
-            help="topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped), or /tf",
+            help="topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped), of fixes (NavSatFix), or /tf",
         ),
     ] = None,
     mount: Annotated[
@@ -143,6 +143,7 @@ def drive(
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
     from mapvote.formats.drives.point_times import TimeRules
+    from mapvote.formats.geo.frame import frame_of
     from mapvote.live.choice import Voice, Wish, choose_topics
     from mapvote.live.dds import Network
     from mapvote.live.messages import POSE_TOPIC
@@ -173,7 +174,6 @@ def drive(
     frames = [f"{topic}:={to}" for topic, to in (("/tf", tf), ("/tf_static", tf_static)) if to]
     names = ros_names(namespace, [*(remap or []), *frames])
     sim_time = sim_time_of(parameter or [])
-    wish = Wish(names.named("points", points), next(iter(names.named("odometry", odometry)), None), names)
     voice = Voice(lambda text: print(text, flush=True))
     model, network, stopped = None if sensor is None else read_sensor(sensor, "--sensor"), Network(domain), [False]
     heartbeat = Heartbeat()
@@ -187,13 +187,16 @@ def drive(
     with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
         warm_vehicle(plan.settings)
         heartbeat.ready()
+        on_earth = frame_of(maps.current().georeference)
+        odometry_topic = next(iter(names.named("odometry", odometry)), None)
+        wish = Wish(names.named("points", points), odometry_topic, names, not on_earth.is_local)
         chosen = choose_topics(network, wish, voice, ended, idle or math.inf)
         if chosen is None:
             return
         listened = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
         print(f"listening to {' and '.join(listened)}", flush=True)
         rules = TimeRules(motion_compensated, time_field)
-        topics = Subscriptions(network, chosen, model, names, sim_time=sim_time, rules=rules)
+        topics = Subscriptions(network, chosen, model, names, sim_time=sim_time, rules=rules, on_earth=on_earth)
         ros = RosStatus(network, vehicle, names.resolve(POSE_TOPIC))
         board = StatusBoard(maps, outbox)
         board.tell(1.0, ros.diagnose)

@@ -197,6 +197,9 @@ class Drive:
     """(n, 4, 4) what the vehicle believed (GNSS/INS), or None."""
     prior_sigma_m: float = 1.0
     prior_sigma_deg: float = 1.0
+    prior_sigmas: F64 | None = None
+    """(n, 2) standard deviations of priors by satellite fixes, metres in the plane and radians of heading; inf where a
+    scan has no prior. The two above are then their medians."""
     prior_in_map: bool = True
     """Whether the prior is in the map's frame; odometry in a frame of its own (REP 105: odom) is not."""
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
@@ -215,7 +218,7 @@ class Drive:
     def has_precise_prior(self) -> bool:
         """Whether its prior is a surveyor's."""
         good = self.prior_sigma_m <= PRECISE_PRIOR_M and self.prior_sigma_deg <= PRECISE_PRIOR_DEG
-        return self.T_map_lidar_prior is not None and good
+        return self.T_map_lidar_prior is not None and self.prior_sigmas is None and good
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -231,6 +234,9 @@ class PosePrior:
     T_map_lidar: F64
     sigma_m: float
     sigma_rad: float
+    is_planar: bool = False
+    """Whether place and heading in the plane alone are believed, as by satellite fixes: height, roll and pitch are not.
+    """
 
     def __post_init__(self) -> None:
         check_array(self.T_map_lidar, "T_map_lidar of the prior", (4, 4), np.float64)
@@ -240,12 +246,18 @@ class PosePrior:
         """The prior of scan ``i`` of ``drive``, if it has one."""
         if drive.T_map_lidar_prior is None:
             return None
+        if drive.prior_sigmas is not None:
+            sigma_m, sigma_rad = drive.prior_sigmas[i].tolist()
+            return cls(drive.T_map_lidar_prior[i], sigma_m, sigma_rad, True) if np.isfinite(sigma_m) else None
         return cls(drive.T_map_lidar_prior[i], drive.prior_sigma_m, float(np.radians(drive.prior_sigma_deg)))
 
     @property
     def information(self) -> F64:
-        """(6, 6) inverse covariance."""
-        return np.diag([self.sigma_m**-2] * 3 + [self.sigma_rad**-2] * 3)
+        """(6, 6) inverse covariance of (x, y, z, roll, pitch, yaw) in map axes."""
+        level = 0.0 if self.is_planar else 1.0
+        position = self.sigma_m**-2
+        rotation = self.sigma_rad**-2
+        return np.diag([position, position, level * position, level * rotation, level * rotation, rotation])
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import difflib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from mapvote.core.types import MapvoteError
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
-from mapvote.live.messages import CLOUD, ODOMETRY, POSE_TOPIC, POSES, TF
+from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
 from mapvote.live.names import RosNames
 
 
@@ -82,6 +82,8 @@ class Wish:
     odometry: str | None = None
     """Full name; None: the only one, if any comes."""
     names: RosNames = field(default_factory=RosNames)
+    on_earth: bool = True
+    """Whether the place of the map on Earth is known: without it, fixes of GNSS are of no use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,9 @@ class Chosen:
     points: tuple[PublishedTopic, ...]
     """The first LiDAR's is the one in whose frame scans are."""
     odometry: PublishedTopic | None
-    """A topic of poses."""
+    """A topic of poses, or of fixes."""
+    imu: PublishedTopic | None = None
+    """Headings beside fixes."""
 
 
 def choose_topics(
@@ -114,7 +118,8 @@ def choose_topics(
         settled = now_s - seen_s >= (WAITS.settle_s if not wish.points else 0.0)
         hopeless = wish.odometry is None and now_s - seen_s >= WAITS.odometry_s
         if len(clouds) >= max(len(wish.points), 1) and settled and (poses or hopeless):
-            return _only(clouds, poses or _moving_frames(published, wish), wish)
+            sources = poses or _fixes(published, wish) or _moving_frames(published, wish)
+            return _with_imu(_only(clouds, sources, wish), published, wish)
         voice.lacks(text)
         if text and now_s - start_s > limit_s:
             raise MapvoteError(text)
@@ -138,7 +143,20 @@ def _poses(published: Sequence[PublishedTopic], wish: Wish) -> list[PublishedTop
     """The topics of poses that the vehicle may use; of moving frames only the one that is named."""
     if wish.odometry is None:
         return _of_kinds(published, POSES, (), wish.names)
-    return _of_kinds(published, (*POSES, TF), (wish.odometry,), wish.names)
+    return _of_kinds(published, (*POSES, GNSS, TF), (wish.odometry,), wish.names)
+
+
+def _fixes(published: Sequence[PublishedTopic], wish: Wish) -> list[PublishedTopic]:
+    """The topics of fixes, which bound the place if no pose is sent."""
+    return _of_kinds(published, (GNSS,), (), wish.names) if wish.on_earth else []
+
+
+def _with_imu(chosen: Chosen, published: Sequence[PublishedTopic], wish: Wish) -> Chosen:
+    """The choice with the only IMU, where fixes need its headings."""
+    if chosen.odometry is None or chosen.odometry.kind != GNSS:
+        return chosen
+    imus = _of_kinds(published, (IMU,), (), wish.names)
+    return replace(chosen, imu=imus[0] if len(imus) == 1 else None)
 
 
 def _moving_frames(published: Sequence[PublishedTopic], wish: Wish) -> list[PublishedTopic]:
@@ -187,7 +205,13 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
 def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish) -> str:
     """What is missing of the topic of poses, and what to type."""
     if wish.odometry is not None:
-        return _lack_of(wish.odometry, (*POSES, TF), published, "--odometry")
+        return _lack_of(wish.odometry, (*POSES, GNSS, TF), published, "--odometry")
+    fixes = _fixes(published, wish)
+    if fixes:
+        return (
+            f"no {ODOMETRY} or other pose is sent. {WAITS.odometry_s:.0f} s after the first cloud the drive begins "
+            f"with the fixes of {fixes[0].topic}; or type --odometry {fixes[0].topic}"
+        )
     return (
         f"no {ODOMETRY} or other pose is sent. The drive begins without it {WAITS.odometry_s:.0f} s after the first "
         "cloud, and the whole map is searched; or start the odometry, or type --odometry TOPIC"

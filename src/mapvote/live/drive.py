@@ -18,22 +18,20 @@ import numpy as np
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.doctor import Finding, any_error, in_order
 from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
-from mapvote.formats.drives.trajectory import sorted_trajectory
-from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.drives.fixes import FIX_RULES, Fixes
 from mapvote.live.log_lines import Repeated
 from mapvote.live.outbox import Outbox
+from mapvote.live.priors import Priors, pose_in
 from mapvote.live.road_map import Maps
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
-_POSES, _FIXES = 20_000, 400
-"""Poses of odometry, and poses of scans that voted, that are kept at most."""
-_PAST_NS = 3 * 10**9
-"""Poses of odometry so much older than the oldest scan that waits are of no use."""
+_FIXES = 400
+"""Poses of scans that voted that are kept at most."""
 _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
 _CROWDED, _RELAXED = 30, 5
@@ -227,7 +225,8 @@ class LiveDrive:
         self.name, self.number = name, outbox.begin(name)
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
-        self._road, self._poses = RoadDriven(self._cuts), deque[tuple[int, F64]](maxlen=_POSES)
+        self._road = RoadDriven(self._cuts)
+        self._priors = Priors()
         self._waiting = deque[WaitingScan]()
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
@@ -257,11 +256,13 @@ class LiveDrive:
 
     def on_pose(self, time_ns: int, T_map_base: F64) -> None:
         """One pose of odometry in the map's frame, in any order."""
-        if self._poses and time_ns < self._poses[-1][0] - _BACK_NS:
-            back_s = 1e-9 * (self._poses[-1][0] - time_ns)
+        back_s = self._priors.add(time_ns, T_map_base)
+        if back_s:
             self._repeated("odometry", f"odometry's clock jumped back by {back_s:.1f} s")
-            self._poses.clear()
-        self._poses.append((time_ns, T_map_base))
+
+    def on_fixes(self, fixes: Fixes) -> None:
+        """The last fixes of the receiver, of which some may have come before."""
+        self._priors.fixes = fixes
 
     def on_scan(self, scan: WaitingScan) -> None:
         """One scan, as it arrives. It is left out if it is not later than the last one, or if too many wait."""
@@ -300,8 +301,7 @@ class LiveDrive:
         self.vehicle = None
         self._place = None
         self._observed.clear()
-        new_ns = self._last_ns + step_ns
-        self._poses = deque((p for p in self._poses if abs(p[0] - new_ns) < 10 * _BACK_NS), maxlen=_POSES)
+        self._priors.jump_to(self._last_ns + step_ns)
 
     def step(self, *, ended: bool = False) -> bool:
         """Vote with the oldest scan that waits, if its pose is known; returns whether there was one. If none waits, or
@@ -316,8 +316,7 @@ class LiveDrive:
         if not ready:
             return False
         waiting = self._waiting.popleft()
-        while len(self._poses) > 2 and self._poses[1][0] < waiting.stamp_ns - _PAST_NS:
-            self._poses.popleft()
+        self._priors.forget_before(waiting.stamp_ns)
         self._observe(waiting)
         self._thinning.cost(time.monotonic() - start)
         return True
@@ -360,8 +359,8 @@ class LiveDrive:
         """Whether a scan waits, and neither a pose later than it nor the map around it may still come."""
         if not self._waiting:
             return False
-        scan, newest = self._waiting[0], max((t for t, _ in self._poses), default=0)
-        unknown = newest < scan.stamp_ns or len(self._poses) < 2
+        scan = self._waiting[0]
+        unknown = not self._priors.covers(scan.stamp_ns)
         if self._with_poses and not ended and unknown and self._waiting[-1].stamp_ns - scan.stamp_ns < _PATIENCE_NS:
             return False
         if ended or self.vehicle is not None or len(self._waiting) > _CROWDED:
@@ -392,7 +391,7 @@ class LiveDrive:
             self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(self._cuts), 0
         vehicle = self.vehicle
         if self.first is not None:
-            self.checked_now = self.first.add(scan, prior, vehicle)
+            self.checked_now = self.first.add(scan, _sure_pose(prior), vehicle)
         self._observed.append((waiting.stamp_ns, waiting.sent_ns))
         self.counts.observed += 1
         vehicle.observe(scan, prior)
@@ -404,10 +403,11 @@ class LiveDrive:
         self._road, self._finished = RoadDriven(self._cuts), 0
         self._leave(vehicle.cut(stretch_name(self.name, self.number + 1), newest))
 
-    def _position(self, prior: F64 | None) -> F64 | None:
+    def _position(self, prior: F64 | PosePrior | None) -> F64 | None:
         """(3,) where the vehicle is by its last scan that has a place, while scans find theirs; else by its prior. None
         where neither says."""
-        by_prior = None if prior is None else self._in_map(prior)
+        T = pose_in(prior)
+        by_prior = None if T is None else self._in_map(T)
         if self._place is None or (self._is_lost and by_prior is not None):
             return None if by_prior is None else np.asarray(by_prior[:3, 3])
         return self._place
@@ -465,12 +465,11 @@ class LiveDrive:
         if self.first is None:
             self._release()
 
-    def _prior(self, time_ns: int) -> F64 | None:
-        if len(self._poses) >= 2:
-            times, T = zip(*self._poses, strict=True)
-            found = sorted_trajectory(np.array(times), np.stack(T), of_vehicle=True, frame=MapFrame())
-            try:
-                return np.asarray(found.at(np.array([time_ns]), "odometry")[0] @ self.T_base_lidar)
-            except MapvoteError:
-                pass
-        return None
+    def _prior(self, time_ns: int) -> F64 | PosePrior | None:
+        return self._priors.at(time_ns, self.T_base_lidar)
+
+
+def _sure_pose(prior: F64 | PosePrior | None) -> F64 | None:
+    """The pose of a prior whose heading is known; a fix alone has none that the doctor could examine."""
+    unsure = isinstance(prior, PosePrior) and prior.sigma_rad > FIX_RULES.known_rad
+    return None if unsure else pose_in(prior)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.drives.rosbag import pose_of_message
 from mapvote.formats.reading import first_line
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -26,7 +25,9 @@ POSES = (ODOMETRY, POSE_WITH_COVARIANCE, POSE)
 POSE_TOPIC = "mapvote/pose"
 """Where a vehicle publishes its own pose, below its namespace."""
 CLOCK = "rosgraph_msgs/msg/Clock"
-READ = {CLOUD, ODOMETRY, TF, "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "std_msgs/msg/Header", CLOCK}
+GNSS = "sensor_msgs/msg/NavSatFix"
+IMU = "sensor_msgs/msg/Imu"
+READ = {CLOUD, ODOMETRY, TF, IMU, GNSS, "std_msgs/msg/Header", CLOCK}
 READ |= {f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")}
 READ |= {
     f"geometry_msgs/msg/{name}{stamped}"
@@ -34,7 +35,8 @@ READ |= {
     for stamped in ("", "Stamped")
 }
 """Types of the topics that are counted and played."""
-MAP_FRAME, BASE_FRAME, LIDAR_FRAME = "map", "base_link", "lidar"
+MAP_FRAME = "map"
+LIDAR_FRAME = "lidar"
 _DATATYPES = {"<f4": 7, "<u2": 4}
 """Of a sensor_msgs/PointField."""
 _MAP_MSGS = "autoware_map_msgs"
@@ -155,12 +157,3 @@ def pose_of(T: F64) -> Any:
     q = message.orientation
     q.x, q.y, q.z, q.w = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
     return message
-
-
-def matrix_of(position: Any, orientation: Any) -> F64:
-    """T (4, 4) of a message's position and quaternion. MapvoteError if they are no pose."""
-    q = orientation
-    length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
-    if not np.isfinite([length, position.x, position.y, position.z]).all() or length < 0.5:
-        raise MapvoteError("numbers that are not finite, or a quaternion of zeros")
-    return pose_of_message(position, orientation)

@@ -18,10 +18,10 @@ from mapvote.core.geometry import inverse
 from mapvote.core.points import point_field
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
-from mapvote.formats.drives.rosbag import Bag, is_rosbag
+from mapvote.formats.drives.bag import Bag, is_rosbag
+from mapvote.formats.drives.frames import BASE_FRAME
 from mapvote.live.dds import Network, Publication
 from mapvote.live.messages import (
-    BASE_FRAME,
     CLOUD,
     LIDAR_FRAME,
     MAP_FRAME,

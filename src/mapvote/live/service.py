@@ -13,7 +13,7 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.drives.rosbag import is_map_frame
+from mapvote.formats.drives.frames import is_map_frame
 from mapvote.live.choice import WAITS, Voice
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
 from mapvote.live.messages import TF
@@ -68,7 +68,11 @@ def prepare(
     first_s = np.inf
     while not ended():
         topics.network.wait(_LOOP_S)
-        poses += topics.take_poses()
+        begun = topics.ways_begun
+        came = topics.take_poses()
+        if topics.ways_begun != begun:  # the poses before are in another frame
+            poses.clear()
+        poses += came
         scans += topics.take_scans()
         now_s = time.monotonic()
         if scans:
@@ -149,6 +153,7 @@ def run(
         if _mounted(live, topics, plan):
             for pose in poses:
                 live.on_pose(*pose)
+            live.on_fixes(topics.receiver.fixes())
         for clouds in scans:
             live.on_scan(topics.waiting(clouds))
         stepped = live.step()

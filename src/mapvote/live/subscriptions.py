@@ -15,15 +15,17 @@ import numpy as np
 
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.formats.drives.sensor_estimate import RING_RULE, UNKNOWN_SENSOR, estimate_sensor, rate_of_first
+from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.choice import Chosen
 from mapvote.live.dds import Network
 from mapvote.live.drive import WaitingScan
-from mapvote.live.frames import Frames
+from mapvote.live.fix_topics import FixTopics
 from mapvote.live.log_lines import Repeated
-from mapvote.live.messages import BASE_FRAME, CLOCK, CLOUD, TF, from_cdr, matrix_of, stamp_ns, time_ns
+from mapvote.live.messages import CLOCK, CLOUD, GNSS, IMU, MAP_FRAME, POSES, TF, from_cdr, stamp_ns, time_ns
 from mapvote.live.names import RosNames
 from mapvote.live.sweeps import Cloud, Packets, Sweeps
 
@@ -91,10 +93,11 @@ class Subscriptions:
         *,
         sim_time: bool = False,
         rules: TimeRules = TimeRules(),  # noqa: B008 - frozen
+        on_earth: MapFrame = MapFrame(),  # noqa: B008 - frozen
     ) -> None:
         """``sensor``: of the first LiDAR; None: it is measured in the first scans. ``names`` resolves tf, tf_static and
-        clock. ``sim_time``: the time is that of the clock's topic. ``rules``: what is stated of the
-        times of points."""
+        clock. ``sim_time``: the time is that of the clock's topic. ``rules``: what is stated of the times of points.
+        ``on_earth``: how the map lies on Earth, for fixes."""
         self.network, self.chosen, self.sensor = network, chosen, sensor
         self.names = names or RosNames()
         self.sensor_told = "stated" if sensor is not None else ""
@@ -104,6 +107,11 @@ class Subscriptions:
         """The frame that odometry tracks, and its parent."""
         self.clocks = Clocks()
         self.frames = Frames()
+        self.receiver = FixTopics(on_earth, self.frames)
+        self.odometry_frame = ""
+        """The frame in which poses are sent; ``map_frame`` is the one they are brought to."""
+        self.ways_begun = 0
+        """How often somebody began to publish where that frame lies in the map."""
         self.clouds = self.poses = self.unusable = 0
         """Clouds and poses that arrived; messages of any topic that cannot be used."""
         self.last_unusable = ""
@@ -116,6 +124,9 @@ class Subscriptions:
             [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
             for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
         )
+        self._imu = [
+            network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in [chosen.imu] if one
+        ]
         self.tf = self._frames_topic("tf")
         self.tf_static = self._frames_topic("tf_static")
         self._tf_static = network.subscribe(self.tf_static, TF, reliable=True, transient_local=True)
@@ -141,46 +152,61 @@ class Subscriptions:
         return self._clock_ns
 
     def take_poses(self) -> list[tuple[int, F64]]:
-        """Poses that arrived: stamps, and T_map_base."""
+        """Poses that arrived: stamps, and T_map_base. Fixes that arrived go to ``receiver``."""
         kind = "" if self.chosen.odometry is None else self.chosen.odometry.kind
+        if kind in POSES and not is_map_frame(self.odometry_frame):
+            self._take_moving_frames()
+        for _, data in (received for reader in self._imu for received in reader.take()):
+            with self._some_unusable(IMU):
+                self.receiver.add_imu(from_cdr(IMU, data))
         out: list[tuple[int, F64]] = []
         for sent_ns, data in (received for reader in self._odometry for received in reader.take()):
             with self._some_unusable(kind):
                 message = from_cdr(kind, data)
+                if kind == GNSS:
+                    self.receiver.add_fix(message)
+                    self.map_frame = MAP_FRAME
+                    self.poses += 1
+                    self.clocks.pose(sent_ns, stamp_ns(message.header), time.monotonic())
+                    continue
                 poses = self._poses_of_tf(message) if kind == TF else [self._pose_of(message)]
                 out += poses
-                for stamp_ns, _ in poses:
-                    self.clocks.pose(sent_ns, stamp_ns, time.monotonic())
+                for pose_ns, _ in poses:
+                    self.clocks.pose(sent_ns, pose_ns, time.monotonic())
         self.poses += len(out)
         return out
 
+    def _take_moving_frames(self) -> None:
+        for _, data in self._tf.take():
+            self._add_frames(data, fixed=False)
+
     def _pose_of(self, message: Any) -> tuple[int, F64]:
-        """Stamp and pose of an Odometry, a PoseStamped or a PoseWithCovarianceStamped. The last two do not name what
-        they track: it is base_link (REP 105) where the LiDAR sits on one."""
+        """Stamp and pose of an Odometry, a PoseStamped or a PoseWithCovarianceStamped, in the map where somebody
+        publishes where its frame lies there. The last two do not name what they track: it is base_link (REP 105) where
+        the LiDAR sits on one."""
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         T = matrix_of(pose.position, pose.orientation)
         named = getattr(message, "child_frame_id", "").strip("/")
         if not named and self.frames.between(BASE_FRAME, self.lidar_frames[0]) is not None:
             named = BASE_FRAME
         self.base_frame = named
-        self.map_frame = message.header.frame_id.strip("/")
-        return stamp_ns(message.header), T
+        self.odometry_frame = message.header.frame_id.strip("/")
+        way = None if is_map_frame(self.odometry_frame) else self.frames.T_map_of(self.odometry_frame)
+        if way is None:
+            self.map_frame = self.odometry_frame
+            return stamp_ns(message.header), T
+        root = self.frames.root(self.odometry_frame)
+        self.ways_begun += self.map_frame != root
+        self.map_frame = root
+        return stamp_ns(message.header), way @ T
 
     def _poses_of_tf(self, message: Any) -> list[tuple[int, F64]]:
         """The poses of the body that carries the first LiDAR, in the frame at the top of the tree."""
-        out = []
-        for transform in message.transforms:
-            self.frames.add(transform, fixed=False)
-            body = transform.child_frame_id.strip("/")
-            lidar = self.lidar_frames[0]
-            if not lidar or (body != lidar and self.frames.fixed(body, lidar) is None):
-                continue
-            self.base_frame = body
-            self.map_frame = self.frames.root(body)
-            T = self.frames.between(self.map_frame, body)
-            if T is not None:
-                out.append((stamp_ns(transform.header), T))
-        return out
+        poses = self.frames.poses_of_body(message, self.lidar_frames[0])
+        if poses:
+            self.base_frame = poses[-1].body
+            self.map_frame = poses[-1].root
+        return [(pose.stamp_ns, pose.T_root_body) for pose in poses]
 
     @contextmanager
     def _some_unusable(self, kind: str) -> Iterator[None]:
@@ -197,8 +223,7 @@ class Subscriptions:
         for _, data in self._tf_static.take():
             self._add_frames(data, fixed=True)
         if self.mounts() is None or self.T_base_lidar() is None:  # a joint that is fixed, but sent on /tf
-            for _, data in self._tf.take():
-                self._add_frames(data, fixed=False)
+            self._take_moving_frames()
         clouds: list[Cloud] = []
         for lidar, reader in enumerate(self._points):
             for sent_ns, data in reader.take():
@@ -223,8 +248,10 @@ class Subscriptions:
                 self.frames.add(transform, fixed=fixed)
 
     def T_base_lidar(self) -> F64 | None:
-        """(4, 4) the first LiDAR on what odometry tracks; the identity if both are one frame, or nobody names what
-        odometry tracks. None if no frames join the two."""
+        """(4, 4) the first LiDAR on what odometry tracks, or from the antenna of fixes; the identity if both are one
+        frame, or nobody names what odometry tracks. None if no frames join the two."""
+        if self.chosen.odometry is not None and self.chosen.odometry.kind == GNSS:
+            return self.receiver.T_antenna_lidar(self.lidar_frames[0])
         if self.base_frame in ("", self.lidar_frames[0]):
             return np.eye(4)
         return self.frames.between(self.base_frame, self.lidar_frames[0])

@@ -8,7 +8,7 @@ One km2 of streets has some 10^7 places and headings: seconds, so no branching a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError, Scan
 from mapvote.matching.coarse_search import COARSE_SEARCH, best_and_rival, distinct, place_without_prior
 from mapvote.matching.matcher import map_around
 from mapvote.matching.ndt_voxels import LEVELS
@@ -122,9 +122,41 @@ def laid_out(point_map: PointMap, numbers: GlobalSearchNumbers = GLOBAL_SEARCH) 
     # Cells on which a vehicle can stand: known ground, with no low obstacle in the cell or the four beside it.
     low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)
     r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
+    return CoarseMap(x0, y0, ground_z, words, _by_parity(_dilated(words)), 2 * r, 2 * c, _spans_of(r, c))
+
+
+def _spans_of(r: I64, c: I64) -> I64:
+    """(m, 3) as :class:`CoarseMap` has them, of places in row ``r`` (n,) and column ``c`` (n,) of every second cell,
+    row by row."""
     first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
-    spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
-    return CoarseMap(x0, y0, ground_z, words, _by_parity(_dilated(words)), 2 * r, 2 * c, spans)
+    return np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A circle in the map within which a place is searched for."""
+
+    x: float
+    y: float
+    radius_m: float
+
+    def holds(self, x: F64, y: F64) -> Bool:
+        """(n,) whether places, map metres, lie within."""
+        return np.asarray((x - self.x) ** 2 + (y - self.y) ** 2 <= self.radius_m**2)
+
+    def holds_pose(self, T_map: F64) -> bool:
+        """Whether a pose (4, 4) lies within."""
+        return bool(self.holds(T_map[:1, 3], T_map[1:2, 3])[0])
+
+
+def _within(lay: CoarseMap, bound: Bound, cell_m: float) -> CoarseMap:
+    """The map with the places within ``bound`` alone."""
+    x = lay.x0 + (lay.cols.astype(np.float64) + 0.5) * cell_m
+    y = lay.y0 + (lay.rows.astype(np.float64) + 0.5) * cell_m
+    inside = bound.holds(x, y)
+    rows = lay.rows[inside]
+    cols = lay.cols[inside]
+    return replace(lay, rows=rows, cols=cols, spans=_spans_of(rows // 2, cols // 2))
 
 
 def _by_parity(words: U32) -> U32:
@@ -287,25 +319,34 @@ class GlobalSearch:
     def _layout(self) -> CoarseMap:
         return laid_out(self.point_map, self.numbers)
 
-    def __call__(self, scan: Scan) -> F64 | None:
-        """The pose (4, 4) of the scan, or None if no place holds or another fits as well.
+    def __call__(self, scan: Scan, bound: Bound | None = None) -> F64 | None:
+        """The pose (4, 4) of the scan, or None if no place holds or another fits as well. ``bound``: no other place is
+        looked at.
 
         A map without ground has neither drivable squares nor heights above ground: there every shift and yaw of
         the scan is tried (matching/coarse_search.py), which takes some seconds for each square kilometre.
         """
         if not self._has_ground:
-            placed = place_without_prior(self._points, scan.points.astype(np.float64))
-            return (
-                placed.T_a_b
-                if placed.lead >= COARSE_SEARCH.min_lead and placed.score >= self.numbers.min_score
-                else None
-            )
-        place = self.find(scan)
+            return self._without_ground(scan, bound)
+        place = self.find(scan, bound)
         if place is None or place.fit < self.judge.check.min_fit or place.lead < self.judge.check.min_lead:
             return None
-        return place.T_map_lidar
+        return place.T_map_lidar if bound is None or bound.holds_pose(place.T_map_lidar) else None
 
-    def find(self, scan: Scan) -> Found | None:
+    def _without_ground(self, scan: Scan, bound: Bound | None) -> F64 | None:
+        """The place in a map without ground, by every shift and yaw of the scan."""
+        points = self._points
+        if bound is not None:
+            wide = replace(bound, radius_m=bound.radius_m + self.numbers.reach_m)
+            points = points[wide.holds(points[:, 0], points[:, 1])]
+            if len(points) < self.numbers.first:
+                return None
+        placed = place_without_prior(points, scan.points.astype(np.float64))
+        if placed.lead < COARSE_SEARCH.min_lead or placed.score < self.numbers.min_score:
+            return None
+        return placed.T_a_b if bound is None or bound.holds_pose(placed.T_a_b) else None
+
+    def find(self, scan: Scan, bound: Bound | None = None) -> Found | None:
         """The best place, however good it is; None if the scan has hardly a point above the ground, or the map no place
         like it."""
         numbers = self.numbers
@@ -323,18 +364,22 @@ class GlobalSearch:
         # The sensor's height over the ground, and the poses of the best peaks.
         below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
         sensor_m = -float(np.quantile(below, 0.05)) if len(below) else 1.8
-        best = sorted(self._peaks(xy, bits), key=lambda peak: -peak[0])[: numbers.refined]
+        lay = self._layout if bound is None else _within(self._layout, bound, numbers.cell_m)
+        if not len(lay.cols):
+            return None
+        best = sorted(self._peaks(lay, xy, bits), key=lambda peak: -peak[0])[: numbers.refined]
         return self._choose(scan, [self._pose(peak, sensor_m) for peak in best])
 
-    def _peaks(self, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
+    def _peaks(self, lay: CoarseMap, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
-        lay, numbers = self._layout, self.numbers
+        numbers = self.numbers
         yaws = np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws)
         check = self.judge.check
         hopeless = int(0.5 * check.min_fit * check.min_known * numbers.first)
         scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, numbers.first)
         likely = highest(scores.ravel(), 400 * numbers.peaks)
-        place, heading = likely // numbers.yaws, likely % numbers.yaws
+        place = likely // numbers.yaws
+        heading = likely % numbers.yaws
         x, y = lay.cols[place] + 0.5, lay.rows[place] + 0.5
         spread = numbers.peaks, numbers.spread_m, numbers.spread_rad
         kept = apart(x * numbers.cell_m, y * numbers.cell_m, yaws[heading], *spread)

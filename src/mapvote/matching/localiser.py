@@ -19,7 +19,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
-from mapvote.matching.global_search import GlobalSearch
+from mapvote.matching.global_search import Bound, GlobalSearch
 from mapvote.matching.matcher import map_around
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Fix, Tracker
@@ -56,6 +56,26 @@ class Localisation:
 LOCALISATION = Localisation()
 
 
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Which prior a track may start from, and how one that is too wide for it bounds the search."""
+
+    sure_m: float = 5.0
+    """A prior no wider than this is tried as a pose, metres; half of the farthest guess around it."""
+    sure_rad: float = 0.2
+    """The same for its heading, radians."""
+    sigmas: float = 3.0
+    """A wider one bounds the search of the map to so many of its standard deviations."""
+    beside_m: float = 5.0
+    """Width of the bound beside them, metres."""
+    bounded: int = 3
+    """Searches in turn within the bound that may fail before the whole map is searched."""
+
+
+START = Start()
+
+
 class Localise(Protocol):
     """Poses of scans. Scans go in, in order of time; fixes come out in the same order, some later."""
 
@@ -90,7 +110,12 @@ class Localiser:
     """
 
     def __init__(
-        self, point_map: PointMap, settings: Settings, sensor: Sensor, numbers: Localisation = LOCALISATION
+        self,
+        point_map: PointMap,
+        settings: Settings,
+        sensor: Sensor,
+        numbers: Localisation = LOCALISATION,
+        start: Start = START,
     ) -> None:
         self.numbers = numbers
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
@@ -98,6 +123,9 @@ class Localiser:
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
         self.prior_frame = PriorFrame()
+        self._start = start
+        self._failed_within = 0
+        """Searches in turn within a prior's bound that found no place."""
         self.misfit = np.zeros(3)
         """(3,) shift of trusted fixes from their priors lately, map metres."""
         self._waiting: deque[_Waiting] = deque()
@@ -113,10 +141,12 @@ class Localiser:
             nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
             self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None, prior, nowhere=True))
             return self._decide(max(0, len(self._waiting) - self.numbers.wait_scans), False)
+        believed = None
         if prior is not None:
             self._catch_leap(scan, prior)
-        usable = prior is not None and not self.prior_frame.is_unknown
-        fix = self.tracker.localise(scan, self._corrected(prior) if prior is not None and usable else None)
+            prior = self._at_height(prior)
+            believed = self._corrected(prior) if self._is_pose(prior) and not self._reverses(prior) else None
+        fix = self.tracker.localise(scan, believed)
         self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
         self._waiting.append(_Waiting(fix, misfit, prior))
@@ -140,7 +170,7 @@ class Localiser:
 
     def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
         """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
-        placed = prior is not None and not self.prior_frame.is_unknown
+        placed = prior is not None and self._is_pose(prior)
         homeless = not placed and self.tracker.last_pose is None
         self._unconfirmed = 0 if self._confirmed else self._unconfirmed + 1
         if not (homeless or self._unconfirmed >= self._next_search):
@@ -148,12 +178,48 @@ class Localiser:
         if self._unconfirmed < self._next_search and self._unconfirmed > 1:
             return False
         self._next_search = 2 * max(self._unconfirmed, self.numbers.first_search)
-        T_map_lidar = self.search(scan)
+        bound = self._bound(prior)
+        T_map_lidar = self.search(scan, bound)
+        self._failed_within = self._failed_within + 1 if T_map_lidar is None and bound is not None else 0
         if T_map_lidar is not None:
             self.tracker.move_to(T_map_lidar, scan.stamp_ns)
-            if prior is not None and self.prior_frame.is_far(prior, T_map_lidar):
+            has_frame = prior is not None and bound is None and not prior.is_planar
+            if prior is not None and has_frame and self.prior_frame.is_far(prior, T_map_lidar):
                 self._take_frame(prior, T_map_lidar)
         return T_map_lidar is not None or not homeless
+
+    def _is_pose(self, prior: PosePrior) -> bool:
+        """Whether the prior is sure enough to be tried as a pose of the scan; without a height only beside a track."""
+        if self.prior_frame.is_own and not prior.is_planar:
+            return True
+        if prior.is_planar and self.tracker.last_pose is None:
+            return False
+        sure = prior.sigma_m <= self._start.sure_m and prior.sigma_rad <= self._start.sure_rad
+        return sure and not self.prior_frame.is_unknown
+
+    def _bound(self, prior: PosePrior | None) -> Bound | None:
+        """The circle in which a prior that is no sure pose, or that knows no height, is searched for; None where the
+        whole map is searched."""
+        if prior is None or (self._is_pose(prior) and not prior.is_planar) or self.prior_frame.is_unknown:
+            return None
+        if self._failed_within >= self._start.bounded:
+            return None
+        x, y = prior.T_map_lidar[:2, 3].tolist()
+        return Bound(x, y, self._start.sigmas * prior.sigma_m + self._start.beside_m)
+
+    def _reverses(self, prior: PosePrior) -> bool:
+        """Whether the heading of fixes is more than a right angle off the track: the way driven then is backwards."""
+        last = self.tracker.last_pose
+        return prior.is_planar and last is not None and float(prior.T_map_lidar[:2, 0] @ last[:2, 0]) < 0.0
+
+    def _at_height(self, prior: PosePrior) -> PosePrior:
+        """The prior, at the height of the track where it knows none: satellites count heights from an ellipsoid, maps
+        mostly from the sea, which may differ by 100 m."""
+        if not prior.is_planar or self.tracker.last_pose is None:
+            return prior
+        T_map_lidar = prior.T_map_lidar.copy()
+        T_map_lidar[2, 3] = self.tracker.last_pose[2, 3]
+        return replace(prior, T_map_lidar=T_map_lidar)
 
     def _take_frame(self, prior: PosePrior, T_map_lidar: F64) -> None:
         """The prior is in a frame of its own: the scans that wait were taken where their priors lie in it."""
@@ -189,7 +255,7 @@ class Localiser:
 
     def _corrected(self, prior: PosePrior) -> PosePrior:
         """The prior in the map's frame, without its error of late, and no more certain than that error."""
-        if self.prior_frame.is_own:
+        if self.prior_frame.is_own and not prior.is_planar:
             return self.prior_frame.in_map(prior)
         T_map_lidar = prior.T_map_lidar.copy()
         T_map_lidar[:3, 3] += self.misfit
@@ -299,7 +365,7 @@ class Localiser:
                 self.misfit = self.misfit + self.numbers.memory * (waiting.misfit - self.misfit)
             if waiting.prior is not None and waiting.begun == self.prior_frame.begun:
                 self._place_prior(waiting)  # by all that was learnt before this scan
-                if fix.trusted:
+                if fix.trusted and not waiting.prior.is_planar and self._is_pose(waiting.prior):
                     self.prior_frame.learn(waiting.prior, fix.registration.T_map_lidar)
             if waiting.in_map is not None:
                 fix = replace(fix, prior=waiting.in_map)

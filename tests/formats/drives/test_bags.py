@@ -15,11 +15,12 @@ from scipy.spatial import cKDTree
 
 from bag_recorder import CLOUD, START, Recorder
 from mapvote.core import geometry
-from mapvote.core.types import F32, MapvoteError
+from mapvote.core.types import F32, MapvoteError, PosePrior
 from mapvote.formats import open_drive
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.messages import ODOMETRY, blank_message, header_of, to_cdr
+from mapvote.live.messages import GNSS, IMU, ODOMETRY, TF, blank_message, header_of, to_cdr
 from mapvote.live.play import odometry_message
+from receiver_messages import fix_message, imu_message, moving_frame
 
 N = 5
 STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * i for i in range(N)]
@@ -268,3 +269,60 @@ def test_a_choice_of_poses_and_a_mount_that_nobody_names_are_said(
     assert "join lidar to base_link" in caplog.messages[-1]
     assert open_drive(unjoined, sensor="hdl32e", prior="/wheels").T_map_lidar_prior is not None
     assert "taken for the LiDAR's own" in caplog.messages[-1]
+
+
+@pytest.mark.parametrize(("root", "in_map"), [("map", True), ("odom", False)])
+def test_a_bag_without_odometry_gives_the_pose_of_the_body_that_moves_on_tf(
+    tmp_path: Path, root: str, in_map: bool
+) -> None:
+    bag = Recorder(tmp_path / "bag")
+    bag.static({"lidar": MOUNT})
+    for i, ns in enumerate(STAMPS):
+        bag.cloud("/points", "lidar", ns, cloud(i))
+        T = geometry.from_xyz_rpy(2.0 * i, 1.0, 0.0, 0.0, 0.0, 0.1)
+        bag.write_raw("/tf", TF, ns, moving_frame(ns, root, "base_link", T))
+        bag.write_raw("/tf", TF, ns, moving_frame(ns, "base_link", "wheel", np.eye(4)))
+    bag.bag.close()
+    for options in ({"as_live": True}, {"prior": "/tf"}):
+        drive = open_drive(tmp_path / "bag", sensor="hdl32e", **options)
+        assert drive.T_map_lidar_prior is not None
+        assert np.allclose(drive.T_map_lidar_prior[2], geometry.from_xyz_rpy(4.0, 1.0, 0.0, 0.0, 0.0, 0.1) @ MOUNT)
+        assert drive.prior_in_map == in_map
+
+
+def test_odometry_is_brought_to_the_map_where_a_localiser_published_the_way_on_tf(tmp_path: Path) -> None:
+    T_map_odom = geometry.from_xyz_rpy(100.0, 50.0, 0.0, 0.0, 0.0, 0.6)
+    bag = Recorder(tmp_path / "bag")
+    bag.static({"lidar": MOUNT})
+    for i, ns in enumerate(STAMPS):
+        bag.write_raw("/tf", TF, ns - 1000, moving_frame(ns, "map", "odom", T_map_odom))
+        bag.write_raw("/wheels", ODOMETRY, ns, odometry_message(ns, geometry.from_xyz_rpy(float(i), 0.0, 0.0), "odom"))
+        bag.cloud("/points", "lidar", ns, cloud(i))
+    bag.bag.close()
+    drive = open_drive(tmp_path / "bag", sensor="hdl32e", as_live=True)
+    assert drive.prior_in_map
+    assert drive.T_map_lidar_prior is not None
+    assert np.allclose(drive.T_map_lidar_prior[3], T_map_odom @ geometry.from_xyz_rpy(3.0, 0.0, 0.0) @ MOUNT)
+
+
+def test_fixes_of_a_drive_that_votes_state_their_own_sigmas_and_know_no_later_fix(tmp_path: Path) -> None:
+    frame = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
+    bag = Recorder(tmp_path / "bag")
+    for i, ns in enumerate(STAMPS):
+        place = frame.to_lonlat(np.array([[1.5 * i, 0.0, 20.0]]))
+        bag.write_raw("/fix", GNSS, ns - 10**7, fix_message(ns - 10**7, place[0], sigma_m=0.02))
+        bag.write_raw("/imu", IMU, ns - 10**7, imu_message(ns - 10**7, 0.0, sigma_rad=0.01))
+        bag.cloud("/points", "lidar", ns, cloud(i))
+    bag.bag.close()
+    drive = open_drive(tmp_path / "bag", sensor="hdl32e", as_live=True, frame=frame)
+    assert drive.prior_sigmas is not None
+    assert drive.T_map_lidar_prior is not None
+    assert drive.prior_sigmas[0, 1] == pytest.approx(0.01, abs=0.002)
+    assert drive.prior_sigmas[-1, 0] < 0.1 < drive.prior_sigmas[0, 0]
+    assert drive.prior_sigma_m == pytest.approx(np.median(drive.prior_sigmas[:, 0]))
+    assert np.allclose(drive.T_map_lidar_prior[-1, :2, 3], [1.5 * len(STAMPS) - 1.35, 0.0], atol=0.05)
+    prior = PosePrior.of(drive, 1)
+    assert prior is not None
+    assert prior.is_planar
+    unplaced = open_drive(tmp_path / "bag", sensor="hdl32e", as_live=True)
+    assert unplaced.T_map_lidar_prior is None, "nobody knows where the map lies on Earth"

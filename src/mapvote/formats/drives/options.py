@@ -245,8 +245,10 @@ def make_drive(
     read_scan: Callable[[int, Sensor], Scan],
     frame: MapFrame = MapFrame(),  # noqa: B008 - frozen
     T_base_lidar: F64 | None = None,
+    prior_sigmas: F64 | None = None,
 ) -> Drive:
-    """A Drive of the chosen scans. ``stamps_ns`` (n,) and the prior (n, 4, 4) are of all scans of the files.
+    """A Drive of the chosen scans. ``stamps_ns`` (n,), the prior (n, 4, 4) and its sigmas (n, 2) are of all scans of
+    the files.
 
     ``frame``: where the prior's frame lies. ``T_base_lidar``: the format's own mount, unless another is given.
     The sensor is what the caller or drive.toml say, else it is measured in some of the scans.
@@ -270,6 +272,8 @@ def make_drive(
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
         sensor = replace(sensor, rate_hz=rate_hz)
     T_map_lidar = None if T_map_lidar_prior is None else T_map_lidar_prior[chosen]
+    sigmas = None if prior_sigmas is None else prior_sigmas[chosen]
+    sigma_m, sigma_deg = _usual_sigmas(options, sigmas)
     if options.motion_compensated is False and T_map_lidar is not None:
         sensor = turning_about(sensor, T_map_lidar, read_scan(int(chosen[len(chosen) // 2]), sensor))
 
@@ -281,12 +285,22 @@ def make_drive(
         stamps_ns=stamps_ns[chosen],
         read_scan=lambda i: read_scan(int(chosen[i]), sensor),
         T_map_lidar_prior=T_map_lidar,
-        prior_sigma_m=options.prior_sigma_m,
-        prior_sigma_deg=options.prior_sigma_deg,
+        prior_sigma_m=sigma_m,
+        prior_sigma_deg=sigma_deg,
+        prior_sigmas=sigmas,
         T_base_lidar=mount_of(options, T_base_lidar, where),
         georeference={} if frame.is_local else frame.georeference(),
         sensor_told=told,
     )
+
+
+def _usual_sigmas(options: DriveOptions, sigmas: F64 | None) -> tuple[float, float]:
+    """Standard deviations of a drive's priors in metres and degrees: the medians of ``sigmas`` (n, 2), metres and
+    radians, where the priors have their own, else those of the options."""
+    if sigmas is None or not np.isfinite(sigmas[:, 0]).any():
+        return options.prior_sigma_m, options.prior_sigma_deg
+    sigma_m, sigma_rad = np.median(sigmas[np.isfinite(sigmas[:, 0])], axis=0).tolist()
+    return sigma_m, float(np.degrees(sigma_rad))
 
 
 def _sensor_of(

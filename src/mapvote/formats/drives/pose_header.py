@@ -22,6 +22,7 @@ _ROLES = [
     ("down", "down"),
     ("latitude", "(?:.*_)?lat(?:itude)?"),
     ("longitude", "(?:.*_)?(?:lon|lng|long|longitude)"),
+    ("sigma", "(?:.*_)?(?:sigma|std|stddev|accuracy)(?:_(?:h|xy|horizontal|position))?"),
     ("status", "(?:.*_)?status"),
     ("nanoseconds", "(?:.*_)?(?:nsecs?|nanosecs?|nanoseconds)"),
     ("stamp", "header_stamp(?:_secs?|_seconds)?"),

@@ -125,7 +125,7 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
     _tell_unread(folder.files)
     reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
     own = folder.prior, folder.prior_name, folder.T_base_lidar
-    T_prior, frame = prior_of(path, options, folder.files, folder.stamps_ns, *own)
+    prior = prior_of(path, options, folder.files, folder.stamps_ns, *own)
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
         file = folder.files[i]
@@ -135,10 +135,11 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
         path,
         options,
         stamps_ns=folder.stamps_ns,
-        T_map_lidar_prior=T_prior,
+        T_map_lidar_prior=prior.T_map_lidar,
         read_scan=read_scan,
-        frame=frame,
+        frame=prior.frame,
         T_base_lidar=folder.T_base_lidar,
+        prior_sigmas=prior.sigmas,
     )
 
 

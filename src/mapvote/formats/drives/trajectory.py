@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.record import record
-from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.core.types import F64, I64, Bool, MapvoteError
+from mapvote.formats.drives.fixes import FIX_RULES, Fixes, fixes_of, priors_at
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
 from mapvote.formats.drives.point_fields import log
 from mapvote.formats.drives.pose_header import Column, find_header, is_number, split_row
@@ -188,6 +189,8 @@ class Trajectory:
     of_vehicle: bool
     frame: MapFrame
     """Where its map lies; local unless it came from latitudes and longitudes."""
+    fixes: Fixes | None = None
+    """The fixes that the poses were made of, where they came from a satellite receiver."""
 
     def at(self, stamps_ns: I64, where: str, rule: TrajectoryRule = TRAJECTORY_RULE) -> F64:
         """(m, 4, 4) at constant twist between two poses. MapvoteError if it does not cover the stamps without holes."""
@@ -244,9 +247,17 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
     if {"latitude", "longitude"} <= set(columns):
         place = np.column_stack([columns["longitude"], columns["latitude"], columns.get("z", zero)])
         keep, place = sound_fixes(str(file), place, columns.get("status"))
+        if {"qx", "qy", "qz", "qw"} <= set(columns):
+            rpy = _rpy_of_quaternions(needed(file, columns, "qx", "qy", "qz", "qw"))
         T, frame = poses_from_gnss(place, rpy[keep], frame)
-        T = T if {"yaw", "heading", "qw"} & set(columns) else yaw_from_track(T)
-        return sorted_trajectory(times_ns[keep], T, of_vehicle=True, frame=frame)
+        has_heading = bool({"yaw", "heading", "qw"} & set(columns))
+        T = T if has_heading else yaw_from_track(T)
+        trajectory = sorted_trajectory(times_ns[keep], T, of_vehicle=True, frame=frame)
+        # A whole pose without a standard deviation of its own is taken as it is.
+        if has_heading and "sigma" not in columns:
+            return trajectory
+        heading = rpy[keep, 2] if has_heading else None
+        return replace(trajectory, fixes=_fixes_of_table(times_ns[keep], place, columns, keep, heading, frame))
     position = needed(file, columns, "x", "y", "z")
     if {"qx", "qy", "qz", "qw"} <= set(columns):
         quaternions = needed(file, columns, "qx", "qy", "qz", "qw")
@@ -256,6 +267,28 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
     else:
         raise MapvoteError(f"{file}: no orientation: name columns qx, qy, qz, qw, or roll, pitch, yaw")
     return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
+
+
+def _fixes_of_table(
+    times_ns: I64, place: F64, columns: Mapping[str, F64], keep: Bool, yaw: F64 | None, frame: MapFrame
+) -> Fixes:
+    """The fixes of a table, with the standard deviations and headings that its columns state."""
+    order = np.unique(times_ns, return_index=True)[1]
+    covariances = np.full((len(order), 9), np.nan)
+    if "sigma" in columns:
+        covariances[:] = np.eye(3).ravel() * columns["sigma"][keep][order, None] ** 2
+    fixes = fixes_of(times_ns[order], place[order], covariances, frame)
+    if yaw is None:
+        return fixes
+    sigmas = np.full(len(order), FIX_RULES.unstated_heading_rad)
+    return fixes.with_headings(times_ns[order].tolist(), yaw[order].tolist(), sigmas.tolist())
+
+
+def _rpy_of_quaternions(rows: F64) -> F64:
+    """(n, 3) roll, pitch and yaw, radians, of rows qx, qy, qz, qw; zeros, which receivers write before they know their
+    attitude, have none."""
+    rows = np.where(np.linalg.norm(rows, axis=1, keepdims=True) > 0.5, rows, [0.0, 0.0, 0.0, 1.0])
+    return np.asarray(scipy.spatial.transform.Rotation.from_quat(rows).as_euler("ZYX")[:, ::-1])
 
 
 def _motions_of_quaternions(file: Path, rows: F64) -> F64:
@@ -342,7 +375,7 @@ _ANGLES = ("roll", "pitch", "yaw", "heading")
 
 def _scale(role: str, column: Column) -> float:
     """Metres, or radians, in one of a column; 1 of what has no unit, or none that its header names."""
-    return column.scale or 1.0 if role in ("x", "y", "z", "down", *_ANGLES) else 1.0
+    return column.scale or 1.0 if role in ("x", "y", "z", "down", "sigma", *_ANGLES) else 1.0
 
 
 def _in_degrees(file: Path, columns: Mapping[str, F64], unstated: Sequence[str]) -> bool:
@@ -450,6 +483,17 @@ def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any
     )
 
 
+class Prior(NamedTuple):
+    """The prior of a recorded drive."""
+
+    T_map_lidar: F64 | None = None
+    """(n, 4, 4) of every scan; None: there is none."""
+    frame: MapFrame = MapFrame()
+    """The frame that it is in."""
+    sigmas: F64 | None = None
+    """(n, 2) as :class:`mapvote.core.types.Drive` has it."""
+
+
 def prior_of(
     path: Path,
     options: DriveOptions,
@@ -458,23 +502,30 @@ def prior_of(
     own: Callable[[], Trajectory | F64 | None],
     own_name: str | None = None,
     T_base_lidar: F64 | None = None,
-) -> tuple[F64 | None, MapFrame]:
-    """(T_map_lidar of every scan (n, 4, 4), the frame they are in): the file that the options name, else prior.txt,
-    else the layout's own. ``files``: of the scans, which lines of a file are matched with by number."""
+) -> Prior:
+    """The prior of every scan: by the file that the options name, else prior.txt, else the layout's own. ``files``: of
+    the scans, which lines of a file are matched with by number."""
     said = options.prior
     if said is not None and said.lower() == "none":
-        return None, MapFrame()
+        return Prior()
     home = beside(path)
     places = (entry(home, "prior.txt"),) if said is None else () if said == own_name else (Path(said), home / said)
     file = next((place for place in places if place.is_file()), None)
     if file is None and said not in (None, own_name):
         raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")
     if file is not None and not has_times(file):
-        return of_scans(read_T_map_lidar(file, path), files, file), MapFrame()
+        return Prior(of_scans(read_T_map_lidar(file, path), files, file))
     poses = own() if file is None else read_trajectory(file, map_frame(options))
     if poses is None:
-        return None, MapFrame()
+        return Prior()
     if not isinstance(poses, Trajectory):
-        return of_scans(poses, files, path), MapFrame()
+        return Prior(of_scans(poses, files, path))
+    mount = mount_of(options, T_base_lidar, str(path))
+    # A vehicle on the road knows the fixes up to each scan alone; where the map lies on Earth, so does its recording.
+    if options.as_live and poses.fixes is not None and map_frame(options) is not None:
+        priors = priors_at(poses.fixes, stamps_ns, mount)
+        if priors is None:
+            raise MapvoteError(f"{file or path}: no fix comes within {FIX_RULES.old_s:g} s before any scan")
+        return Prior(priors[0], poses.frame, priors[1])
     T = poses.at(stamps_ns, str(file or path))
-    return (T @ mount_of(options, T_base_lidar, str(path)) if poses.of_vehicle else T), poses.frame
+    return Prior(T @ mount if poses.of_vehicle else T, poses.frame)

@@ -1,0 +1,143 @@
+"""An open bag: its topics, messages and fixed frames, read through the rosbags library (extra ``ros``)."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core import geometry
+from mapvote.core.extras import require
+from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
+from mapvote.formats.drives.frames import Edges, pose_of_message
+from mapvote.formats.drives.point_fields import livox_table, point_cloud_table
+from mapvote.formats.reading import first_line
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+LIVOX = "livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"
+"""Clouds of Livox's drivers: decoded points, each with its time."""
+CLOUDS = (CLOUD, *LIVOX)
+PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
+"""Parts of the names of messages in which drivers record what came over the wire."""
+TF = "tf2_msgs/msg/TFMessage"
+
+
+def is_rosbag(path: Path) -> bool:
+    """Whether a bag of any kind lies at ``path``."""
+    return is_bag(path) or is_bag_without_metadata(path)
+
+
+class Bag:
+    """An open bag. Closed when the drive that reads from it is gone."""
+
+    def __init__(self, path: Path) -> None:
+        reader = require("rosbags.highlevel", "ros", str(path))
+        stores = require("rosbags.typesys", "ros", str(path))
+        typestore = stores.get_typestore(stores.Stores.LATEST)
+        files = bag_files(path)
+        try:
+            self.reader = reader.AnyReader(files.paths, default_typestore=typestore)
+            self.reader.open()
+        except Exception as error:  # rosbags lets through what its storages raise
+            raise MapvoteError(
+                f"{path}: not a readable bag ({first_line(error)}); was the recording stopped properly? Try: "
+                f"{mend_of(path)}"
+            ) from error
+        weakref.finalize(self, self.reader.close)
+        self.path = path
+        self.mended = files.mended
+        """What is wrong with its files, and is read nevertheless."""
+
+    def decode(self, connection: Any, data: bytes) -> Any:
+        """A serialised message; MapvoteError if it is damaged."""
+        try:
+            return self.reader.deserialize(data, connection.msgtype)
+        except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
+            raise MapvoteError(
+                f"{self.path}: {connection.topic}: a message is damaged ({first_line(error)}); copy the bag again"
+            ) from error
+
+    def topics(self, *types: str) -> dict[str, int]:
+        """Topics of these message types, with their number of messages."""
+        return {name: t.msgcount for name, t in sorted(self.reader.topics.items()) if t.msgtype in types}
+
+    def raw(self, topic: str, **window: int) -> Iterator[tuple[Any, int, bytes]]:
+        """(connection, receive time ns, bytes) one by one; ``start``, ``stop`` bound the receive time."""
+        connections = [c for c in self.reader.connections if c.topic == topic]
+        try:
+            yield from self.reader.messages(connections=connections, **window)
+        except MapvoteError:
+            raise
+        except Exception as error:  # whatever zstd, lz4, sqlite and struct raise
+            raise MapvoteError(
+                f"{self.path}: {topic}: damaged ({type(error).__name__}: {first_line(error)}); copy it again"
+            ) from error
+
+    def messages(self, topic: str, **window: int) -> Iterator[tuple[int, Any]]:
+        """(receive time ns, message) one by one."""
+        for connection, time_ns, data in self.raw(topic, **window):
+            yield time_ns, self.decode(connection, data)
+
+    def points(self, where: str, connection: Any, data: bytes) -> NDArray[np.void]:
+        """The points (n,) of a serialised PointCloud2 or CustomMsg, with their fields."""
+        if connection.msgtype in LIVOX:
+            return livox_table(where, data, ros2=self.reader.is2)
+        return point_cloud_table(where, self.decode(connection, data))
+
+    def frame_id(self, data: bytes) -> str:
+        """The frame in the header of a serialised message, without reading the rest."""
+        order = "<" if not self.reader.is2 or data[1] & 1 else ">"
+        length = struct.unpack_from(f"{order}I", data, 12)[0] if len(data) >= 16 else 0
+        return bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+
+    def stamp_ns(self, data: bytes) -> int:
+        """The stamp in the header of a serialised message, without reading the rest."""
+        order = "<" if not self.reader.is2 or data[1] & 1 else ">"
+        if len(data) < 12:
+            raise MapvoteError(f"{self.path}: a message of {len(data)} bytes has no header; copy the bag again")
+        seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def stamps_of(bag: Bag, topic: str) -> I64:
+    """(n, 2) the stamp in the header and the time of receipt of every message, nanoseconds, as received."""
+    rows = [(bag.stamp_ns(data), received_ns) for _, received_ns, data in bag.raw(topic)]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:
+    """The frame of a topic's first message; ``child``: what an Odometry tracks, "" where the message does not say."""
+    if child:
+        return next((str(getattr(m, "child_frame_id", "")).strip("/") for _, m in bag.messages(topic)), "")
+    return next((bag.frame_id(data).strip("/") for _, _, data in bag.raw(topic)), "")
+
+
+def static_frames(bag: Bag) -> Edges:
+    """From each frame of /tf_static to its neighbours, with T_frame_neighbour (4, 4), both ways."""
+    edges: Edges = {}
+    for topic in bag.topics(TF):
+        if not topic.endswith("tf_static"):
+            continue
+        for _, message in bag.messages(topic):
+            for t in message.transforms:
+                T = matrix_in(bag, topic, t.transform.translation, t.transform.rotation)
+                parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
+                edges.setdefault(parent, []).append((child, T))
+                edges.setdefault(child, []).append((parent, geometry.inverse(T)))
+    return edges
+
+
+def matrix_in(bag: Bag, topic: str, p: Any, q: Any) -> F64:
+    """T (4, 4) of the position and quaternion of a message. MapvoteError names the topic where they are no pose."""
+    if not np.any([q.x, q.y, q.z, q.w]):
+        raise MapvoteError(
+            f"{bag.path}: {topic} holds a quaternion of zeros, which is no rotation: mend who writes it, or choose "
+            f"another topic (poses: --prior TOPIC or --prior none; LiDARs: --topic)"
+        )
+    return pose_of_message(p, q)
