@@ -17,6 +17,7 @@ from mapvote.core.grid import TileIndex
 from mapvote_server.store.integrity import tiles_hurt_or_mended
 from mapvote_server.store.policy import RoundPolicy
 from mapvote_server.store.queries import newest_seq, tiles_set_between, version_of
+from mapvote_server.store.retention import cleared_since
 from mapvote_server.store.votes import Electorate, next_ripe_ns, standing_tiles
 from mapvote_server.work import check_time
 
@@ -56,13 +57,13 @@ class KeptTiles(Generic[Found]):
     def refresh(
         self, connection: sa.Connection, asked: Electorate, now_ns: int, look: Callable[[TileIndex], Found | None]
     ) -> None:
-        """Look at every tile that an event touched since the last time; at all of them at first, and under another
-        policy."""
+        """Look at every tile that an event touched since the last time; at all of them at first, under another policy,
+        and once ballots were cleared away."""
         last, newest = self._moment, version_of(connection).number
         rules = asked.policy.fuse, asked.policy.round
         moment = _Moment(newest_seq(connection), newest, rules, next_ripe_ns(connection, asked))
         ripe = last is not None and last.until_ns is not None and now_ns >= last.until_ns
-        if last is None or last.rules != moment.rules or ripe:
+        if last is None or last.rules != moment.rules or ripe or cleared_since(connection, last.mark):
             self._unread = {*self.found, *standing_tiles(connection, moment.mark)}
         elif last.mark != moment.mark:
             self._unread |= {*standing_tiles(connection, moment.mark, last.mark)}

@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.store import schema
-from mapvote_server.store.database import MOST_ASKED
+from mapvote_server.store.database import MOST_ASKED, Question
 from mapvote_server.store.policy import Policy, policy_in
 from mapvote_server.store.queries import (
     current_number,
@@ -26,6 +26,9 @@ from mapvote_server.store.queries import (
     version_of,
 )
 from mapvote_server.store.store import Store
+
+CLEARED = "cleared"
+"""The kind of the event by which something was deleted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +64,7 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         if dry_run or not (versions or old_planes or old_ballots or old_decisions):
             return found
         detail = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
-        seq = log_event(connection, store.clock(), "cleared", by, detail)
+        seq = log_event(connection, store.clock(), CLEARED, by, detail)
         connection.execute(v.update().where(gone).values(cleared_seq=seq))
         _delete(connection, schema.decisions, ("version", "row", "col"), old_decisions)
         _delete(connection, schema.ballot_tiles, ("row", "col", "ballot"), old_ballots)
@@ -70,6 +73,19 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         empty = (b.c.bytes > 0) & ~sa.exists().where(t.c.ballot == b.c.seq)
         connection.execute(b.update().where(empty).values(bytes=0))
     return found
+
+
+def cleared_since(connection: sa.Connection, seq: int) -> bool:
+    """Whether anything was deleted after an event."""
+    return _CLEARED.ask(connection, seq=seq).first() is not None
+
+
+_E = schema.events.c
+_CLEARED = Question(
+    sa.select(_E.seq)
+    .where(_E.kind == sa.literal(CLEARED), _E.seq > sa.bindparam("seq", type_=sa.BigInteger))
+    .limit(sa.literal_column("1"))
+)
 
 
 def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
