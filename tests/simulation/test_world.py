@@ -156,3 +156,27 @@ def test_ar1_errors_have_their_deviation_and_their_memory() -> None:
     np.testing.assert_allclose(errors.std(axis=0), [0.1, 2.0], rtol=0.05)
     later = round(DRIVE_PLAN.memory_s / 0.1)
     assert np.corrcoef(errors[:-later, 0], errors[later:, 0])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.05)
+
+
+def test_what_hangs_over_a_street_stays_and_nothing_of_it_reaches_the_ground_or_a_house_that_goes() -> None:
+    world = make_world(load_scenario("overhead"), 4)
+    hanging = [body for body in world.bodies if body.kind in ("wire", "bridge", "board", "crown")]
+    assert [sum(body.kind == kind for body in hanging) for kind in ("wire", "bridge", "board", "crown")] == [8, 6, 8, 4]
+    assert {body.role for body in hanging} == {Role.KEPT}
+    for body in hanging:
+        lowest = body.triangles.reshape(-1, 3)[body.triangles[..., 2].argmin()]
+        assert lowest[2] > world.terrain.height(lowest[0], lowest[1]) + 4.0
+    gone = [body.triangles for body in world.bodies if body.role == Role.REMOVED]
+    assert len(gone) == 4
+    for crown, house in zip((body.triangles for body in hanging if body.kind == "crown"), gone, strict=True):
+        assert crown[..., 2].min() > house[..., 2].max() + 1.0, "a crown begins a metre above the house below it"
+
+
+def test_a_street_without_overhead_is_laid_out_as_if_there_were_no_such_thing() -> None:
+    plain, hung = (load_scenario("overhead", {"overhead": {"wire_m": metres}}) for metres in ((), (10.0,)))
+    one = make_world(plain, 4).bodies
+    other = make_world(hung, 4).bodies
+    across = [k for k, body in enumerate(other) if body.kind == "wire" and np.ptp(body.triangles[..., 1]) > 30.0]
+    assert len(across) == 1
+    rest = [body for k, body in enumerate(other) if k not in across]
+    assert all((a.triangles == b.triangles).all() for a, b in zip(one, rest, strict=True))

@@ -29,7 +29,8 @@ Scenario = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="street570, as_published, clear, street, slanted, junction, terrace, half_gone, corner, or a TOML file",
+        help="street570, as_published, clear, street, slanted, junction, terrace, half_gone, overhead, corner, or a "
+        "TOML file",
     ),
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="seed of layout, clutter, traffic and noise")]

@@ -31,7 +31,18 @@ from mapvote.fusion.change_time import denied_last, doubtful, lately_changed, re
 from mapvote.fusion.copies import Copy, liars_among, originals, without
 from mapvote.fusion.distrust import contradictors, deniers
 from mapvote.fusion.edit import EditVotes, add_points, delete_points, words_gone
-from mapvote.fusion.gravity import Fallen, Remains, fall_across, fall_within, remains_of, remains_without_votes
+from mapvote.fusion.gravity import (
+    FALLING,
+    GRAVITY,
+    Fallen,
+    Falling,
+    Gravity,
+    Remains,
+    fall_across,
+    fall_within,
+    remains_of,
+    remains_without_votes,
+)
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled, without_spilled_in
 from mapvote.fusion.tile_vote import TileVote, by_voter, newest_votes, offered, one_each, silenced
@@ -119,20 +130,17 @@ def fuse_tile(
     settings: FuseSettings,
     version: int = 0,
     history: History | None = None,
-    *,
-    reviewed: Bool | None = None,
-    fallen: Fallen | None = None,
+    falling: Falling = FALLING,
 ) -> tuple[Decision, Tile]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
     tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
-    it. ``reviewed`` (256, 256): cells of changes that a reviewer holds or rejected, from which nothing falls.
-    ``fallen``: what falls besides, as its neighbours decide. The rest as in :func:`decide_tile`.
+    it. ``falling``: what decides besides the votes which groups fall. The rest as in :func:`decide_tile`.
     """
     decided = decide_tile(tile, drives, rule, settings, history)
     gone, edit_votes = deletions(tile, decided)
     edited, added, deleted = _edit(tile, decided.votes, decided.edits, decided.quorum, gone)
     if not rule.undetermined_competes:
-        decided, edited, more = _let_fall(decided, tile, edited, reviewed, fallen)
+        decided, edited, more = _let_fall(decided, tile, edited, falling)
         deleted += more
     if edited is not tile:
         changed = np.flatnonzero(differing(tile, edited))
@@ -212,19 +220,18 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int, gone: 
     return _learn_free(edited, votes, quorum, points_added=added > 0), added, deleted
 
 
-def _let_fall(
-    decided: Decision, tile: Tile, edited: Tile, reviewed: Bool | None, fallen: Fallen | None
-) -> tuple[Decision, Tile, int]:
+def _let_fall(decided: Decision, tile: Tile, edited: Tile, falling: Falling) -> tuple[Decision, Tile, int]:
     """(the decision, the tile ``edited`` by votes, without what falls, how many points that were)."""
     # From cells whose change waits nothing falls.
-    waiting = [np.flatnonzero(cells) for cells in (decided.denied, reviewed) if cells is not None]
+    waiting = [np.flatnonzero(cells) for cells in (decided.denied, falling.reviewed) if cells is not None]
     waits = np.unique(np.concatenate([decided.pending.cells, *waiting]))
     decided = replace(decided, waits=waits)
-    if edited.points is tile.points and fallen is None:
+    if edited.points is tile.points and falling.fallen is None:
         return decided, edited, 0
-    left = remains_of(tile, edited, decided.edits, waits)
-    fell, missing = fall_within(tile.index, left)
-    fell = fell if fallen is None else fell.joined(fallen)
+    # What falls by this tile alone, and what the tiles around decide.
+    left = remains_of(tile, edited, decided.edits, waits, gravity=falling.gravity)
+    fell, missing = fall_within(tile.index, left, falling.gravity)
+    fell = fell if falling.fallen is None else fell.joined(falling.fallen)
     decided = replace(decided, undecided=left if missing else None)
     return _without(fell, decided, tile, edited, left) if len(fell.cells) else (decided, edited, 0)
 
@@ -396,7 +403,7 @@ def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np
 
 
 def update_map(
-    point_map: PointMap, ballots: Iterable[Ballot], settings: FuseSettings
+    point_map: PointMap, ballots: Iterable[Ballot], settings: FuseSettings, gravity: Gravity = GRAVITY
 ) -> tuple[PointMap, dict[TileIndex, Decision]]:
     """Fuse a round of ballots and edit the map: (updated map, decisions by tile). Untouched tiles are the same objects.
 
@@ -413,20 +420,21 @@ def update_map(
     def fuse(index: TileIndex, fallen: Fallen | None = None) -> None:
         tile = point_map.tile(index)
         votes = [unspent(vote, tile) for vote in newest_votes(_votes_on(index, unique), settings)]
-        decisions[index], edited = fuse_tile(tile, votes, rule, settings, version, fallen=fallen)
+        falling = Falling(fallen=fallen, gravity=gravity)
+        decisions[index], edited = fuse_tile(tile, votes, rule, settings, version, falling=falling)
         if edited is not tile:
             changed[index] = edited
 
     def remains_at(index: TileIndex) -> Remains:
         tile, decided = point_map.tile(index), decisions.get(index)
         if decided is None:
-            return remains_without_votes(tile)
-        return remains_of(tile, changed.get(index, tile), decided.edits, decided.waits, decided.fell)
+            return remains_without_votes(tile, gravity)
+        return remains_of(tile, changed.get(index, tile), decided.edits, decided.waits, decided.fell, gravity)
 
     for index in sorted({tile.tile for ballot in unique.values() for tile in ballot.tiles}):
         fuse(index)
     undecided = {index: one.undecided for index, one in decisions.items() if one.undecided is not None}
-    for index, fallen in fall_across(undecided, remains_at).items():
+    for index, fallen in fall_across(undecided, remains_at, gravity).items():
         tile = point_map.tile(index)
         after_fall = None
         if index in undecided:

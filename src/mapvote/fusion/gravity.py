@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import I32, I64, NO_VOTE, U8, U64, Bool, CellState, read_only
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class Gravity:
     """When a group falls."""
@@ -40,7 +42,7 @@ class Gravity:
     ground_voxels: int = 7
     """So many of the lowest voxels of a column hold; bit 0 holds the ground, so they reach 1.8 to 2.1 m above it."""
     longest_cells: int = 250
-    """A group that spans more rows or columns stays, cells: 75 m."""
+    """A group that spans more rows or columns stays, cells: 75 m; 0: nothing falls."""
     longest_object_cells: int = 500
     """An object that spans more rows or columns has no inside, cells: 150 m. So two tiles in each direction show all
     that decides about one tile."""
@@ -67,14 +69,16 @@ class Remains:
     """Lattice layer of bit 0 of each column."""
 
 
-def remains_of(before: Tile, after: Tile, states: U8, kept: I64, fell: Fallen | None = None) -> Remains:
+def remains_of(
+    before: Tile, after: Tile, states: U8, kept: I64, fell: Fallen | None = None, gravity: Gravity = GRAVITY
+) -> Remains:
     """The remains of a tile ``before`` and ``after`` its edit by ``states`` (256, 256).
 
     ``kept`` (n,): flat cells that hold, whatever their state. ``fell``: what went by gravity, not by votes. A tile
     without known ground has no beginning of columns: all of it holds.
     """
     rest = after.obstacle_words
-    near_ground = (1 << GRAVITY.ground_voxels) - 1 if after.has_ground else (1 << 64) - 1
+    near_ground = (1 << gravity.ground_voxels) - 1 if after.has_ground else (1 << 64) - 1
     holds = rest & np.uint64(near_ground)
     stands = (states == int(CellState.UNCHANGED_OCCUPIED)) | (states == int(CellState.CHANGED_OCCUPIED))
     holds[stands] = rest[stands]
@@ -86,10 +90,10 @@ def remains_of(before: Tile, after: Tile, states: U8, kept: I64, fell: Fallen | 
     return Remains(rest, holds, deleted, after.base)
 
 
-def remains_without_votes(tile: Tile) -> Remains:
+def remains_without_votes(tile: Tile, gravity: Gravity = GRAVITY) -> Remains:
     """The remains of a tile of which no vehicle votes."""
     silent = np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8)
-    return remains_of(tile, tile, silent, np.empty(0, np.int64))
+    return remains_of(tile, tile, silent, np.empty(0, np.int64), gravity=gravity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +133,18 @@ class Fallen:
         return Fallen.of(words, beside)
 
 
+@dataclass(frozen=True, slots=True)
+class Falling:
+    """All but the votes that decides what falls in a tile."""
+
+    reviewed: Bool | None = None
+    """(256, 256) cells of changes that a reviewer holds or rejected, from which nothing falls."""
+    fallen: Fallen | None = None
+    """What falls besides, as the tiles around decide."""
+    gravity: Gravity = GRAVITY
+
+
+FALLING = Falling()
 _NOWHERE = np.iinfo(np.int64).max
 _HALF = 1 << 31
 
@@ -143,23 +159,25 @@ def lattice_cell(key: int) -> tuple[int, int]:
     return key >> 32, (key & 0xFFFFFFFF) - _HALF
 
 
-def fall_within(index: TileIndex, left: Remains) -> tuple[Fallen, frozenset[TileIndex]]:
+def fall_within(index: TileIndex, left: Remains, gravity: Gravity = GRAVITY) -> tuple[Fallen, frozenset[TileIndex]]:
     """(what falls in one tile whatever lies around it, the tiles without which more cannot be decided)."""
     rows, cols = (np.flatnonzero(left.deleted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return Fallen.none(), frozenset()
     # What falls has a voxel in the box around all that was deleted, or a little beyond.
-    margin = 2 * GRAVITY.reach_cells + GRAVITY.touch_voxels + 1
+    margin = 2 * gravity.reach_cells + gravity.touch_voxels + 1
     within = min(rows[0], cols[0]) >= margin and max(rows[-1], cols[-1]) < TILE_CELLS - margin
     box = slice(rows[0] - margin, rows[-1] + margin + 1), slice(cols[0] - margin, cols[-1] + margin + 1)
     if within and not (left.rest[box] & ~left.holds[box]).any():
         return Fallen.none(), frozenset()
-    fallen, missing = _fall_in(index, {index: left})
+    fallen, missing = _fall_in(index, {index: left}, gravity)
     return fallen.get(index, Fallen.none()), missing
 
 
 def fall_across(
-    undecided: Mapping[TileIndex, Remains], remains_at: Callable[[TileIndex], Remains]
+    undecided: Mapping[TileIndex, Remains],
+    remains_at: Callable[[TileIndex], Remains],
+    gravity: Gravity = GRAVITY,
 ) -> dict[TileIndex, Fallen]:
     """What falls besides, by tile.
 
@@ -171,7 +189,7 @@ def fall_across(
         sites, missing = {index: undecided[index]}, frozenset({index})
         found: dict[TileIndex, Fallen] = {}
         while missing:
-            found, missing = _fall_in(index, sites)
+            found, missing = _fall_in(index, sites, gravity)
             sites |= {tile: undecided[tile] if tile in undecided else remains_at(tile) for tile in missing}
         for tile, more in found.items():
             fallen[tile] = fallen[tile].joined(more) if tile in fallen else more
@@ -179,7 +197,7 @@ def fall_across(
 
 
 def _fall_in(
-    index: TileIndex, sites: Mapping[TileIndex, Remains], gravity: Gravity = GRAVITY
+    index: TileIndex, sites: Mapping[TileIndex, Remains], gravity: Gravity
 ) -> tuple[dict[TileIndex, Fallen], frozenset[TileIndex]]:
     """(what falls by the deletions of tile ``index`` as far as ``sites`` show, the tiles that are missing)."""
     window = _Window.of(sites)

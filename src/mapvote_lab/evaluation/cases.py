@@ -29,6 +29,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteError
 from mapvote.core.voting import one_hot, plurality, to_wire
 from mapvote.fusion.fuse import states_over, update_map
+from mapvote.fusion.gravity import GRAVITY, Gravity
 from mapvote.perception.frontend import Observation
 from mapvote.rules.paper import read, reading_table, readings_of, sightings
 from mapvote_lab.evaluation.scores import Scores, score_cells
@@ -108,12 +109,17 @@ def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
 
 
 def fuse_case(
-    point_map: PointMap, ballots: Sequence[Ballot], min_votes: int, fuse: FuseSettings, window: Grid
+    point_map: PointMap,
+    ballots: Sequence[Ballot],
+    min_votes: int,
+    fuse: FuseSettings,
+    window: Grid,
+    gravity: Gravity = GRAVITY,
 ) -> CaseOutcome:
     """The server's side of one case (paper IV): decide every cell, edit the map."""
     start = time.perf_counter()
     settings = fuse.model_copy(update={"min_votes": min_votes})
-    updated, decisions = update_map(point_map, ballots, settings)
+    updated, decisions = update_map(point_map, ballots, settings, gravity)
     seconds = time.perf_counter() - start
     states, grid = states_over(point_map.lattice, decisions)
     own = [lay_on(*ballot_states(ballot, point_map), window) for ballot in ballots]

@@ -70,6 +70,18 @@ class Flaws(_Table):
     range_sigma_m: float | None = Field(default=None, ge=0, description="range noise; None: that of the sensor's model")
 
 
+class Overhead(_Table):
+    """What hangs over the street (simulation/overhead.py), metres along it; none of it by default."""
+
+    wire_m: tuple[float, ...] = Field(default=(), description="three wires across, from facade to facade")
+    bridge_m: tuple[float, ...] = Field(default=(), description="a foot-bridge across, its piers out of sight")
+    board_m: tuple[float, ...] = Field(default=(), description="a board before the facades, on both sides")
+    over_demolished: bool = Field(
+        default=False,
+        description="over each house that goes: a crown, a wire, a viaduct, their support out of sight",
+    )
+
+
 class Scenario(_Table):
     """A street, what changes on it, who drives there and what they carry."""
 
@@ -103,6 +115,7 @@ class Scenario(_Table):
     traffic: TrafficDensity = TrafficDensity()
     clutter: Clutter = Clutter()
     flaws: Flaws = Flaws()
+    overhead: Overhead = Overhead()
     changes: tuple[PlannedChange, ...] = ()
 
 

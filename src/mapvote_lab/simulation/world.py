@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, MapvoteError
-from mapvote_lab.simulation import shapes
+from mapvote_lab.simulation import overhead, shapes
 from mapvote_lab.simulation.scenario import Scenario
 from mapvote_lab.simulation.shapes import FOOT_M, box, building, car, hedge, join, place, van
 
@@ -185,6 +185,7 @@ def make_world(scenario: Scenario, seed: int) -> World:
     middle = Side(0.0, terrain.axis_y, 0.0, 1, ())
     for s in scenario.clutter.gantry_m:
         bodies.append(Body("gantry", middle.put(shapes.gantry(STREET.kerb_m + 0.6), s, 0.0, terrain)))
+    bodies += _overhead(scenario, bodies, terrain, np.random.default_rng([seed, 8]))
     bodies += _parked_cars(scenario, terrain, np.random.default_rng([seed, 2]))
     return World(terrain, tuple(bodies))
 
@@ -301,6 +302,17 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
                 bodies.append(Body("rail", side.put(shapes.rail(length), s, STREET.kerb_m + 0.25, terrain)))
             s += length + rng.uniform(1.0, 4.0)
     return bodies
+
+
+def _overhead(scenario: Scenario, bodies: list[Body], terrain: Terrain, rng: np.random.Generator) -> list[Body]:
+    """What hangs over the street, and over those of its ``bodies`` that go."""
+    found = []
+    for kind, triangles, s, side in overhead.across(scenario.overhead):
+        found.append(Body(kind, Side(0.0, terrain.axis_y, 0.0, side, ()).put(triangles, s, 0.0, terrain)))
+    gone = [body for body in bodies if body.role == Role.REMOVED] if scenario.overhead.over_demolished else []
+    for house in gone:
+        found += [Body(kind, hangs) for kind, hangs in overhead.over_house(house.triangles, rng).items()]
+    return found
 
 
 def _parked_cars(scenario: Scenario, terrain: Terrain, rng: np.random.Generator) -> list[Body]:

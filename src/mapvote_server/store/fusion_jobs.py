@@ -38,7 +38,7 @@ from mapvote.fusion.decision_record import (
     packed_cells,
 )
 from mapvote.fusion.fuse import Decision, fall_besides, fuse_tile
-from mapvote.fusion.gravity import Fallen, Remains, fall_across, remains_of
+from mapvote.fusion.gravity import Fallen, Falling, Remains, fall_across, remains_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.tile_vote import TileVote, voter_of
 from mapvote_server.errors import Unavailable
@@ -196,9 +196,8 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open
     rule, settings = rule_named(cast.method), task.asked.settings
     barred = [cells for _, cells in polled.bars[tile.index]]
     reviewed = np.logical_or.reduce(barred) if barred else None
-    decision, edited = fuse_tile(
-        tile, votes, rule, settings, task.version, recent, reviewed=reviewed, fallen=task.fallen
-    )
+    falling = Falling(reviewed, task.fallen)
+    decision, edited = fuse_tile(tile, votes, rule, settings, task.version, recent, falling)
     standings = pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings))
     if decision.undecided is not None:
         return Open(task, tile, edited, decision, standings)
