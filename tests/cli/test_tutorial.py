@@ -13,8 +13,8 @@ from command_line import type_in
 ROOT = Path(__file__).parents[2]
 DRIVE = ROOT / "../shared/data/kitti/2011_09_26_0001"
 
-NOT_HERE = "python3 -m venv", "mapvote import tiles/"
-"""Installs from the network; reads a map that the reader may have."""
+NOT_HERE = "python3 -m venv", "mapvote import tiles/", "mapvote vote my_bag"
+"""Installs from the network; reads a map or a bag that the reader may have."""
 
 
 @pytest.mark.slow

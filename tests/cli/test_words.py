@@ -41,6 +41,7 @@ NOT_RUN = {
     ),
     r"http://127\.0\.0\.1:8080": "needs the server of the block before: tests/cli/test_vote.py votes with a real one",
     r"^mapvote (play|drive|topics)\b": "needs a second process on DDS: tests/live/test_drive.py runs both",
+    r"^mapvote vote my_bag": "needs a bag of a drive: tests/live/test_drive.py votes on one",
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
 }

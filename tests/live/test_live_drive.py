@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,9 +19,10 @@ from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.live import drive as drive_module
-from mapvote.live.drive import Counts, LiveDrive, Thinning, WaitingScan
+from mapvote.live.drive import Counts, LiveDrive, WaitingScan
 from mapvote.live.outbox import Outbox, ballot_of
 from mapvote.live.road_map import OneMap
+from mapvote.live.thinning import THINNING, Thinning
 from mapvote.vehicle import Cuts, Vehicle
 from streets import drive_along, path, street
 
@@ -84,6 +86,56 @@ def test_of_scans_that_come_twice_as_fast_as_they_are_voted_on_every_other_one_i
 def test_a_stop_of_two_seconds_costs_no_scan() -> None:
     thinning = Thinning()
     assert all(thinning.admits(0.1 * i, waiting) for i, waiting in enumerate([0] * 50 + list(range(20)) + [1] * 50))
+
+
+@pytest.mark.parametrize("cost_s", [0.12, 0.4, 1.5])
+def test_a_computer_that_becomes_too_slow_votes_with_scans_of_the_last_seconds_only(cost_s: float) -> None:
+    """After ten seconds at 10 Hz each scan takes longer than the time between two."""
+    thinning = Thinning()
+    waiting = deque[float]()
+    now_s = 0.0
+    number = 0
+    ages_s: list[float] = []
+    left_out = 0
+    while now_s < 180.0:
+        while 0.1 * number <= now_s:
+            if thinning.admits(0.1 * number, len(waiting)):
+                waiting.append(0.1 * number)
+            else:
+                left_out += 1
+            number += 1
+        if not waiting:
+            now_s += 0.01
+            continue
+        came_s = waiting.popleft()
+        took_s = 0.03 if now_s < 10.0 else cost_s
+        now_s += took_s
+        ages_s.append(now_s - came_s)
+        thinning.cost(took_s)
+        left_out += thinning.shed(waiting)
+    assert number == len(ages_s) + left_out + len(waiting), "each scan is counted once"
+    assert max(ages_s) < 2.0 * THINNING.longest_s
+    assert np.median(ages_s[len(ages_s) // 2 :]) < THINNING.longest_s + cost_s
+    assert len(ages_s) * cost_s > 0.8 * 170.0, "the computer is used"
+
+
+def test_one_slow_scan_such_as_a_search_of_the_map_costs_no_other() -> None:
+    thinning = Thinning()
+    for _ in range(20):
+        thinning.cost(0.04)
+    thinning.cost(8.0)
+    waiting = deque(range(80))
+    assert thinning.shed(waiting) == 0
+    assert list(waiting) == list(range(80))
+
+
+def test_scans_are_shed_evenly_and_the_oldest_and_newest_stay() -> None:
+    thinning = Thinning()
+    for _ in range(20):
+        thinning.cost(0.6)
+    waiting = deque(range(91))
+    assert thinning.shed(waiting) == 81
+    assert list(waiting) == list(range(0, 91, 10))
 
 
 def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_on(tmp_path: Path) -> None:

@@ -128,6 +128,12 @@ def drive(
     ros_args: Annotated[
         bool, typer.Option("--ros-args", hidden=True, help="begins options of ROS 2; changes nothing")
     ] = False,
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="CORES", help="run on at most this many processor cores")
+    ] = None,
+    nice: Annotated[
+        int | None, typer.Option(min=-20, max=19, metavar="N", help="lower the priority by this, as nice(1) does")
+    ] = None,
     config: Config = None,
 ) -> None:
     """Vote while driving, from ROS 2 topics. A ballot closes every 2 km, every 10 minutes and after 2 minutes at rest.
@@ -148,6 +154,7 @@ def drive(
     from mapvote.live.dds import Network
     from mapvote.live.messages import POSE_TOPIC
     from mapvote.live.names import ros_names, sim_time_of
+    from mapvote.live.process import limit_process
     from mapvote.live.service import Plan, run
     from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
     from mapvote.live.subscriptions import Subscriptions
@@ -161,6 +168,7 @@ def drive(
     require("rosbags.typesys", "ros2", "mapvote drive")
     if metrics is not None:
         require("prometheus_client", "server", "--metrics")
+    limit_process(threads, nice)
     logging.getLogger("mapvote.live").setLevel(logging.INFO)
     plan = Plan(
         vehicle,

@@ -27,6 +27,7 @@ from mapvote.live.log_lines import Repeated
 from mapvote.live.outbox import Outbox
 from mapvote.live.priors import Priors, pose_in
 from mapvote.live.road_map import Maps
+from mapvote.live.thinning import THINNING, Thinning
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
@@ -34,10 +35,6 @@ _FIXES = 400
 """Poses of scans that voted that are kept at most."""
 _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
-_CROWDED, _RELAXED = 30, 5
-"""If more scans wait some are left out, until fewer wait: a short stop of the process costs no scan."""
-_LEAST_SHARE, _MOST = 0.2, 120
-"""Of five scans in turn one is admitted, unless so many wait."""
 _KEEP_S = 8.0
 """A tile that got votes is written to the journal after so long. With the scans that wait, and with tiles that are
 written one at a time, a crash costs less than 30 s of road."""
@@ -98,32 +95,6 @@ class Counts:
     """Left out because tiles around the vehicle had not come yet."""
     clock_jumps: int = 0
     ballots: int = 0
-
-
-class Thinning:
-    """Which scans are left out if there is time for some of them only: evenly, never two where one is enough."""
-
-    def __init__(self) -> None:
-        self._period_s = self._cost_s = self._credit = self._came_s = 0.0
-        self._crowded = False
-
-    def cost(self, seconds: float) -> None:
-        """What a scan took."""
-        self._cost_s += 0.1 * (seconds - self._cost_s)
-
-    def admits(self, came_s: float, waiting: int) -> bool:
-        """Whether the scan that arrived at ``came_s``, of any clock, shall vote while ``waiting`` others wait."""
-        self._period_s += 0.1 * (np.clip(came_s - self._came_s, 0.0, 1.0) - self._period_s)
-        self._came_s = came_s
-        if self._crowded != (waiting > (_RELAXED if self._crowded else _CROWDED)):
-            self._crowded, self._credit = not self._crowded, 1.0
-        if not self._crowded:
-            return True
-        self._credit += np.clip(0.9 * self._period_s / max(self._cost_s, 1e-3), _LEAST_SHARE, 0.95)
-        if self._credit < 1.0 or waiting > _MOST:
-            return False
-        self._credit -= 1.0
-        return True
 
 
 class FirstSeconds:
@@ -319,6 +290,7 @@ class LiveDrive:
         self._priors.forget_before(waiting.stamp_ns)
         self._observe(waiting)
         self._thinning.cost(time.monotonic() - start)
+        self.counts.left_out += self._thinning.shed(self._waiting)
         return True
 
     def finish(self) -> None:
@@ -363,7 +335,7 @@ class LiveDrive:
         unknown = not self._priors.covers(scan.stamp_ns)
         if self._with_poses and not ended and unknown and self._waiting[-1].stamp_ns - scan.stamp_ns < _PATIENCE_NS:
             return False
-        if ended or self.vehicle is not None or len(self._waiting) > _CROWDED:
+        if ended or self.vehicle is not None or len(self._waiting) > THINNING.crowded:
             return True
         return self._maps.covers(self._position(self._prior(scan.stamp_ns)))
 
