@@ -20,6 +20,7 @@ from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.listing import below
@@ -30,18 +31,29 @@ from mapvote_server.store.policy import GatePolicy
 from mapvote_server.store.publish import Gate
 
 Verdict = Literal["pass", "hold", "abstain"]
-REACH_M = 50.0
-"""Scans farther from every change are left out."""
-MOST_SCANS = 60
-"""Scans compared at most, spread evenly."""
-MIN_SCANS = 20
-"""With fewer scans near a change the gate abstains: the t distribution's bound is then wider than any tolerance."""
-BLOCK_SCANS = 5
-"""Neighbouring scans that count as one observation: at 10 Hz they see the same surfaces."""
-START_M = 0.3
-"""Distance of the initial guesses from the prior pose."""
-_SCATTER_M = 1.0
-"""Upper bound of :attr:`Localised.scatter_m`."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class GateRule:
+    """Numbers of the comparison of two map versions by the localisation of drives."""
+
+    reach_m: float = 50.0
+    """Distance from every change beyond which scans are left out, metres."""
+    most_scans: int = 60
+    """Scans compared at most, spread evenly."""
+    min_scans: int = 20
+    """Scans near a change below which the gate abstains: the t distribution's bound is then wider than any
+    tolerance."""
+    block_scans: int = 5
+    """Neighbouring scans that count as one observation: at 10 Hz they see the same surfaces."""
+    start_m: float = 0.3
+    """Distance of the initial guesses from the prior pose, metres."""
+    scatter_m: float = 1.0
+    """Upper bound of :attr:`Localised.scatter_m`, metres."""
+
+
+GATE_RULE = GateRule()
 _START_ANGLES = np.radians([90.0, 210.0, 330.0])
 
 
@@ -119,12 +131,12 @@ def gate(
         raise MapvoteError(f"gate: {old.map_id!r} and {new.map_id!r} are not versions of one map")
     if drive.T_map_lidar_prior is None:
         raise MapvoteError(f"{drive.path}: the gate needs a drive with prior poses (prior.txt, or --prior FILE)")
-    near = scans_near(old, new, drive.T_map_lidar_prior, REACH_M)
-    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), MOST_SCANS)).astype(np.int64))]
-    if len(chosen) < MIN_SCANS:
+    near = scans_near(old, new, drive.T_map_lidar_prior, GATE_RULE.reach_m)
+    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), GATE_RULE.most_scans)).astype(np.int64))]
+    if len(chosen) < GATE_RULE.min_scans:
         reason = (
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "
-            f"{REACH_M:g} m of what changed; the gate needs {MIN_SCANS}"
+            f"{GATE_RULE.reach_m:g} m of what changed; the gate needs {GATE_RULE.min_scans}"
         )
         return "abstain", [reason]
     return pass_or_hold(compare(localise_in_both(old, new, drive, [int(i) for i in chosen], ndt), settings))
@@ -157,7 +169,8 @@ def localise_in_both(
         clouds = thin_for_levels(deskew(drive.read_scan(i), _prior_twist(drive, i)))
         prior = drive.T_map_lidar_prior[i]
         guesses = [
-            prior @ from_xyz_rpy(START_M * np.cos(a), START_M * np.sin(a), 0.0, 0.0, 0.0, 0.0) for a in _START_ANGLES
+            prior @ from_xyz_rpy(GATE_RULE.start_m * np.cos(a), GATE_RULE.start_m * np.sin(a), 0.0, 0.0, 0.0, 0.0)
+            for a in _START_ANGLES
         ]
         in_old, in_new = (_localise(window, clouds, prior, guesses, ndt) for window in windows)
         pairs.append((in_old, in_new))
@@ -176,7 +189,7 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
     out = []
     for name, field, sign, tolerance in kinds:
         olds, news = (np.array([getattr(pair[side], field) for pair in pairs]) for side in (0, 1))
-        blocks = np.array([b.mean() for b in np.array_split(sign * (news - olds), len(pairs) // BLOCK_SCANS)])
+        blocks = np.array([b.mean() for b in np.array_split(sign * (news - olds), len(pairs) // GATE_RULE.block_scans)])
         spread = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
         uncertainty = float(scipy.special.stdtrit(len(blocks) - 1, 0.95)) * spread
         gain = float(sign * (news.mean() - olds.mean()))
@@ -203,7 +216,7 @@ def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F6
     scatter = float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
     trusted = best.inlier_share >= ndt.min_inlier_share and sigma_m <= ndt.max_sigma_m
-    return Localised(best.score, best.inlier_share, min(scatter, _SCATTER_M), float(trusted))
+    return Localised(best.score, best.inlier_share, min(scatter, GATE_RULE.scatter_m), float(trusted))
 
 
 def _prior_twist(drive: Drive, i: int) -> F64:

@@ -20,11 +20,32 @@ from mapvote.codec.planes import Words, compress, pack_plane, unpack_bytes, unpa
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.points import Fields, Values, point_field
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, Bool, CellState, MapvoteError
 
 FORMAT_VERSION = 1
-MAX_TILES = 4096
-MAX_TILE_INDEX = 1 << 20
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class BallotLimits:
+    """Largest sizes of a ballot's parts: no honest ballot has more."""
+
+    tiles: int = 4096
+    """Tiles of a ballot."""
+    tile_index: int = 1 << 20
+    """Largest row or column of a tile, in tiles from the map's origin."""
+    attribute_bytes: int = 16
+    """Size of all attributes of a new point together, bytes."""
+    points_per_cell: int = 64
+    """New points in a cell: one per voxel of its column."""
+    path_step_m: float = 5.0
+    """Least distance between two cells of a path, metres."""
+    path_cells: int = 100_000
+    """Cells of a path."""
+
+
+BALLOT_LIMITS = BallotLimits()
 
 Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 """Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
@@ -128,10 +149,10 @@ def decode(data: bytes) -> Ballot:
     if ballot.format_version != FORMAT_VERSION:
         raise MapvoteError(f"ballot: format {ballot.format_version}; this mapvote reads format {FORMAT_VERSION}")
     indices = [t.tile for t in ballot.tiles]
-    if len(indices) > MAX_TILES or len(set(indices)) != len(indices):
-        raise MapvoteError(f"ballot: {len(indices)} tiles; at most {MAX_TILES}, each once")
+    if len(indices) > BALLOT_LIMITS.tiles or len(set(indices)) != len(indices):
+        raise MapvoteError(f"ballot: {len(indices)} tiles; at most {BALLOT_LIMITS.tiles}, each once")
     for tile in ballot.tiles:
-        if max(abs(tile.tile[0]), abs(tile.tile[1])) > MAX_TILE_INDEX:
+        if max(abs(tile.tile[0]), abs(tile.tile[1])) > BALLOT_LIMITS.tile_index:
             raise MapvoteError(f"ballot: tile {tile.tile} lies outside any map")
         if (tile.states is None) == (tile.tally is None):
             raise MapvoteError(f"ballot: tile {tile.tile} needs either states or a tally")
@@ -239,10 +260,6 @@ def unpack_tally(data: bytes) -> U16:
     return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
 
 
-MAX_ATTRIBUTE_BYTES = 16
-"""Largest size of all attributes of a new point together."""
-
-
 def unpack_offer(new_points: bytes | None, fields: bytes | None) -> tuple[F32 | None, dict[str, Values]]:
     """The new points (m, 3) of a tile and their attributes (m,), of their planes; MapvoteError as
     :func:`unpack_points`, if an attribute is unknown, or if it is not of each point."""
@@ -251,7 +268,7 @@ def unpack_offer(new_points: bytes | None, fields: bytes | None) -> tuple[F32 | 
         return points, {}
     if points is None:
         raise MapvoteError("ballot: a tile has fields of new points, but none of those")
-    raw = unpack_bytes(fields, 4096 + MAX_ATTRIBUTE_BYTES * len(points), "ballot: fields")
+    raw = unpack_bytes(fields, 4096 + BALLOT_LIMITS.attribute_bytes * len(points), "ballot: fields")
     sent = unpack_fields(raw, len(points), "ballot: fields")
     for name, values in sent.items():
         if values.dtype != np.dtype(point_field(name).dtype):
@@ -280,12 +297,10 @@ def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
 # planes of bytes: the way from each point's cell to the next (two), from each layer to the next (four), and the place
 # in the voxel (three).
 
-MAX_POINTS_PER_CELL = 64
-"""One new point per voxel of a column: no honest ballot has more."""
 PLACES = 32
 """Places along a voxel's side that a point may have."""
 _POINT_BYTES = 9
-_MAX_POINT_BYTES = CELLS * MAX_POINTS_PER_CELL * _POINT_BYTES
+_MAX_POINT_BYTES = CELLS * BALLOT_LIMITS.points_per_cell * _POINT_BYTES
 _TOP_M = 1e5
 
 
@@ -306,8 +321,8 @@ def unpack_points(data: bytes) -> F32:
     sound = _placed(raw.reshape(_POINT_BYTES, -1), points)
     if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
-    if _most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)) > MAX_POINTS_PER_CELL:
-        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
+    if _most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)) > BALLOT_LIMITS.points_per_cell:
+        raise MapvoteError(f"ballot: new_points holds more than {BALLOT_LIMITS.points_per_cell} points in one cell")
     return points
 
 
@@ -405,26 +420,23 @@ def pack_odds(steps: I8) -> bytes:
 # Path: a cell of the lattice every few metres, for display. Cells as steps from one to the next, int32, under zstd: two
 # hundred bytes for a kilometre.
 
-STEP_M = 5.0
-"""Between two cells of a path, at least."""
-MAX_PATH_CELLS = 100_000
-
 
 def pack_path(positions: Sequence[F64], lattice: Lattice) -> bytes:
-    """Positions (x, y, ..) in map metres, in the order driven, thinned to one every STEP_M; the first and last stay."""
+    """Positions (x, y, ..) in map metres, in the order driven, thinned to one every
+    ``BallotLimits.path_step_m``; the first and last stay."""
     kept: list[F64] = []
     for position in positions:
-        if not kept or np.hypot(*(position[:2] - kept[-1][:2])) >= STEP_M:
+        if not kept or np.hypot(*(position[:2] - kept[-1][:2])) >= BALLOT_LIMITS.path_step_m:
             kept.append(position)
     if len(positions):
         kept.append(positions[-1])
-    cells = np.stack(lattice.cells_of(np.reshape(kept, (len(kept), -1))[:MAX_PATH_CELLS]), axis=1)
+    cells = np.stack(lattice.cells_of(np.reshape(kept, (len(kept), -1))[: BALLOT_LIMITS.path_cells]), axis=1)
     return pack_plane(np.diff(cells, axis=0, prepend=0).astype(np.int32))
 
 
 def unpack_path(data: bytes) -> I64:
     """(n, 2) rows and columns on the lattice; MapvoteError if damaged."""
-    raw = unpack_bytes(data, 8 * MAX_PATH_CELLS, "ballot: path")
+    raw = unpack_bytes(data, 8 * BALLOT_LIMITS.path_cells, "ballot: path")
     if len(raw) % 8:
         raise MapvoteError(f"ballot: path has {len(raw)} bytes, not a multiple of 8")
     return np.cumsum(np.frombuffer(raw, dtype="<i4").reshape(-1, 2).astype(np.int64), axis=0)

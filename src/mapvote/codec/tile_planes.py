@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,25 @@ from mapvote.codec.fields import decode_fields, pack_fields, unpack_fields
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
+from mapvote.core.record import record
 from mapvote.core.tile import PLANES, Memory, Tile
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
-_ZSTD_LEVEL = 2
-MAX_TILE_POINTS = 50_000_000
-"""8,000 points per square metre; 600 MB. Nothing honest is denser."""
-MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
-"""800 MB: 16 bytes for each point of the densest tile there may be."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class TilePlaneSizes:
+    """Compression and largest sizes of a tile's planes."""
+
+    zstd_level: int = 2
+    """Level of zstd: noisy float32 gains nothing above level 3."""
+    points: int = 50_000_000
+    """Points of the densest tile: 8,000 per square metre, 600 MB."""
+    plane_bytes: int = 16 * points
+    """Bytes of the largest plane, 800 MB: 16 for each point of the densest tile."""
+
+
+TILE_PLANE_SIZES = TilePlaneSizes()
 
 
 def base_hash(tile: Tile | None) -> str:
@@ -40,8 +52,10 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
     old, known = edited_from or (None, TileHashes.none())
 
     def pack(raw: bytes | memoryview, what: str) -> str:
-        if len(raw) > MAX_PLANE_BYTES:
-            too_large = f"{len(raw)} bytes, {MAX_PLANE_BYTES} are the most: thin the map out, or leave fields out"
+        if len(raw) > TILE_PLANE_SIZES.plane_bytes:
+            too_large = (
+                f"{len(raw)} bytes, {TILE_PLANE_SIZES.plane_bytes} are the most: thin the map out, or leave fields out"
+            )
             raise MapvoteError(f"tile {tile_key(tile.index)}: its {what} take {too_large}")
         digest, plane = _packed(raw)
         blobs.update(plane)
@@ -119,7 +133,7 @@ def names_in_plane(data: bytes, digest: str) -> list[str]:
 
 def check_plane(data: bytes, digest: str) -> bytes:
     """The content of a plane; MapvoteError if it is not what its hash says."""
-    raw = unpack_bytes(data, MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
+    raw = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, f"tile plane {digest[:12]}")
     if hashlib.sha256(raw).hexdigest() != digest:
         raise MapvoteError(f"tile plane {digest[:12]} is not what its hash says; fetch it again")
     return raw
@@ -132,7 +146,7 @@ def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
 
 def _packed(raw: bytes | memoryview) -> tuple[str, dict[str, bytes]]:
     digest = hashlib.sha256(raw).hexdigest()
-    return digest, {digest: compress(raw, _ZSTD_LEVEL)}
+    return digest, {digest: compress(raw, TILE_PLANE_SIZES.zstd_level)}
 
 
 def _raw_memory(memory: Memory) -> bytes:
@@ -155,7 +169,7 @@ def unpack_memory_plane(data: bytes, digest: str) -> Memory:
 
 def pack_cells(cells: Bool) -> bytes:
     """(256, 256) bool as a small blob."""
-    return compress(np.packbits(cells.reshape(-1)).tobytes(), _ZSTD_LEVEL)
+    return compress(np.packbits(cells.reshape(-1)).tobytes(), TILE_PLANE_SIZES.zstd_level)
 
 
 def unpack_cells(data: bytes) -> Bool:

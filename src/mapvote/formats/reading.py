@@ -8,18 +8,45 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 
-MOST_BYTES = 4_000_000_000
-"""Largest file that is read whole."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class FileLimits:
+    """Largest sizes that files may claim or have: beyond them a file is damaged or hostile."""
+
+    whole_bytes: int = 4_000_000_000
+    """Size of the largest file that is read whole, bytes."""
+    las_points_per_byte: int = 16
+    """Points per byte of a LAS or LAZ file: real LAZ files need a byte or more for a point."""
+    e57_points_per_byte: int = 16
+    """Points per byte of an E57 file."""
+    lzf_expansion: int = 300
+    """Bytes from one byte of LZF, at most; LZF itself writes up to 264 bytes for each 3."""
+    pcd_line_bytes: int = 1 << 20
+    """Bytes of one line of a PCD header: binary data without a line break are not read whole."""
+    pcd_elements: int = 1 << 20
+    """COUNT of a PCD field: bytes of a point stay within the range of numpy's types."""
+    ply_header_bytes: int = 100_000
+    """Bytes of a PLY header."""
+    path_bytes: int = 240_000_000
+    """Bytes of the driven paths of a map folder: ten million scans, eleven days at 10 Hz."""
+    coordinate_m: float = 1e11
+    """Largest coordinate: no system on Earth exceeds it, not even in millimetres."""
 
 
-def read_whole(file: Path, most: int = MOST_BYTES) -> bytes:
+FILE_LIMITS = FileLimits()
+
+
+def read_whole(file: Path, most: int = FILE_LIMITS.whole_bytes) -> bytes:
     """The content of a regular file. OSError if it cannot be read, has more than ``most`` bytes, or is a pipe, a device
     or a socket: reading one of these waits or goes on for ever."""
     if _regular(file).st_size > most:

@@ -14,23 +14,39 @@ import numpy as np
 
 from mapvote.codec.ballot import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.decision_record import Record
 from mapvote.fusion.loss_budget import alike_beside, change_probability
-from mapvote.shapes.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
+from mapvote.shapes.outlines import PIECE_RULE, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]
 Size = Literal["large", "vehicle", "small"]
-SMALL_AREA_M2 = 1.0
-VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, VEHICLE_HEIGHT_M = 12.0, 2.55, 4.0
-"""The largest bus or lorry (Directive 96/53/EC). A change within these limits may be a vehicle, or the trail of one
-that a survey kept, and is listed apart. Each connected piece is measured, so that several vehicles side by side are no
-larger thing."""
-_BORDER_M = 2 * CELL_SIZE * 2**0.5
-"""How much wider the cells of a thing may be than itself: a cell's diagonal on either side."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ObjectSizes:
+    """Sizes by which changed objects are told apart: the largest bus or lorry (Directive 96/53/EC) is listed as a
+    vehicle or the trail of one. Each connected piece is measured, so several vehicles side by side are no larger
+    object."""
+
+    small_area_m2: float = 1.0
+    """Area below which an object is small, square metres."""
+    vehicle_length_m: float = 12.0
+    """Length of the largest vehicle, metres."""
+    vehicle_width_m: float = 2.55
+    """Width of the largest vehicle, metres."""
+    vehicle_height_m: float = 4.0
+    """Height of the largest vehicle, metres."""
+    border_m: float = 2 * CELL_SIZE * 2**0.5
+    """Excess of an object's cells over the object: a cell's diagonal on either side, metres."""
+
+
+OBJECT_SIZES = ObjectSizes()
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
@@ -113,10 +129,10 @@ class ChangeObject:
     @property
     def size(self) -> Size:
         """Size class, for lists that begin with the large changes."""
-        if self.area_m2 < SMALL_AREA_M2:
+        if self.area_m2 < OBJECT_SIZES.small_area_m2:
             return "small"
-        fits = self.height_m <= VEHICLE_HEIGHT_M and self.longest_m <= VEHICLE_LENGTH_M
-        return "vehicle" if fits and self.width_m <= VEHICLE_WIDTH_M + _BORDER_M else "large"
+        fits = self.height_m <= OBJECT_SIZES.vehicle_height_m and self.longest_m <= OBJECT_SIZES.vehicle_length_m
+        return "vehicle" if fits and self.width_m <= OBJECT_SIZES.vehicle_width_m + OBJECT_SIZES.border_m else "large"
 
     @property
     def share_for(self) -> float | None:
@@ -159,7 +175,9 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     )
 
 
-def change_objects(changed: Sequence[ChangedCells], min_cells: int = 1, reach_m: float = REACH_M) -> list[ChangeObject]:
+def change_objects(
+    changed: Sequence[ChangedCells], min_cells: int = 1, reach_m: float = PIECE_RULE.reach_m
+) -> list[ChangeObject]:
     """Things over all tiles, see :func:`mapvote.shapes.outlines.group`; in order of their lowest, leftmost cell.
 
     The tiles may come in any order. Objects of fewer than ``min_cells`` cells are left out.

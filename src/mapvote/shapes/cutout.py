@@ -6,20 +6,32 @@ import base64
 import html
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64
 from mapvote.core.voxels import found_among
 from mapvote.shapes.packed_cloud import SIDE_M, cloud_bytes, pack
 
-AROUND_M = 10.0
-MOST_POINTS = 60_000
-"""Most points of one change: half a megabyte."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CutoutSizes:
+    """Sizes of a cloud that is cut out around a change."""
+
+    around_m: float = 10.0
+    """Distance from the change up to which points are shown, metres."""
+    points: int = 60_000
+    """Points of one change at most: half a megabyte."""
+
+
+CUTOUT_SIZES = CutoutSizes()
 _MODULES = (
     "vendor/three.core.min.js",
     "vendor/three.module.min.js",
@@ -44,9 +56,9 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
 
     At most 76.8 m of it, and 60,000 points evenly.
     """
-    rows, cols = lattice.cells_of(np.array([[box[0] - AROUND_M, box[1] - AROUND_M]]))
+    rows, cols = lattice.cells_of(np.array([[box[0] - CUTOUT_SIZES.around_m, box[1] - CUTOUT_SIZES.around_m]]))
     window = Grid(lattice, int(rows[0]), int(cols[0]), TILE_CELLS, TILE_CELLS)
-    far = np.array([box[2] + AROUND_M, box[3] + AROUND_M]) - [window.x0, window.y0]
+    far = np.array([box[2] + CUTOUT_SIZES.around_m, box[3] + CUTOUT_SIZES.around_m]) - [window.x0, window.y0]
     ground = np.full(window.shape, np.nan, dtype=np.float32)
     found: dict[str, list[F32]] = {"kept": [], "removed": [], "added": []}
     for index in window.tiles():
@@ -123,6 +135,6 @@ def _inside(points: F64, window: Grid, far: F64) -> F32:
 
 
 def _thinned(points: F32) -> F32:
-    if len(points) <= MOST_POINTS:
+    if len(points) <= CUTOUT_SIZES.points:
         return points
-    return points[np.sort(np.random.default_rng(0).permutation(len(points))[:MOST_POINTS])]
+    return points[np.sort(np.random.default_rng(0).permutation(len(points))[: CUTOUT_SIZES.points])]

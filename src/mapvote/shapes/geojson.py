@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import shapely
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.record import record
 from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.shapes.change_objects import ChangeObject
@@ -83,13 +85,13 @@ def _neighbours(objects: Sequence[ChangeObject]) -> list[list[str]]:
     """For each object the ids of other large things whose box is within 15 m, nearest first."""
     large = [other for other in objects if other.size == "large"]
     boxes, others = (shapely.box(*np.array([o.box for o in some]).reshape(-1, 4).T) for some in (objects, large))
-    here, there = shapely.STRtree(others).query(boxes, predicate="dwithin", distance=NEAR_M / CELL_SIZE)
+    here, there = shapely.STRtree(others).query(boxes, predicate="dwithin", distance=NEIGHBOUR_RULE.near_m / CELL_SIZE)
     distance_m = CELL_SIZE * shapely.distance(boxes[here], others[there])
     near: list[list[tuple[float, str]]] = [[] for _ in objects]
     for i, k, metres in zip(here.tolist(), there.tolist(), distance_m.tolist(), strict=True):
         if objects[i] is not large[k]:
             near[i].append((metres, large[k].id))
-    return [[name for _, name in sorted(one)][:MOST_NEIGHBOURS] for one in near]
+    return [[name for _, name in sorted(one)][: NEIGHBOUR_RULE.listed] for one in near]
 
 
 def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
@@ -138,8 +140,20 @@ def utc(stamp_ns: int | None) -> str | None:
 
 
 _LAST_S = 253_402_300_799
-NEAR_M = 15.0
-MOST_NEIGHBOURS = 5
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class NeighbourRule:
+    """Numbers of the neighbours that a change names."""
+
+    near_m: float = 15.0
+    """Distance up to which a change is a neighbour, metres."""
+    listed: int = 5
+    """Neighbours that are listed at most."""
+
+
+NEIGHBOUR_RULE = NeighbourRule()
 MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 

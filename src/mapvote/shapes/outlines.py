@@ -12,6 +12,7 @@ import scipy
 import shapely
 
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.record import record
 from mapvote.core.types import F64, I32, I64, Bool
 
 Ring = I64
@@ -99,12 +100,29 @@ def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
 
 SLOT_CELLS = 4
 """1.2 m: two walls of one room are farther apart."""
-WALL_CELLS = 10
-"""3 m: least length of a slot."""
-LEAST_SHARE = 0.2
-"""Least share of the cells on either side of a cut: no wall is cut off its building."""
-_MOST_CUTS = 12
-"""Each building of a row needs its own cut."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PieceRule:
+    """Numbers by which changed cells are cut into objects and joined."""
+
+    least_share: float = 0.2
+    """Least share of the cells on either side of a cut: no wall is cut off its building."""
+    cuts: int = 12
+    """Cuts of one group of cells: each building of a row needs its own."""
+    reach_m: float = 1.5
+    """Largest distance of a piece from the hull of its object, metres: a gap that occlusion leaves in a wall."""
+    part_share: float = 1 / 3
+    """Size of a piece relative to its neighbour beyond which it is an object of its own, unless their hulls overlap:
+    houses stand closer together than the walls of one house."""
+    touch_cells: float = 1.0
+    """Overlap of hulls up to which they only touch, cells: houses wall to wall."""
+    wall_cells: int = 10
+    """Least length of a slot, cells: 3 m."""
+
+
+PIECE_RULE = PieceRule()
 _DISK = np.hypot(*np.indices((SLOT_CELLS + 1, SLOT_CELLS + 1)) - SLOT_CELLS // 2) <= SLOT_CELLS / 2 + 0.25
 
 
@@ -113,7 +131,7 @@ def buildings(rows: I64, cols: I64, kinds: I64) -> Pieces:
     found = pieces(rows, cols, kinds)
     part = np.zeros(len(rows), dtype=np.int64)
     done: set[tuple[int, int]] = set()
-    for turn in range(1, _MOST_CUTS + 1):
+    for turn in range(1, PIECE_RULE.cuts + 1):
         fresh = _cut_each(rows, cols, found.objects, done)
         if not fresh.any():
             break
@@ -128,7 +146,7 @@ def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) ->
     cell and size, which need not be asked again."""
     fresh = np.zeros(len(rows), dtype=np.bool_)
     sizes = np.bincount(objects)
-    for label in np.flatnonzero(sizes >= 2 * WALL_CELLS / LEAST_SHARE):
+    for label in np.flatnonzero(sizes >= 2 * PIECE_RULE.wall_cells / PIECE_RULE.least_share):
         mine = np.flatnonzero(objects == label)
         name = int(mine[0]), len(mine)
         if name in done:
@@ -152,13 +170,13 @@ def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
     best: tuple[float, Bool] | None = None
     for k in range(1, count + 1):
         slot = np.argwhere(slots == k).astype(np.float64)
-        if len(slot) < WALL_CELLS:
+        if len(slot) < PIECE_RULE.wall_cells:
             continue
         middle, along, length, width = _line(slot)
         across = (at - middle) @ np.array([-along[1], along[0]])
         beyond, bridge = across > 0, 0.5 * np.count_nonzero(np.abs(across) < 1)
-        narrow = max(WALL_CELLS, bridge) <= length and width <= SLOT_CELLS
-        enough = LEAST_SHARE <= beyond.mean() <= 1 - LEAST_SHARE
+        narrow = max(PIECE_RULE.wall_cells, bridge) <= length and width <= SLOT_CELLS
+        enough = PIECE_RULE.least_share <= beyond.mean() <= 1 - PIECE_RULE.least_share
         if narrow and enough and (best is None or length > best[0]):
             best = length, beyond
     return None if best is None else best[1]
@@ -173,17 +191,7 @@ def _line(cells: F64) -> tuple[F64, F64, float, float]:
     return middle, along, float(length), float(width)
 
 
-REACH_M = 1.5
-"""Largest distance of a piece from the hull of its thing: a gap that occlusion leaves in a wall."""
-PART_SHARE = 1 / 3
-"""A piece larger than this share of its neighbour is a thing of its own, unless their hulls overlap: houses stand
-closer together than the walls of one house."""
-
-TOUCH_CELLS = 1.0
-"""Overlap of hulls, cells, up to which they only touch: houses wall to wall."""
-
-
-def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_M) -> I32:
+def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = PIECE_RULE.reach_m) -> I32:
     """(n,) labels of things, 0 ... k - 1, of cells (n,) whose ``pieces`` are 8-connected and of one kind each.
 
     From the largest piece down, each joins the nearest thing of its kind within ``reach_m`` of whose convex hull it
@@ -208,7 +216,7 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
         fits = [
             (gap, leader)
             for gap, leader in zip(gaps, near.tolist(), strict=True)
-            if gap < -TOUCH_CELLS or (gap <= reach and size[piece] <= PART_SHARE * size[leader])
+            if gap < -PIECE_RULE.touch_cells or (gap <= reach and size[piece] <= PIECE_RULE.part_share * size[leader])
         ]
         if fits:
             owner[piece] = min(fits)[1]

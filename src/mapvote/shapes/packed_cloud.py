@@ -14,6 +14,7 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.kernel import allocating
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, U16
 from mapvote.core.voxels import found_among
@@ -24,9 +25,20 @@ N_LEVELS = len(SPACINGS_M) + 1
 SIDE_M = TILE_CELLS * CELL_SIZE
 ABOVE_OFFSET_M = 10.0
 _STEPS = 65535
-_LEAST_Z_STEP_M = 0.002
-_MOST_LAYERS = 512
-"""Number of voxel layers: all heights above share the last one."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class LayerRule:
+    """Heights of a packed cloud."""
+
+    least_z_step_m: float = 0.002
+    """Least step of a height, metres."""
+    layers: int = 512
+    """Number of voxel layers: all heights above share the last one."""
+
+
+LAYER_RULE = LayerRule()
 _BYTES = "<u4,<u4,<f4,<f4"
 _CLOUD_MAGIC = 0x3143564D
 
@@ -66,7 +78,7 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 
     sizes = np.array(SPACINGS_M)
     low, high = _heights(points)
     sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
-    layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
+    layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, LAYER_RULE.layers)
     level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: neighbours come close together
     ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
     room = len(points) if most is None else max(most, int(ends[0]))
@@ -80,9 +92,9 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 
 def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
     """(packed (n, 4), z0_m, z_step_m) of points from a tile's corner, in their order, see :class:`Levels`."""
     if not len(points):
-        return np.zeros((0, 4), dtype=np.uint16), 0.0, _LEAST_Z_STEP_M
+        return np.zeros((0, 4), dtype=np.uint16), 0.0, LAYER_RULE.least_z_step_m
     low, high = _heights(points)
-    step = max(_LEAST_Z_STEP_M, (high - low) / _STEPS)
+    step = max(LAYER_RULE.least_z_step_m, (high - low) / _STEPS)
     known = ground_z[np.isfinite(ground_z)]
     elsewhere = float(np.median(known)) if len(known) else low
     return _pack(points, ground_z, elsewhere, low, step), low, step

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.routing import APIRoute
 
 from mapvote.codec.planes import unpack_bytes
-from mapvote.codec.tile_planes import MAX_PLANE_BYTES
+from mapvote.codec.tile_planes import TILE_PLANE_SIZES
 from mapvote.shapes.geojson import utc
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.lanes import on
@@ -97,7 +97,7 @@ async def plane(request: Request, digest: Digest) -> Response:
     if takes_zstd(request):
         headers["Content-Encoding"] = "zstd"
     else:
-        data = unpack_bytes(data, MAX_PLANE_BYTES, "tile plane")
+        data = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "tile plane")
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 

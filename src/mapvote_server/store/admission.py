@@ -20,6 +20,7 @@ from mapvote.codec.ballot import Ballot, tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import TileIndex
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.errors import Conflict, TooMany, Unauthorised, Unavailable
@@ -27,8 +28,7 @@ from mapvote_server.store import keys, schema
 from mapvote_server.store.database import Question, insert_rows
 from mapvote_server.store.examination import Examination, Incoming, Votes, cells_of
 from mapvote_server.store.place import (
-    MAX_ABOVE_M,
-    MAX_BELOW_M,
+    PLACE_RULE,
     TWO_PLACES,
     apart_m,
     are_two_places,
@@ -49,11 +49,22 @@ from mapvote_server.store.queries import (
 )
 from mapvote_server.store.store import Store
 
-MAX_CLOCK_AHEAD_NS = 300 * 10**9
-"""A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
-other votes look old."""
-_COMPARED = 16
-"""Other drives of a vehicle at the same time that a ballot is compared with."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class AdmissionRule:
+    """Numbers of the admission of ballots."""
+
+    clock_ahead_ns: int = 300 * 10**9
+    """Time after the server's own by which a drive may end, nanoseconds: clocks differ, but a vehicle from the future
+    would make all other votes look old."""
+    compared: int = 16
+    """Other drives of a vehicle at the same time that a ballot is compared with."""
+    counted_again_ns: int = DAY_NS // 24
+    """Time after which a vehicle's use is counted in the store again, nanoseconds."""
+
+
+ADMISSION_RULE = AdmissionRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +134,7 @@ class RoundNow:
     def _wrong_time(self, ballot: Ballot, now_ns: int) -> MapvoteError | None:
         if ballot.start_ns < 0 or ballot.end_ns <= 0:
             return MapvoteError("ballot: the drive lies before 1970; set the vehicle's clock")
-        if ballot.end_ns > now_ns + MAX_CLOCK_AHEAD_NS:
+        if ballot.end_ns > now_ns + ADMISSION_RULE.clock_ahead_ns:
             return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
         if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
             return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
@@ -256,9 +267,14 @@ class Intake:
             low, high = one.heights_m
             near = touched(one.tile, tiles) or [index for index in around(one.tile) if index in tiles]
             ground_m = min((self._ground_m(connection, tiles[index].ground) for index in near), default=np.inf)
-            if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low <= high <= ground_m + MAX_ABOVE_M:
+            if (
+                np.isfinite(ground_m)
+                and not ground_m - PLACE_RULE.below_m <= low <= high <= ground_m + PLACE_RULE.above_m
+            ):
                 span = f"{low:.1f} to {high:.1f} m on tile {tile_key(one.tile)}"
-                below = f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there"
+                below = (
+                    f"{PLACE_RULE.below_m:g} m below to {PLACE_RULE.above_m:g} m above the map's lowest ground there"
+                )
                 return MapvoteError(
                     f"new points at {span} are not within {below}, {ground_m:.1f} m: is the vehicle on this level?"
                 )
@@ -290,7 +306,11 @@ class Intake:
             return None
         vehicle = one.ballot.vehicle
         used = self._used.get(vehicle)
-        if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or self._over_quota(one, used) is not None:
+        if (
+            used is None
+            or used.since_ns < now - ADMISSION_RULE.counted_again_ns
+            or self._over_quota(one, used) is not None
+        ):
             used = self._used[vehicle] = _count(connection, vehicle, now)
         refused = self._over_quota(one, used)
         if refused is None:
@@ -347,7 +367,7 @@ _SAME_TIME = Question(
     sa.select(_b.seq, _b.drive, _b.start_ns, _b.end_ns)
     .where(_b.vehicle == sa.bindparam("vehicle"), _b.drive != sa.bindparam("drive"), _b.gone_seq.is_(None))
     .where(_b.end_ns >= sa.bindparam("after_ns"), _b.start_ns <= sa.bindparam("before_ns"))
-    .limit(_COMPARED)
+    .limit(ADMISSION_RULE.compared)
 )
 """Standing ballots of other drives of a vehicle in a span of time."""
 
@@ -396,9 +416,6 @@ def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now
     return bool((cells_of(votes.spoken) & (memory.changed <= version)).any())
 
 
-_COUNTED_AGAIN_NS = DAY_NS // 24
-
-
 @dataclass(frozen=True, slots=True)
 class Quota:
     """The quota of one vehicle."""
@@ -421,11 +438,11 @@ def _exceeded(quota: Quota, used: _Used, one: Incoming | Examination) -> TooMany
     vehicle = one.ballot.vehicle
     if used.ballots >= quota.drives_a_day:
         said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
-        return TooMany(said, _COUNTED_AGAIN_NS / 1e9)
+        return TooMany(said, ADMISSION_RULE.counted_again_ns / 1e9)
     if used.size + one.size > quota.stored_bytes:
         full = f"the ballots of {vehicle!r} would take more than {quota.stored_bytes:,} bytes in the store"
         mend = "ask the operator to clear old ones away, or for a larger quota"
-        return TooMany(f"{full}: {mend}", _COUNTED_AGAIN_NS / 1e9)
+        return TooMany(f"{full}: {mend}", ADMISSION_RULE.counted_again_ns / 1e9)
     return None
 
 

@@ -11,6 +11,7 @@ import sqlite3
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from threading import Lock
 from typing import Any
@@ -20,23 +21,41 @@ from sqlalchemy import exc
 from sqlalchemy.sql.compiler import SQLCompiler
 
 from mapvote.codec.ballot import Planes
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote_server.errors import Unavailable
 from mapvote_server.work import check_time, is_late, remaining_s
 
-_WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
-_PAGE_BYTES = 16384
-"""A ballot's planes are a few kB each: in SQLite's own 4 kB pages they waste half of the file and of the writing."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class DatabaseSizes:
+    """Sizes of the work of one database connection."""
+
+    writers_lock: int = 0x6D617076
+    """Number of PostgreSQL's advisory lock of the writers."""
+    page_bytes: int = 16384
+    """Page of a SQLite file, bytes: a ballot's planes are a few kB each, and in SQLite's own 4 kB pages they waste half
+    of the file and of the writing."""
+    steps_per_look: int = 20_000
+    """Steps of SQLite's machine between two looks at the time limit: about a millisecond."""
+    variables: int = 500
+    """Values in one statement: SQLite limits its variables."""
+    remembered_bytes: int = 128 << 20
+    """Memory of unpacked votes, bytes: some 1,500 votes of a vehicle on a tile."""
+    one_by_one: int = 200
+    """Tiles up to which each is asked for by itself, instead of reading all of the map's."""
+    checked_together: int = 500
+    """Rows that are checked in one transaction."""
+
+
+DATABASE_SIZES = DatabaseSizes()
 
 
 COPIED = (
     "if this file was copied while a server had it open, its -wal file is missing: "
     'copy by `sqlite3 STORE ".backup COPY"`'
 )
-
-
-_LOOKS_EVERY = 20_000
-"""Steps of SQLite's machine between two looks at the time limit; about a millisecond."""
 
 
 class Database:
@@ -83,7 +102,7 @@ class Database:
             connection = connection.execution_options(mapvote_writes=True)
             with connection.begin():
                 if not self.is_sqlite:
-                    connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_WRITERS_LOCK)))
+                    connection.execute(sa.select(sa.func.pg_advisory_xact_lock(DATABASE_SIZES.writers_lock)))
                 yield connection
 
     def make_private_file(self) -> None:
@@ -102,10 +121,6 @@ class Database:
     def close(self) -> None:
         """Give every connection back."""
         self.engine.dispose()
-
-
-MOST_ASKED = 500
-"""In one statement: SQLite limits its variables."""
 
 
 class Question:
@@ -183,12 +198,12 @@ def _in_time(*_: Any) -> None:
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # transactions are begun by _begin_sqlite, not guessed by the driver
     cursor = connection.cursor()
-    cursor.execute(f"PRAGMA page_size={_PAGE_BYTES}")  # heeded only while the file is empty
+    cursor.execute(f"PRAGMA page_size={DATABASE_SIZES.page_bytes}")  # heeded only while the file is empty
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.close()
-    connection.set_progress_handler(is_late, _LOOKS_EVERY)
+    connection.set_progress_handler(is_late, DATABASE_SIZES.steps_per_look)
 
 
 def _begin_sqlite(connection: sa.Connection) -> None:
@@ -242,10 +257,6 @@ def is_sound(table: sa.Table, row: Any) -> bool:
     return bool(row.sum == sum_of(*operator.attrgetter(*summed(table))(row)))
 
 
-REMEMBERED_BYTES = 128 << 20
-"""Some 1,500 votes of a vehicle on a tile."""
-
-
 class Remembered:
     """A cache of unpacked planes, by the sum of their row: two rows of one sum say the same. The least recently used
     leave it first. Thread-safe; it ends with the process."""
@@ -279,5 +290,5 @@ class Remembered:
             self.bytes = 0
 
 
-remembered = Remembered(REMEMBERED_BYTES)
+remembered = Remembered(DATABASE_SIZES.remembered_bytes)
 """The cache of this process: what admission unpacks is not unpacked again when a round is fused soon after."""

@@ -13,18 +13,29 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, Planes, check_path, decode, tile_key, unpack_planes
 from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.record import record
 from mapvote.core.types import Bool, MapvoteError
 from mapvote_server.store import schema
 from mapvote_server.store.database import remembered, sum_of
 
-MAX_UNPACKED_BYTES = 512 << 20
-"""All planes of one ballot together, decompressed: some ten kilometres of street."""
 
-MIN_SCANS = 3
-"""Fewer localised scans found no ballot: their place was never confirmed by others."""
-MAX_MISFIT_SIGMAS = 3.0
-MISFIT_SLACK_M = 1.0
-"""A drive whose fixes lie steadily farther off its priors is held back: its clock, its GNSS or its place is wrong."""
+@record()
+@dataclass(frozen=True, slots=True)
+class ExaminationRule:
+    """Limits of a ballot's content."""
+
+    unpacked_bytes: int = 512 << 20
+    """All planes of one ballot together, decompressed, bytes: some ten kilometres of street."""
+    min_scans: int = 3
+    """Localised scans below which a drive founds no ballot: its place was never confirmed by others."""
+    misfit_sigmas: float = 3.0
+    """Standard deviations of the priors by which the fixes of a drive may lie off them."""
+    misfit_slack_m: float = 1.0
+    """Metres more by which they may. A drive steadily beyond is held back: its clock, its GNSS or its place is
+    wrong."""
+
+
+EXAMINATION_RULE = ExaminationRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +120,8 @@ class Examination:
         for tile in self.ballot.tiles[len(self._votes) :]:
             planes = unpack_planes(tile)
             self._unpacked_bytes += planes.nbytes
-            if self._unpacked_bytes > MAX_UNPACKED_BYTES:
-                most = f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed"
+            if self._unpacked_bytes > EXAMINATION_RULE.unpacked_bytes:
+                most = f"ballot: larger than {EXAMINATION_RULE.unpacked_bytes} bytes when decompressed"
                 raise MapvoteError(f"{most}; send a shorter drive")
             self._votes.append(_votes_of(tile, self.ballot.base[tile_key(tile.tile)], planes))
             if time.monotonic() > ends_s:
@@ -137,14 +148,14 @@ def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
 
 
 def _check_founded(ballot: Ballot) -> None:
-    if ballot.scans_localised < MIN_SCANS:
+    if ballot.scans_localised < EXAMINATION_RULE.min_scans:
         raise MapvoteError(
-            f"ballot: only {ballot.scans_localised} of {ballot.scans} scans were localised, {MIN_SCANS} are needed; "
-            "drive farther on the map"
+            f"ballot: only {ballot.scans_localised} of {ballot.scans} scans were localised, "
+            f"{EXAMINATION_RULE.min_scans} are needed; drive farther on the map"
         )
     if ballot.prior_misfit_m is None or ballot.prior_sigma_m is None:
         return
-    allowed = MAX_MISFIT_SIGMAS * ballot.prior_sigma_m + MISFIT_SLACK_M
+    allowed = EXAMINATION_RULE.misfit_sigmas * ballot.prior_sigma_m + EXAMINATION_RULE.misfit_slack_m
     if ballot.prior_misfit_m > allowed:
         raise MapvoteError(
             f"ballot held back: fixes and priors of {ballot.vehicle}/{ballot.drive} lie {ballot.prior_misfit_m:.1f} m "

@@ -23,6 +23,7 @@ from mapvote.codec.tile_planes import pack_tile, unpack_free_plane, unpack_groun
 from mapvote.config import FuseSettings
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex
+from mapvote.core.record import record
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, U8, Bool, MapvoteError
@@ -47,9 +48,23 @@ from mapvote_server.store.integrity import Damage, DamagedBallots
 from mapvote_server.store.queries import load_tile, tile_as_of
 from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
 
-_GROUP, _ROUND = 8, 8
-"""Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
-executor, so that all its workers have work and a round can be cancelled between groups."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class JobSizes:
+    """Sizes of the jobs in which a round is fused."""
+
+    group: int = 8
+    """Neighbouring tiles that are fused within one database transaction, at most."""
+    round_groups: int = 8
+    """Groups of a round with an executor, at least: all its workers have work, and a round can be cancelled between
+    groups."""
+    sites: int = 32
+    """Tiles that are kept while groups are followed, at most, 2 MB each; and tiles that are kept open, about 6 MB
+    each."""
+
+
+JOB_SIZES = JobSizes()
 _NOWHERE, _NO_CELLS = np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64)
 
 
@@ -296,7 +311,7 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
     rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
-    size = min(_GROUP, max(1, len(tasks) // _ROUND)) if executor else _GROUP
+    size = min(JOB_SIZES.group, max(1, len(tasks) // JOB_SIZES.round_groups)) if executor else JOB_SIZES.group
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
     done: list[Fused | Open] = []
@@ -304,7 +319,7 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
         if isinstance(fused, Open):
             unpacked += 1
-        done.append(fused.packed() if isinstance(fused, Open) and unpacked > _SITES else fused)
+        done.append(fused.packed() if isinstance(fused, Open) and unpacked > JOB_SIZES.sites else fused)
     return done
 
 
@@ -329,7 +344,7 @@ def settled(
     """
     undecided = {index: fused.undecided for index, fused in alone.items() if fused.undecided is not None}
 
-    @lru_cache(maxsize=_SITES)
+    @lru_cache(maxsize=JOB_SIZES.sites)
     def remains_at(index: TileIndex) -> Remains:
         task = task_of(index)
         fused = alone[index] if index in alone else fuse_stored([task], database)[0]
@@ -354,10 +369,6 @@ def _fused_with(fallen: Fallen, task: Task, database: Database) -> Fused:
     """The tile of a task, fused again with what falls besides."""
     fused = fuse_stored([replace(task, fallen=fallen)], database)[0]
     return fused.packed() if isinstance(fused, Open) else fused
-
-
-_SITES = 32
-"""Most tiles that are kept while groups are followed, 2 MB each, and most that are kept open, about 6 MB each."""
 
 
 def _remains_after(before: Tile, fused: Fused, record: Record) -> Remains:

@@ -15,16 +15,14 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.planes import compress, unpack_bytes
-from mapvote.codec.tile_planes import MAX_PLANE_BYTES
+from mapvote.codec.tile_planes import TILE_PLANE_SIZES
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote_server.errors import NotFound
 from mapvote_server.store import schema
-from mapvote_server.store.database import Question, insert_rows, is_sound
+from mapvote_server.store.database import DATABASE_SIZES, Question, insert_rows, is_sound
 from mapvote_server.store.queries import log_event, oldest_kept, shows_in_kept, shows_in_target
 from mapvote_server.store.store import Store
-
-_BATCH = 500
 
 
 def check(store: Store, *, mend: bool = False, by: str = "operator") -> list[Damage]:
@@ -79,7 +77,7 @@ def _planes(connection: sa.Connection) -> Iterator[Damage]:
 
 def _wrong(digest: str, data: bytes) -> str:
     try:
-        raw = unpack_bytes(data, MAX_PLANE_BYTES, "plane")
+        raw = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "plane")
     except MapvoteError as error:
         return str(error)[:120]
     return "" if hashlib.sha256(raw).hexdigest() == digest else "is not what its hash says"
@@ -130,7 +128,7 @@ def _ends(connection: sa.Connection) -> Iterator[Damage]:
 
 def _in_batches(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[Any]:
     """Rows, so many at a time: a store is larger than memory."""
-    yield from connection.execution_options(yield_per=_BATCH).execute(query)
+    yield from connection.execution_options(yield_per=DATABASE_SIZES.checked_together).execute(query)
 
 
 MENDED = "mended"

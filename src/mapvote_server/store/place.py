@@ -15,30 +15,42 @@ from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote_server.store.examination import Votes, cells_of
 
-MAX_BELOW_M, MAX_ABOVE_M = 10.0, 120.0
-"""New points lie between so much below and so much above the lowest ground of the map around them."""
-MAX_REACH_M = 200.0
-"""Twice what a LiDAR sees: a vote farther from the map than this cannot come from a vehicle that localised in it."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PlaceRule:
+    """Places at which a ballot may vote."""
+
+    below_m: float = 10.0
+    """Depth of new points below the lowest ground of the map around them, metres."""
+    above_m: float = 120.0
+    """Height of new points above the lowest ground of the map around them, metres."""
+    reach_m: float = 200.0
+    """Distance of a vote from the map, metres: twice a LiDAR's range, so no vehicle that localised in the map votes
+    beyond."""
+
+
+PLACE_RULE = PlaceRule()
 _TILE_M = TILE_CELLS * CELL_SIZE
-_TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
+_TILES_AWAY = int(PLACE_RULE.reach_m // _TILE_M) + 1
 
 
 def refuse_far_tiles(tiles: Sequence[TileIndex], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """The refusal of tiles on which a vehicle cannot have been: one more than MAX_REACH_M from every tile of the map,
-    or groups of them that lie farther apart than that. None if it may have been there."""
+    """The refusal of tiles on which a vehicle cannot have been: one farther than ``PlaceRule.reach_m`` from every tile
+    of the map, or groups of them that lie farther apart than that. None if it may have been there."""
     for tile in tiles:
         if not any(index in map_tiles for index in around(tile)):
             return _too_far(tile)
     apart = _first_apart(list(tiles))
     if apart is not None:
         first, other = (tile_key(index) for index in apart)
-        ways = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
+        ways = f"tiles {first} and {other} lie on ways more than {PLACE_RULE.reach_m:.0f} m apart"
         return MapvoteError(f"{ways}: a drive is one way; send each part as a drive of its own")
     return None
 
 
 def _too_far(tile: TileIndex) -> MapvoteError:
-    far = f"tile {tile_key(tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
+    far = f"tile {tile_key(tile)} has votes more than {PLACE_RULE.reach_m:.0f} m from the map"
     return MapvoteError(f"{far}: a vehicle votes on what it saw while it localised in the map")
 
 
@@ -48,7 +60,7 @@ def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex])
         if touched(votes.tile, map_tiles):
             continue  # the whole tile is within reach
         near = [index for index in around(votes.tile) if index in map_tiles]
-        if not near or _farthest_m(votes, near) > MAX_REACH_M:
+        if not near or _farthest_m(votes, near) > PLACE_RULE.reach_m:
             return _too_far(votes.tile)
     return refuse_far_tiles([votes.tile for votes in said], map_tiles)
 
@@ -57,7 +69,7 @@ _AROUND = [
     (row, col)
     for row in range(-_TILES_AWAY, _TILES_AWAY + 1)
     for col in range(-_TILES_AWAY, _TILES_AWAY + 1)
-    if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= MAX_REACH_M
+    if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= PLACE_RULE.reach_m
 ]
 """Steps to the tiles within reach of any part of a tile."""
 

@@ -21,7 +21,7 @@ from mapvote.core.tile import Memory, Tile
 from mapvote.fusion.decision_record import Record
 from mapvote_server.errors import NotFound
 from mapvote_server.store import schema
-from mapvote_server.store.database import MOST_ASKED, Question, insert_rows
+from mapvote_server.store.database import DATABASE_SIZES, Question, insert_rows
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -75,7 +75,7 @@ def tiles_of(
     connection: sa.Connection, number: int, only: Collection[TileIndex] | None = None
 ) -> dict[TileIndex, TileHashes]:
     """Hashes of a version's tiles (``only`` these), in ascending order: of each, the last row up to that version."""
-    if only is not None and len(only) <= _ONE_BY_ONE:
+    if only is not None and len(only) <= DATABASE_SIZES.one_by_one:
         found = {index: tile_of(connection, number, index) for index in sorted(only)}
         return {index: hashes for index, hashes in found.items() if hashes is not None}
     t = schema.version_tiles
@@ -102,8 +102,8 @@ def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) 
     """Number of points of each tile, read from the head of its plane: no plane is unpacked."""
     b, found = schema.blobs.c, dict[str, int]()
     digests = sorted({hashes.points for hashes in tiles.values()})
-    for start in range(0, len(digests), MOST_ASKED):
-        some = b.hash.in_(digests[start : start + MOST_ASKED])
+    for start in range(0, len(digests), DATABASE_SIZES.variables):
+        some = b.hash.in_(digests[start : start + DATABASE_SIZES.variables])
         heads = sa.select(b.hash, sa.func.substr(b.data, 1, FRAME_HEAD)).where(some)
         found |= {digest: points_in_plane(bytes(head), digest) for digest, head in connection.execute(heads)}
     return {index: found.get(hashes.points, 0) for index, hashes in tiles.items()}
@@ -193,8 +193,8 @@ def newest_seq(connection: sa.Connection) -> int:
 def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
     """Store planes that are not there yet."""
     digests = list(planes)
-    for start in range(0, len(digests), MOST_ASKED):
-        some = digests[start : start + MOST_ASKED]
+    for start in range(0, len(digests), DATABASE_SIZES.variables):
+        some = digests[start : start + DATABASE_SIZES.variables]
         known = set(connection.execute(_KNOWN_BLOBS, {"digests": some}).scalars())
         new = [(digest, planes[digest]) for digest in some if digest not in known]
         if new:
@@ -235,8 +235,6 @@ class Version:
 
 VERSION_COLUMNS = [column for column in schema.versions.c if column.name != "sum"]
 """The columns of a :class:`Version`."""
-_ONE_BY_ONE = 200
-"""So many tiles are sooner asked for one by one than found among all of the map's."""
 _T = schema.version_tiles
 _TILE = Question(
     sa.select(*(_T.c[plane] for plane in schema.TILE_PLANES))

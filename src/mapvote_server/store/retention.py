@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.store import schema
-from mapvote_server.store.database import MOST_ASKED, Question
+from mapvote_server.store.database import DATABASE_SIZES, Question
 from mapvote_server.store.policy import Policy, policy_in
 from mapvote_server.store.queries import (
     current_number,
@@ -125,6 +125,6 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
 
 def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
     columns = sa.tuple_(*(table.c[name] for name in key))
-    for start in range(0, len(rows), MOST_ASKED):
-        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + MOST_ASKED]]
+    for start in range(0, len(rows), DATABASE_SIZES.variables):
+        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + DATABASE_SIZES.variables]]
         connection.execute(table.delete().where(columns.in_(some)))

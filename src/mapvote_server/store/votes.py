@@ -27,7 +27,7 @@ from mapvote.fusion.fuse import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
 from mapvote_server.errors import NotFound
 from mapvote_server.store import schema
-from mapvote_server.store.database import MOST_ASKED, Question, is_sound, remembered
+from mapvote_server.store.database import DATABASE_SIZES, Question, is_sound, remembered
 from mapvote_server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
 from mapvote_server.store.policy import Policy, policy_in
 from mapvote_server.store.queries import Version, log_event
@@ -336,8 +336,8 @@ def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, St
     """The stored votes on tiles of a ``row``, each with its column."""
     found: dict[tuple[int, int, int], Any] = {}
     cols, ballots = sorted({col for col, _ in votes}), sorted({vote.seq for _, vote in votes})
-    for start in range(0, len(ballots), MOST_ASKED):
-        asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + MOST_ASKED]}
+    for start in range(0, len(ballots), DATABASE_SIZES.variables):
+        asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + DATABASE_SIZES.variables]}
         rows = connection.execute(_PLANES_OF, asked_of).all()
         found |= {(stored.row, stored.col, stored.ballot): stored for stored in rows}
     return found

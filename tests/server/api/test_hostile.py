@@ -20,7 +20,7 @@ import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from live_server import serving_here
-from mapvote.codec.ballot import MAX_TILE_INDEX, encode
+from mapvote.codec.ballot import BALLOT_LIMITS, encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote_server.store import keys
 from mapvote_server.store.examination import examine
@@ -140,7 +140,7 @@ def test_a_bomb_of_a_gigabyte_costs_no_memory() -> None:
         (b"\x00" * 1000, 422, "not readable"),
         (bytes(400_000), 413, "300000"),
         (changed(tile_new_points=bomb(1 << 30)), 422, "larger than"),
-        (changed(tile_tile=[MAX_TILE_INDEX + 1, 0]), 422, "outside any map"),
+        (changed(tile_tile=[BALLOT_LIMITS.tile_index + 1, 0]), 422, "outside any map"),
         (changed(map_id="another map"), 409, "another map"),
         (changed(vehicle="v2"), 422, "v2/d1"),
         (changed(end_ns=(1 << 64) - 1), 422, "future"),

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs, utm_of
 
@@ -26,10 +27,20 @@ _UNITS: dict[str, Any] = {
 
 Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Points (n, 3) of a file to map metres; the same array if there is nothing to do."""
-_EARTH_M = (6.33e6, 6.40e6)
-"""From the Earth's centre to any street."""
-_HIGHEST_M = 10_000.0
-"""Above which no street lies, in coordinates whose z is a height."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class EarthSize:
+    """Places of streets on Earth, by which units of coordinates are recognised."""
+
+    radius_m: tuple[float, float] = (6.33e6, 6.40e6)
+    """Distances of streets from the Earth's centre, least and largest, metres."""
+    highest_m: float = 10_000.0
+    """Largest height of a street, metres."""
+
+
+EARTH_SIZE = EarthSize()
 
 
 def settle(
@@ -169,7 +180,10 @@ def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
         return
     low, high = points.min(axis=0), points.max(axis=0)
     radius_m = float(np.linalg.norm(points.astype(np.float64), axis=1).mean())
-    if _EARTH_M[0] < radius_m < _EARTH_M[1] and float(np.abs(points[:, 2]).min()) > _HIGHEST_M:
+    if (
+        EARTH_SIZE.radius_m[0] < radius_m < EARTH_SIZE.radius_m[1]
+        and float(np.abs(points[:, 2]).min()) > EARTH_SIZE.highest_m
+    ):
         raise MapvoteError(
             f"{where}: the points lie {radius_m / 1000.0:.0f} km from (0, 0, 0): they look like metres from the "
             f"Earth's centre; if so: mapvote import '{where}' MAP --from-crs EPSG:4978 --crs EPSG:n; "

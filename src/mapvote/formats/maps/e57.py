@@ -17,9 +17,8 @@ from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.cloud import READ_SIZES, Cloud, ReadSizes
-from mapvote.formats.reading import reading
+from mapvote.formats.reading import FILE_LIMITS, reading
 
-MAX_POINTS_PER_BYTE = 16
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _E57_FIELDS = {"intensity": "intensity", "colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
@@ -33,7 +32,7 @@ def stream_e57(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
     library = require("pye57", "e57", str(path))
     with reading(path, "E57 file"):
         file = library.E57(str(path))
-        size = path.stat().st_size * MAX_POINTS_PER_BYTE
+        size = path.stat().st_size * FILE_LIMITS.e57_points_per_byte
         counts = [file.get_header(i).point_count for i in range(file.scan_count)]
         if sum(counts) > size:
             raise ValueError(f"its header promises {sum(counts)} points, more than it has room for")

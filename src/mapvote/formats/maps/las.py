@@ -32,7 +32,7 @@ from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import kept_fields, known_fields, other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, FLAGS, Head, Piece, read_head, read_pieces
-from mapvote.formats.reading import reading
+from mapvote.formats.reading import FILE_LIMITS, reading
 
 log = logging.getLogger("mapvote.formats")
 
@@ -76,9 +76,6 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
     plane, up = (METRES.get(keys.get(key, 0)) for key in (GeoKey.UNIT, GeoKey.VERTICAL_UNIT))
     return MapFrame(with_units(_known(where, text), plane, up))
 
-
-MAX_POINTS_PER_BYTE = 16
-"""Real LAZ files need a byte or more for a point."""
 
 _DECODER = msgspec.json.Decoder(Head)
 
@@ -235,7 +232,7 @@ def _check_counts(path: Path) -> bool:
     start, vlrs = struct.unpack_from("<II", header, 96)
     record, legacy = struct.unpack_from("<HI", header, 105)
     evlrs, points = struct.unpack_from("<IQ", header, 243) if version >= 4 else (0, legacy)
-    room = max(size - start, 0) * MAX_POINTS_PER_BYTE
+    room = max(size - start, 0) * FILE_LIMITS.las_points_per_byte
     if header[:4] != b"LASF" or start > size or vlrs * 54 > size or evlrs * 60 > size or points > room:
         raise MapvoteError(
             f"{path}: not a whole LAS or LAZ file (its header promises more than it holds); copy it again"

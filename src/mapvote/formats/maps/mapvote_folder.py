@@ -23,13 +23,11 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
 from mapvote.formats.maps.cloud import READ_SIZES, ReadSizes
-from mapvote.formats.reading import first_bytes, read_whole
+from mapvote.formats.reading import FILE_LIMITS, first_bytes, read_whole
 
 MANIFEST = "manifest.json"
 FORMAT = "mapvote-map"
 FORMAT_VERSION = 1
-MAX_PATH_BYTES = 240_000_000
-"""Ten million scans: eleven days at 10 Hz."""
 _TILE_M = np.float32(TILE_CELLS * CELL_SIZE)
 
 
@@ -156,7 +154,7 @@ def _planes(path: Path, hashes: TileHashes) -> dict[str, bytes]:
 
 def _positions(data: bytes, path: Path) -> F64:
     """(n, 3) one driven path of the manifest of the map folder at ``path``."""
-    flat = np.frombuffer(unpack_bytes(data, MAX_PATH_BYTES, f"{path / MANIFEST}: driven"), dtype="<f8")
+    flat = np.frombuffer(unpack_bytes(data, FILE_LIMITS.path_bytes, f"{path / MANIFEST}: driven"), dtype="<f8")
     if len(flat) % 3 or not np.isfinite(flat).all():
         raise MapvoteError(f"{path / MANIFEST}: a driven path is not whole; copy the map again")
     return flat.reshape(-1, 3)

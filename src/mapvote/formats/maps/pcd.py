@@ -30,12 +30,10 @@ from mapvote.formats.maps.cloud import (
     warn_of_float32,
 )
 from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
-from mapvote.formats.reading import reading
+from mapvote.formats.reading import FILE_LIMITS, reading
 
 _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
-_MOST_EXPANDED = 300
-"""LZF writes at most 264 bytes for each 3."""
 _GRID_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}")
 """X_Y: nobody names scans so."""
 _PLACE_TILE = re.compile(r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?", re.IGNORECASE)
@@ -244,7 +242,7 @@ def _compressed(path: Path, file: BinaryIO, header: PcdHeader) -> NDArray[np.voi
             f"{header.layouts()[0].itemsize} bytes; FIELDS, SIZE, COUNT or POINTS is wrong: export it again"
         )
     packed = file.read(packed_bytes)
-    if len(packed) < packed_bytes or whole_bytes > _MOST_EXPANDED * max(packed_bytes, 1):
+    if len(packed) < packed_bytes or whole_bytes > FILE_LIMITS.lzf_expansion * max(packed_bytes, 1):
         raise MapvoteError(f"{path}: cut off: {len(packed)} of {packed_bytes} packed bytes; copy it again")
     raw = lzf.decompress(packed, whole_bytes)
     if raw is None or len(raw) != whole_bytes:

@@ -14,6 +14,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from mapvote.core.types import MapvoteError
+from mapvote.formats.reading import FILE_LIMITS
 
 Encoding = Literal["ascii", "binary", "binary_compressed"]
 ENCODINGS: tuple[Encoding, ...] = ("ascii", "binary", "binary_compressed")
@@ -31,10 +32,6 @@ _KEYWORDS = (
     "DATA",
 )
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-_LONGEST_LINE = 1 << 20
-"""Bytes of one line of a header: binary data without a line break are not read whole."""
-_MOST_ELEMENTS = 1 << 20
-"""Largest COUNT: bytes of a point stay within what numpy can describe."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +115,7 @@ class _Lines:
 
     def read(self, stream: BinaryIO) -> Iterator[list[str]]:
         """The words of each line that says something."""
-        while raw := stream.readline(_LONGEST_LINE):
+        while raw := stream.readline(FILE_LIMITS.pcd_line_bytes):
             self.number += 1
             words = raw.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace").split()
             if not words or words[0].startswith("#"):
@@ -160,7 +157,7 @@ class _Lines:
         letters = [letter[:1].upper() for letter in self._words("TYPE", len(names))]
         if not letters:
             letters = ["F" if size >= 4 else "U" for size in sizes]
-        if any(count > _MOST_ELEMENTS for count in counts):
+        if any(count > FILE_LIMITS.pcd_elements for count in counts):
             raise self._refused("COUNT", f"{max(counts)} elements of one field", "is the header damaged?")
         kinds = [self._kind(letter, size) for letter, size in zip(letters, sizes, strict=True)]
         return tuple(PcdField(*one) for one in zip(names, kinds, counts, strict=True))

@@ -14,10 +14,8 @@ from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.maps.cloud import READ_SIZES, Cloud, CloudPieces, ReadSizes, cloud_of_table, table_of
-from mapvote.formats.reading import reading
+from mapvote.formats.reading import FILE_LIMITS, reading
 
-_LONGEST_HEADER = 100_000
-"""Bytes."""
 _TYPES = {
     "f8": "double", "f4": "float", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"
 }  # fmt: skip
@@ -65,7 +63,7 @@ def _ascii_header(stream: BinaryIO) -> BinaryIO:
     header = b""
     for line in stream:
         header += line
-        if line.strip() == b"end_header" or len(header) > _LONGEST_HEADER:
+        if line.strip() == b"end_header" or len(header) > FILE_LIMITS.ply_header_bytes:
             break
     if header.isascii():
         stream.seek(0)

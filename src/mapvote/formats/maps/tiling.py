@@ -32,17 +32,14 @@ from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import READ_SIZES, Cloud, ReadSizes, joined
 from mapvote.formats.maps.field_names import kept_fields
 from mapvote.formats.maps.laz_subprocess import LasClass
+from mapvote.formats.reading import FILE_LIMITS
 
 Columns = dict[str, NDArray[Any]]
 
 
-_FARTHEST_M = 1e11
-"""Coordinates of no system on Earth are larger, not even in millimetres."""
-
-
 def on_earth(points: NDArray[np.floating]) -> Bool:
     """(n,) which of the points (n, 3) are coordinates at all: finite, and no damaged number such as 1e30."""
-    return np.asarray((np.abs(points) < _FARTHEST_M).all(axis=1))
+    return np.asarray((np.abs(points) < FILE_LIMITS.coordinate_m).all(axis=1))
 
 
 class Spill:
