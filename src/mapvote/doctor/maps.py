@@ -7,7 +7,7 @@ there twice.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.grid import TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import LazyTiles, PointMap, all_points
+from mapvote.core.record import record
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, MapvoteError
@@ -32,43 +33,92 @@ from mapvote.formats.maps.marked_points import MarkedPoints
 from mapvote.formats.maps.tiling import Pieces, grounded, in_map_metres, map_of, on_earth
 from mapvote.survey.clean_map import lone_points
 
-_SOME, _NEAR = 400_000, 100_000
-_FEW = 1000
-"""Fewer points show nothing."""
-_STRAY_M = 300.0
-"""Farther off they make the map larger than it is; nearer ones are reflections."""
-_HIGHEST_M = 3000.0
-"""No map of streets is higher."""
-_FAR_M = 50_000.0
-_SLOPE_DEG = 6.0
-_ALOFT_M = 100.0
-"""Over the ground hardly anything of a street is so high."""
-_SPARSE_M = 0.4
-"""Points farther apart make patterns of their own."""
-_MOST_LONE = 0.005
-"""Of a map's points; a survey's first map has a few in a thousand."""
-_MIDDLE_POINTS = 4_000_000
-"""Of a map larger than memory so many show its ground and copies."""
-_BIN_M = 0.05
-_CELL_M, _SIDE = 0.2, 640
-"""A square of 128 m in cells of 0.2 m is checked."""
-_NEAREST_M, _FARTHEST_M = 1.0, 8.0
-"""Nearer copies are lost in the thickness of the walls themselves."""
-_PEAK = 5.3
-"""Times the usual unevenness. Sound maps of streets give 2 at most, of 24 scans with side walls alike 4.7; copies
-shifted by 1 to 5 m 6 to 20."""
-_NEAR_CELL_M, _NEAR_SIDE = 0.1, 1024
-_BESIDE_M = (0.4, 1.4)
-"""Copies so near are looked for on a finer picture."""
-_CONTRAST = 0.02
-"""Of nine sound maps (six simulated, two of KITTI, a campus) none gives more than 0; copies shifted by .6 m .04 to .16:
-on the campus, whose walls are hedges and noise, less than 0 too."""
-_PATCH_M, _PATCH_POINTS = 1.0, 12
-_UPRIGHT = 0.35
-"""Of a patch's normal, its part along z: what is steeper than 70 deg stands."""
-_LEAN_DEG, _LEAN_SIGMAS = 1.5, 4.0
-_ALIKE = 10.0
-"""So many neighbouring patches lie on one wall and say the same."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class MapCheck:
+    """Numbers of the checks of a map's points, ground and copies."""
+
+    checked_points: int = 400_000
+    """Points of a map that are checked for its unit, its axes and lone points."""
+    neighbour_points: int = 100_000
+    """Points around the middle of a map whose neighbours are searched."""
+    few_points: int = 1000
+    """Points below which a map shows nothing."""
+    stray_m: float = 300.0
+    """Distance from the other points beyond which a point is a stray, metres; a nearer one is a reflection."""
+    highest_m: float = 3000.0
+    """Largest difference of heights of a map of streets, metres."""
+    far_m: float = 50_000.0
+    """Distance from the origin beyond which a map is far, metres."""
+    slope_deg: float = 6.0
+    """Slope of a map's ground beyond which it is tilted, degrees."""
+    aloft_m: float = 100.0
+    """Height over the ground that hardly any point of a street has, metres."""
+    sparse_m: float = 0.4
+    """Distance between neighbouring points beyond which they make patterns of their own, metres."""
+    most_lone: float = 0.005
+    """Share of lone points of a map; a survey's first map has a few in a thousand."""
+    middle_points: int = 4_000_000
+    """Points around the middle of a map larger than memory that show its ground and copies."""
+    bin_m: float = 0.05
+    """Bin of the histogram of heights over the ground, metres."""
+
+
+MAP_CHECK = MapCheck()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CopyCheck:
+    """Numbers of the search for shifted copies of a map's walls."""
+
+    cell_m: float = 0.2
+    """Side of a cell of the picture of walls, metres."""
+    side: int = 640
+    """Cells along the picture: a square of 128 m is checked."""
+    nearest_m: float = 1.0
+    """Least shift of a copy, metres: nearer copies are lost in the thickness of the walls."""
+    farthest_m: float = 8.0
+    """Largest shift of a copy, metres."""
+    peak: float = 5.3
+    """Height of a copy's peak as a multiple of the usual unevenness. Sound maps of streets give 2 at most, of 24 scans
+    with side walls alike 4.7; copies shifted by 1 to 5 m give 6 to 20."""
+    fine_cell_m: float = 0.1
+    """Side of a cell of the finer picture, metres."""
+    fine_side: int = 1024
+    """Cells along the finer picture."""
+    fine_shift_m: tuple[float, float] = (0.4, 1.4)
+    """Least and largest shift of copies on the finer picture, metres."""
+    contrast: float = 0.02
+    """Contrast of a copy on the finer picture. None of nine sound maps (six simulated, two of KITTI, a campus) gives
+    more than 0; copies shifted by .6 m give .04 to .16, on the campus, whose walls are hedges and noise, less than 0
+    too."""
+
+
+COPY_CHECK = CopyCheck()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class LeanCheck:
+    """Numbers of the check whether a map's walls lean."""
+
+    patch_m: float = 1.0
+    """Side of a patch of points to which a plane is fitted, metres."""
+    patch_points: int = 12
+    """Points of a patch at least."""
+    upright: float = 0.35
+    """Part of a patch's normal along z up to which it stands: 70 deg and steeper."""
+    lean_deg: float = 1.5
+    """Lean of the walls from which a map is tilted, degrees."""
+    lean_sigmas: float = 4.0
+    """Standard errors that the lean must exceed."""
+    alike: float = 10.0
+    """Neighbouring patches that lie on one wall and repeat each other."""
+
+
+LEAN_CHECK = LeanCheck()
 
 
 def in_memory(points: NDArray[np.floating]) -> Pieces:
@@ -90,15 +140,15 @@ def classified_ground(point_map: PointMap) -> Pieces:
 def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
     """Of points in map metres, as somebody's file holds them. ``ground``: those of them that it classifies as such."""
     n = sum(map(len, pieces()))
-    if n < _FEW:
+    if n < MAP_CHECK.few_points:
         return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
-    some = _every(pieces, max(1, n // _SOME))
+    some = _every(pieces, max(1, n // MAP_CHECK.checked_points))
     low, high = np.quantile(some, (0.001, 0.999), axis=0)
     apart_m = spacing(pieces, some)
     units = list(_units(high - low, apart_m))
     found = [*_strays(pieces, n, low, high), *units]
     if not units:
-        classified = np.empty((0, 3)) if ground is None else _every(ground, max(1, n // _SOME))
+        classified = np.empty((0, 3)) if ground is None else _every(ground, max(1, n // MAP_CHECK.checked_points))
         found += which_way_up(some, high - low, classified)
     twice = float((apart_m < 1e-6).mean())
     if twice >= 0.05:
@@ -129,7 +179,7 @@ def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> Iterator[Finding]:
     if strays:
         what = f"{strays} of {n} points lie far off all others, up to {far_m:.0f} m"
         mend = "strays, or another place's points: cut them off"
-        yield Finding("warning" if far_m > _STRAY_M else "note", what, mend)
+        yield Finding("warning" if far_m > MAP_CHECK.stray_m else "note", what, mend)
 
 
 def spacing(pieces: Pieces, some: F64) -> F64:
@@ -138,12 +188,12 @@ def spacing(pieces: Pieces, some: F64) -> F64:
     near, away = np.empty((0, 3)), np.empty(0)
     for points in pieces():
         distance = np.maximum(np.abs(points[:, 0] - centre[0]), np.abs(points[:, 1] - centre[1]))
-        close = distance <= (away.max() if len(away) == _NEAR else np.inf)
+        close = distance <= (away.max() if len(away) == MAP_CHECK.neighbour_points else np.inf)
         if not close.any():
             continue
         near, away = np.concatenate([near, points[close]]), np.concatenate([away, distance[close]])
-        if len(near) > _NEAR:
-            chosen = np.sort(np.argpartition(away, _NEAR - 1)[:_NEAR])
+        if len(near) > MAP_CHECK.neighbour_points:
+            chosen = np.sort(np.argpartition(away, MAP_CHECK.neighbour_points - 1)[: MAP_CHECK.neighbour_points])
             near, away = near[chosen], away[chosen]
     axis = int(np.argmax(np.ptp(near, axis=0)))
     order = np.argsort(near[:, axis])
@@ -177,7 +227,7 @@ def _units(wide: F64, apart: F64) -> Iterator[Finding]:
         yield Finding("error", what, mend)
     elif wide[2] < 0.05:
         yield Finding("error", "all points lie at one height: the map is flat", "is the column order x, y, z?")
-    elif wide[2] > _HIGHEST_M or (apart_m > 2.0 and wide[2] > 0.2 * _HIGHEST_M):
+    elif wide[2] > MAP_CHECK.highest_m or (apart_m > 2.0 and wide[2] > 0.2 * MAP_CHECK.highest_m):
         what = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
         yield Finding("error", what, mend)
     elif apart_m > 0.5:
@@ -262,7 +312,7 @@ def check_map(point_map: PointMap) -> Iterator[Finding]:
         what = f"ground and copies were checked in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
         yield Finding("note", what)
     lone = sum(int(lone_points(tile).sum()) for tile in some.tiles.values())
-    if lone > _MOST_LONE * some.n_points:
+    if lone > MAP_CHECK.most_lone * some.n_points:
         what = f"{lone} of {some.n_points} points stand above the ground and touch no other"
         yield Finding("note", what, "vehicles will deny them; mapvote import --clean drops them")
     standing = points[(height > 0.5) & (height < 6.0)]
@@ -271,7 +321,7 @@ def check_map(point_map: PointMap) -> Iterator[Finding]:
     if layer_m is not None:
         what = f"the road lies there twice, {abs(layer_m):.2f} m apart in height: a ghost layer"
         yield Finding("error", what, "two drives of different height were merged: align them")
-    elif float(np.median(spacing(in_memory(points), points))) < _SPARSE_M:
+    elif float(np.median(spacing(in_memory(points), points))) < MAP_CHECK.sparse_m:
         shift = ghost_shift(standing)
         if shift is not None:
             x, y = shift
@@ -288,7 +338,7 @@ def _around_the_middle(point_map: PointMap) -> PointMap:
     row, col = np.median(np.array(list(point_map.tiles)), axis=0)
     chosen: dict[TileIndex, Tile] = {}
     for index in sorted(point_map.tiles, key=lambda index: (np.hypot(index[0] - row, index[1] - col), index)):
-        if chosen and sum(len(tile.points) for tile in chosen.values()) > _MIDDLE_POINTS:
+        if chosen and sum(len(tile.points) for tile in chosen.values()) > MAP_CHECK.middle_points:
             break
         chosen[index] = point_map.tiles[index]
     return replace(point_map, tiles=dict(sorted(chosen.items())))
@@ -304,9 +354,9 @@ def _ground(points: F64, height: F64) -> Iterator[Finding]:
     if below > 0.01:
         what = f"{below:.1%} of the points lie more than 1 m below the ground"
         yield Finding("warning", what, "reflections, cellars, or a second layer below")
-    above = float((height > _ALOFT_M).mean())
+    above = float((height > MAP_CHECK.aloft_m).mean())
     if above > 0.001:
-        what = f"{above:.1%} of the points lie more than {_ALOFT_M:.0f} m above the ground"
+        what = f"{above:.1%} of the points lie more than {MAP_CHECK.aloft_m:.0f} m above the ground"
         mend = "outliers, or another place's points: cut them off; sound among towers only"
         yield Finding("error" if above > 0.01 else "warning", what, mend)
     near = np.abs(height) < 0.15
@@ -320,7 +370,7 @@ def _ground(points: F64, height: F64) -> Iterator[Finding]:
     p = p - p.mean(axis=0)
     slope, *_ = np.linalg.lstsq(np.column_stack([p[:, :2], np.ones(len(p))]), p[:, 2], rcond=None)
     slope_deg = float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
-    if slope_deg > _SLOPE_DEG:
+    if slope_deg > MAP_CHECK.slope_deg:
         what = f"the ground as a whole is tilted by {slope_deg:.1f} deg"
         yield Finding("warning", what, "sound on a steep street only; else z is not up: level the map")
     wide = height[np.abs(height) < 0.6]
@@ -348,7 +398,7 @@ def _frame(point_map: PointMap) -> Finding:
         low = np.minimum(low, points.min(axis=0, initial=np.inf))
         high = np.maximum(high, points.max(axis=0, initial=-np.inf))
     extent = ", ".join(f"{axis} {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
-    if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > _FAR_M:
+    if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > MAP_CHECK.far_m:
         what = f"the map does not name its coordinate system ({extent})"
         return Finding("warning", what, "import it with --from-crs EPSG:n, so that GNSS and maps find it")
     return Finding("note", f"{extent}; {frame.told()}")
@@ -357,7 +407,7 @@ def _frame(point_map: PointMap) -> Finding:
 def _lean(standing: F64) -> Iterator[Finding]:
     """Do walls and poles stand upright? On a slope they do; in a map that is tilted they lean. ``standing`` (n, 3)."""
     sides = _sides(standing)
-    if len(sides) < 3 * _ALIKE:
+    if len(sides) < 3 * LEAN_CHECK.alike:
         return
     # What stands along (a, b, 1) has sides n with n_x a + n_y b = -n_z: Cauchy's robust least squares.
     A, b = sides[:, :2], -sides[:, 2]
@@ -370,9 +420,9 @@ def _lean(standing: F64) -> Iterator[Finding]:
         lean = np.asarray(np.linalg.solve(normal, weighted.T @ b))
     by = float(np.linalg.norm(lean))
     along = lean / max(by, 1e-9)
-    sigma_deg = float(np.degrees(spread * np.sqrt(_ALIKE * along @ np.linalg.inv(normal) @ along)))
+    sigma_deg = float(np.degrees(spread * np.sqrt(LEAN_CHECK.alike * along @ np.linalg.inv(normal) @ along)))
     by_deg = float(np.degrees(np.arctan(by)))
-    if by_deg > max(_LEAN_DEG, _LEAN_SIGMAS * sigma_deg):
+    if by_deg > max(LEAN_CHECK.lean_deg, LEAN_CHECK.lean_sigmas * sigma_deg):
         pitch, roll = np.degrees(np.arctan(lean[0])), np.degrees(np.arctan(-lean[1]))
         what = f"walls and poles lean by {by_deg:.1f} deg (+-{sigma_deg:.1f}): the map is tilted"
         mend = f"level it: turn its points back by pitch {pitch:.1f} deg (about y) and roll {roll:.1f} deg (about x)"
@@ -381,9 +431,9 @@ def _lean(standing: F64) -> Iterator[Finding]:
 
 def _sides(standing: F64) -> F64:
     """(m, 3) directions, near the horizontal, square to what stands: normals of walls, two for each pole."""
-    if len(standing) < _FEW:
+    if len(standing) < MAP_CHECK.few_points:
         return np.empty((0, 3))
-    voxel = np.floor((standing - standing.min(axis=0)) / _PATCH_M).astype(np.int64)
+    voxel = np.floor((standing - standing.min(axis=0)) / LEAN_CHECK.patch_m).astype(np.int64)
     key = np.ravel_multi_index(tuple(voxel.T), tuple(voxel.max(axis=0) + 1))
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
@@ -391,10 +441,14 @@ def _sides(standing: F64) -> F64:
     points = standing[order] - standing.mean(axis=0)
     points -= np.repeat(np.add.reduceat(points, starts) / count[:, None], count, axis=0)
     covariance = np.add.reduceat(points[:, :, None] * points[:, None, :], starts) / count[:, None, None]
-    spread, axes = np.linalg.eigh(covariance[count >= _PATCH_POINTS])
+    spread, axes = np.linalg.eigh(covariance[count >= LEAN_CHECK.patch_points])
     wall = (spread[:, 0] < 0.06**2) & (spread[:, 1] > 0.2**2) & (spread[:, 0] < 0.1 * spread[:, 1])
-    wall &= np.abs(axes[:, 2, 0]) < _UPRIGHT
-    pole = (spread[:, 1] < 0.1**2) & (spread[:, 2] > 0.25**2) & (np.abs(axes[:, 2, 2]) > np.sqrt(1.0 - _UPRIGHT**2))
+    wall &= np.abs(axes[:, 2, 0]) < LEAN_CHECK.upright
+    pole = (
+        (spread[:, 1] < 0.1**2)
+        & (spread[:, 2] > 0.25**2)
+        & (np.abs(axes[:, 2, 2]) > np.sqrt(1.0 - LEAN_CHECK.upright**2))
+    )
     return np.concatenate([axes[wall, :, 0], axes[pole, :, 0], axes[pole, :, 1]])
 
 
@@ -404,9 +458,9 @@ def ghost_layer(height: F64) -> float | None:
     ``height`` (n,) of points over the ground. A second road is as sharp a peak of their histogram as the first; kerbs,
     cars and hedges are broad.
     """
-    if (np.abs(height) < 1.0).sum() < _FEW:
+    if (np.abs(height) < 1.0).sum() < MAP_CHECK.few_points:
         return None
-    count, edges = np.histogram(height[np.isfinite(height)], bins=np.arange(-2.5, 2.5, _BIN_M))
+    count, edges = np.histogram(height[np.isfinite(height)], bins=np.arange(-2.5, 2.5, MAP_CHECK.bin_m))
     peak = np.convolve(count, np.ones(3), mode="same")
     middle = 0.5 * (edges[1:] + edges[:-1])
     ground = float(peak[np.abs(middle) < 0.15].max())
@@ -425,19 +479,19 @@ def ghost_shift(standing: F64) -> tuple[float, float] | None:
     themselves at every shift along them, but less so the larger it is: only a copy is more alike at its shift than at
     half of that.
     """
-    if len(standing) < _FEW:
+    if len(standing) < MAP_CHECK.few_points:
         return None
-    reach = int(_FARTHEST_M / _CELL_M)
-    near = _likeness(standing, _CELL_M, _SIDE, reach)
+    reach = int(COPY_CHECK.farthest_m / COPY_CHECK.cell_m)
+    near = _likeness(standing, COPY_CHECK.cell_m, COPY_CHECK.side, reach)
     usual = 1.4826 * float(np.median(np.abs(near - np.median(near))))
     # Only what rises above everything half a metre around it is a copy.
     ring = np.ones((7, 7), dtype=bool)
     ring[2:5, 2:5] = False
     sharp = near - scipy.ndimage.percentile_filter(near, 90, footprint=ring)
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * _CELL_M
-    sharp[(np.hypot(x, y) < _NEAREST_M) | (near < scipy.ndimage.maximum_filter(near, 5))] = 0.0
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * COPY_CHECK.cell_m
+    sharp[(np.hypot(x, y) < COPY_CHECK.nearest_m) | (near < scipy.ndimage.maximum_filter(near, 5))] = 0.0
     best = np.unravel_index(int(np.argmax(sharp)), sharp.shape)
-    if sharp[best] >= _PEAK * usual:
+    if sharp[best] >= COPY_CHECK.peak * usual:
         return float(x[best]), float(y[best])
     return _shift_beside(standing)
 
@@ -458,17 +512,17 @@ def _likeness(standing: F64, cell_m: float, side: int, reach: int) -> F64:
 
 
 def _shift_beside(standing: F64) -> tuple[float, float] | None:
-    reach = int(1.7 * _BESIDE_M[1] / _NEAR_CELL_M)
-    near = _likeness(standing, _NEAR_CELL_M, _NEAR_SIDE, reach)
+    reach = int(1.7 * COPY_CHECK.fine_shift_m[1] / COPY_CHECK.fine_cell_m)
+    near = _likeness(standing, COPY_CHECK.fine_cell_m, COPY_CHECK.fine_side, reach)
     near /= near[reach, reach]
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64)
     half, more = (
         scipy.ndimage.map_coordinates(near, [reach + f * y, reach + f * x], order=1, mode="nearest") for f in (0.5, 1.5)
     )
     contrast = near - np.maximum(half, more)
-    away_m = np.hypot(x, y) * _NEAR_CELL_M
-    contrast[(away_m < _BESIDE_M[0]) | (away_m > _BESIDE_M[1])] = 0.0
+    away_m = np.hypot(x, y) * COPY_CHECK.fine_cell_m
+    contrast[(away_m < COPY_CHECK.fine_shift_m[0]) | (away_m > COPY_CHECK.fine_shift_m[1])] = 0.0
     best = np.unravel_index(int(np.argmax(contrast)), contrast.shape)
-    if contrast[best] < _CONTRAST:
+    if contrast[best] < COPY_CHECK.contrast:
         return None
-    return float(x[best]) * _NEAR_CELL_M, float(y[best]) * _NEAR_CELL_M
+    return float(x[best]) * COPY_CHECK.fine_cell_m, float(y[best]) * COPY_CHECK.fine_cell_m

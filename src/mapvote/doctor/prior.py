@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, inverses, log, poses_at
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64
 from mapvote.doctor.drive_evidence import Run
 
@@ -22,16 +23,31 @@ Rule = Callable[[F64], F64]
 """Poses (n, 4, 4) from poses (n, 4, 4)."""
 CAMERA_TO_LIDAR = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From x right, y down, z forward to x forward, y left, z up."""
-_DEGREE_M = 111_320.0
-LEVER_M = 10.0
-"""A rotation counts as what it moves at this distance."""
-_TIME_S = 3.0
-"""Shifts in time are looked for so far, and over a quarter of the drive: beyond, little is left to compare."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PriorCheck:
+    """Numbers of the comparison of a prior with the motion that scans show."""
+
+    degree_m: float = 111_320.0
+    """Length of a degree of latitude, metres."""
+    lever_m: float = 10.0
+    """Distance at which a rotation counts as a shift, metres."""
+    time_s: float = 3.0
+    """Largest shift in time that is searched, seconds, within a quarter of the drive: beyond, little is left to
+    compare."""
+    sure: float = 4.0
+    """Standard errors from which a deviation is an error."""
+    likely: float = 2.0
+    """Standard errors from which a deviation may be an error."""
+    sure_of_time: float = 5.0
+    """Standard errors from which a shift in time is an error."""
+
+
+PRIOR_CHECK = PriorCheck()
 LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
 """Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
-SURE, LIKELY = 4.0, 2.0
-"""Standard errors: what is more than so many is an error, and may be one."""
-_SURE_OF_TIME = 5.0
 X_FORWARD = "turn the points, or T_base_lidar, so that x is forward"
 
 
@@ -111,8 +127,8 @@ def _from_degrees(first: int) -> Rule:
 
     def metres(p: F64) -> F64:
         longitude, latitude = p[:, first], p[:, 1 - first]
-        east = longitude * _DEGREE_M * np.cos(np.radians(np.clip(latitude[0], -89, 89)))
-        return np.column_stack([east, latitude * _DEGREE_M, p[:, 2]])
+        east = longitude * PRIOR_CHECK.degree_m * np.cos(np.radians(np.clip(latitude[0], -89, 89)))
+        return np.column_stack([east, latitude * PRIOR_CHECK.degree_m, p[:, 2]])
 
     return _moved(metres)
 
@@ -217,7 +233,9 @@ class Number:
     @property
     def least(self) -> float:
         """What the drive can surely show."""
-        return max(LEAST[self.kind], (_SURE_OF_TIME if self.kind == "time" else SURE) * self.off[1])
+        return max(
+            LEAST[self.kind], (PRIOR_CHECK.sure_of_time if self.kind == "time" else PRIOR_CHECK.sure) * self.off[1]
+        )
 
     @property
     def words(self) -> tuple[str, str]:
@@ -261,7 +279,7 @@ def _residuals(T: F64, runs: Sequence[Run]) -> F64:
 def misfits(T: F64, runs: Sequence[Run]) -> F64:
     """(runs,) metres by which the motion of each run differs, a rotation by what it moves 10 m away."""
     r = _residuals(T, runs)
-    each = np.linalg.norm(r[:, :3], axis=1) + LEVER_M * np.linalg.norm(r[:, 3:], axis=1)
+    each = np.linalg.norm(r[:, :3], axis=1) + PRIOR_CHECK.lever_m * np.linalg.norm(r[:, 3:], axis=1)
     return np.asarray(each.reshape(-1, 2).mean(axis=1))
 
 
@@ -276,7 +294,7 @@ def at_times(T: F64, stamps_ns: I64, shift_s: float) -> F64:
 
 def _fit_rule(rule: Callable[[F64], Rule], starts: list[F64], T: F64, runs: Sequence[Run]) -> tuple[F64, F64]:
     """(parameters (p,) of ``rule`` that fit the runs best, their standard errors (p,)): robust, from several starts."""
-    weights = np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
+    weights = np.array([1.0, 1.0, 1.0, PRIOR_CHECK.lever_m, PRIOR_CHECK.lever_m, PRIOR_CHECK.lever_m])
 
     def off(parameters: F64) -> F64:
         return np.asarray((_residuals(rule(parameters)(T), runs) * weights).ravel())
@@ -318,7 +336,7 @@ def measure_turn(T: F64, runs: Sequence[Run]) -> tuple[Number, Number]:
 
 def measure_time(T: F64, runs: Sequence[Run], stamps_ns: I64) -> Number | None:
     """How much later than the scans the prior's times are; None if no shift that the drive can show fits."""
-    most_s = min(_TIME_S, (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / 4.0)
+    most_s = min(PRIOR_CHECK.time_s, (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / 4.0)
 
     def rule(p: F64) -> Rule:
         return lambda T: at_times(T, stamps_ns, float(p[0]))

@@ -20,10 +20,8 @@ from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
 from mapvote.doctor.prior import (
     AS_IT_IS,
     LEAST,
-    LEVER_M,
-    LIKELY,
+    PRIOR_CHECK,
     READINGS,
-    SURE,
     X_FORWARD,
     Number,
     Reading,
@@ -161,7 +159,7 @@ def _two_at_once(T: F64, fits: Sequence[_Fit], runs: Sequence[Run], road: Road) 
 def _explained_m(drive: Drive, reading: Reading, left_m: float, length_m: float) -> float:
     """By how much the prior's own errors may move the ends of a run. Where ``left_m`` remains under a reading, they are
     hardly more than twice that, whatever drive.toml states. A catch-all levels the prior too."""
-    tilt_m = LEVER_M * np.radians(2.0 * drive.prior_sigma_deg) if reading.catch_all else 0.0
+    tilt_m = PRIOR_CHECK.lever_m * np.radians(2.0 * drive.prior_sigma_deg) if reading.catch_all else 0.0
     return float(1.5 * min(drive.prior_sigma_m, 2.0 * left_m) + tilt_m + 0.01 * length_m)
 
 
@@ -292,7 +290,7 @@ def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Findi
         speed_mps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / (np.diff(stamps_ns) * 1e-9)
         shift_m = abs(time.value) * float(np.median(speed_mps))
         better = later is not None and later.rms_m < 0.8 * whole.rms_m
-        if later is not None and better and shift_m > SURE * min(sigma_m, later.rms_m):
+        if later is not None and better and shift_m > PRIOR_CHECK.sure * min(sigma_m, later.rms_m):
             yield Finding("error" if abs(time.value) > 2.0 * LEAST["time"] else "warning", *time.words)
             return
     if whole is None:
@@ -343,10 +341,10 @@ def _shows(time: Number, T: F64, runs: Sequence[Run]) -> bool:
 
 def _small(number: Number) -> Iterator[Finding]:
     off, sigma = number.off
-    if off <= max(LEAST[number.kind], LIKELY * sigma):
+    if off <= max(LEAST[number.kind], PRIOR_CHECK.likely * sigma):
         return
     what, mend = number.words
-    if off <= SURE * sigma:
+    if off <= PRIOR_CHECK.sure * sigma:
         yield Finding("note", f"{what}; that may be chance", f"a longer drive decides; else: {mend}")
     else:
         yield Finding("error" if off > 2.0 * LEAST[number.kind] else "warning", what, mend)
@@ -371,7 +369,7 @@ def _places(as_it_is: _Fit, runs: Sequence[Run], prior_sigma_m: float) -> Iterat
 
 
 def _scatter(drive: Drive, as_it_is: _Fit, length_m: float) -> Iterator[Finding]:
-    tilt_m = LEVER_M * np.radians(2.0 * drive.prior_sigma_deg)
+    tilt_m = PRIOR_CHECK.lever_m * np.radians(2.0 * drive.prior_sigma_deg)
     if as_it_is.median >= 1.5 * drive.prior_sigma_m + tilt_m + 0.01 * length_m:
         what = f"the prior is off the scans' motion by {as_it_is.median:.1f} m over {length_m:.0f} m, but "
         mend = "say how far it may be off: prior_sigma_m, prior_sigma_deg in drive.toml"

@@ -17,30 +17,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.mount import mount_of_prior
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan, TimesTold
 from mapvote.doctor import Finding, Severity, any_error, usable
 from mapvote.doctor.lean import check_lean
 from mapvote.formats.drives.options import source_of_times
 from mapvote.formats.drives.sensor_estimate import contradiction
 
-_SECTORS = 36
-_POINTS = 12_000
-"""Points of a scan that are checked."""
-_BINS, _BIN_M = 400, 0.5
-_QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05)
-"""Steps to which coordinates may have been rounded."""
-_CUT_SHARE = 0.6
-"""A scan with fewer points than this share of its neighbours' is cut off."""
-_EMPTY_SECTOR = 0.05
-"""A sector with less than this share of an even one's points is empty."""
-_SOME_SCANS = 0.05
-"""A drive of which no larger share is spoilt can be used as it is, and the doctor warns."""
-_PERIOD_POINTS = 50_000
-_FAR_M = 50.0
-"""The mean of the points in the sensor's frame is never so far from the origin."""
-_FIRST_LOOK = 24
-"""Scans checked before a drive is used: defects of all scans show, for a tenth of a second."""
-_FASTEST_MPS = 70.0
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ScanCheck:
+    """Numbers of the checks of single scans."""
+
+    sectors: int = 36
+    """Sectors of a turn."""
+    points: int = 12_000
+    """Points of a scan that are checked."""
+    range_bins: int = 400
+    """Bins of the histogram of ranges."""
+    bin_m: float = 0.5
+    """Width of such a bin, metres."""
+    quanta_m: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1, 0.05)
+    """Steps to which coordinates may have been rounded, metres."""
+    cut_share: float = 0.6
+    """Points of a scan as a share of its neighbours' below which it is cut off."""
+    empty_sector: float = 0.05
+    """Points of a sector as a share of an even one's below which it is empty."""
+    spoilt_share: float = 0.05
+    """Share of spoilt scans up to which a drive can be used as it is, with a warning."""
+    period_points: int = 50_000
+    """Points of a scan by which its period is measured."""
+    far_m: float = 50.0
+    """Distance of the mean of the points from the sensor that no scan reaches, metres."""
+    first_scans: int = 24
+    """Scans checked before a drive is used: defects of all scans show, for a tenth of a second."""
+    fastest_mps: float = 70.0
+    """Fastest vehicle, metres per second."""
+
+
+SCAN_CHECK = ScanCheck()
 IN_MAP_FRAME = Finding(
     "error",
     "the points are in the map's frame already: they move along with the prior",
@@ -64,10 +80,14 @@ _LOOK = np.dtype(
         ("high", "f8", 3),
         ("mean", "f8", 3),
         ("range_m", "f8", 3),  # ranges from the origin: of a tenth, half and 99 % of the points
-        ("sectors", "f8", _SECTORS),  # share of the points in each ten degrees of azimuth about the vertical, from -180
+        (
+            "sectors",
+            "f8",
+            SCAN_CHECK.sectors,
+        ),  # share of the points in each ten degrees of azimuth about the vertical, from -180
         ("near", "f8"),  # share within 2 m of the origin
         ("unit", "f8", 3),  # share of each coordinate that lies in [0, 1]
-        ("rounded", "f8", len(_QUANTA_M)),  # share of the points whose x, y and z are multiples of _QUANTA_M
+        ("rounded", "f8", len(SCAN_CHECK.quanta_m)),  # share of the points whose x, y and z are multiples of quanta_m
         ("turns", "f8"),  # how often the points, in their order, go round counter-clockwise
         ("digest", "f8"),  # a number that two different scans hardly share
     ]
@@ -156,7 +176,11 @@ def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) 
     """A drive that must be usable. Some of its scans are looked at before, the others when they are read: so none is
     read only to be looked at. MapvoteError with the first error that some of the scans show, as of all scans."""
     looking = Looking(drive)
-    some = np.unique(np.linspace(0, len(drive) - 1, _FIRST_LOOK).astype(np.int64)).tolist() if len(drive) else []
+    some = (
+        np.unique(np.linspace(0, len(drive) - 1, SCAN_CHECK.first_scans).astype(np.int64)).tolist()
+        if len(drive)
+        else []
+    )
     if any_error(cheap_checks(drive, looking.look(some, progress))):
         looking.warnings(progress)
     return looking
@@ -164,17 +188,22 @@ def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) 
 
 def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
     """One row of :class:`Looks`: of every so many of the points (n, 3). ``R`` (3, 3) turns them to z up."""
-    xyz = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
+    xyz = points[:: max(1, len(points) // SCAN_CHECK.points)].astype(np.float64)
     n = len(xyz)
     share = 1.0 / max(n, 1)
     level = xyz if R is None else xyz @ R.T
     distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(level[:, 1], level[:, 0])
-    seen = np.cumsum(np.bincount(np.minimum(distance / _BIN_M, _BINS - 1.0).astype(np.int64), minlength=_BINS))
-    sectors = ((azimuth + np.pi) / (2.0 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
+    seen = np.cumsum(
+        np.bincount(
+            np.minimum(distance / SCAN_CHECK.bin_m, SCAN_CHECK.range_bins - 1.0).astype(np.int64),
+            minlength=SCAN_CHECK.range_bins,
+        )
+    )
+    sectors = ((azimuth + np.pi) / (2.0 * np.pi) * SCAN_CHECK.sectors).astype(np.int64) % SCAN_CHECK.sectors
     steps = np.diff(azimuth)
     steps -= 2.0 * np.pi * np.round(steps / (2.0 * np.pi))
     rounded = []
-    for quantum in _QUANTA_M:
+    for quantum in SCAN_CHECK.quanta_m:
         whole = np.abs(xyz[:, 0] / quantum - np.round(xyz[:, 0] / quantum)) < 1e-3  # of x, which is mostly no multiple
         off = xyz[whole] / quantum
         rounded.append((np.abs(off - np.round(off)) < 1e-3).all(axis=1).sum() / max(n, 1))
@@ -182,8 +211,8 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
     row["index"], row["count"] = index, len(points)
     row["low"], row["high"] = xyz.min(axis=0, initial=np.inf), xyz.max(axis=0, initial=-np.inf)
     row["mean"] = xyz.sum(axis=0) * share
-    row["range_m"] = [(np.searchsorted(seen, part * n) + 0.5) * _BIN_M for part in (0.1, 0.5, 0.99)]
-    row["sectors"] = np.bincount(sectors, minlength=_SECTORS) * share
+    row["range_m"] = [(np.searchsorted(seen, part * n) + 0.5) * SCAN_CHECK.bin_m for part in (0.1, 0.5, 0.99)]
+    row["sectors"] = np.bincount(sectors, minlength=SCAN_CHECK.sectors) * share
     row["near"] = (distance < 2.0).sum() * share
     row["unit"] = ((xyz >= 0.0) & (xyz <= 1.0)).sum(axis=0) * share
     row["rounded"] = rounded
@@ -210,7 +239,7 @@ def _in_map_frame(T: F64, looks: Looks) -> bool:
     position, mean = T[looks["index"], :3, 3], looks["mean"]
     away_m = float(np.median(np.linalg.norm(position, axis=1)))
     off_m = float(np.median(np.linalg.norm(mean - position, axis=1)))
-    if away_m > _FAR_M and off_m < 0.5 * away_m:
+    if away_m > SCAN_CHECK.far_m and off_m < 0.5 * away_m:
         return True
     p = position[:, :2]
     if len(p) < 5 or np.linalg.norm(p.max(axis=0) - p.min(axis=0)) < 8.0:
@@ -260,7 +289,7 @@ def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
         yield Finding("warning", what, "if the vehicle did, the file is not its trajectory; else all is well")
     else:
         speed_mps = float(np.median(steps_m / (np.diff(drive.stamps_ns) * 1e-9)))
-        if speed_mps > _FASTEST_MPS:
+        if speed_mps > SCAN_CHECK.fastest_mps:
             mend = "check the unit of its positions (metres) and of the times (seconds)"
             yield Finding("error", f"the prior moves at {speed_mps:.0f} m/s", mend)
         yield from _jumps_and_stops(steps_m, usual_m)
@@ -310,7 +339,9 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
         if far_m < 15.0:
             mend = "cut to a small range? Votes need what stands beside the road, 20 m and more"
             yield Finding("warning", f"99 % of the points lie within {far_m:.0f} m", mend)
-    coarse = [q for q, share in zip(_QUANTA_M, np.median(looks["rounded"], axis=0), strict=True) if share > 0.95]
+    coarse = [
+        q for q, share in zip(SCAN_CHECK.quanta_m, np.median(looks["rounded"], axis=0), strict=True) if share > 0.95
+    ]
     if coarse:
         what = f"coordinates are rounded to {coarse[0]:g} m"
         yield Finding("error" if coarse[0] > 0.2 else "warning", what, "write them in millimetres or as float32")
@@ -345,7 +376,7 @@ def _times_of_points(times: Counter[TimesTold]) -> Iterator[Finding]:
 
 
 def _severity(spoilt: int, scans: int) -> Severity:
-    return "error" if spoilt > _SOME_SCANS * scans else "warning"
+    return "error" if spoilt > SCAN_CHECK.spoilt_share * scans else "warning"
 
 
 def _refused(drive: Drive, looks: Looks) -> Iterator[Finding]:
@@ -406,7 +437,7 @@ def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
 def _period(scan: Scan) -> tuple[int, int]:
     """(after how many numbers a scan repeats itself, how many columns were read): neighbouring points are alike, column
     by column."""
-    points = scan.points[:_PERIOD_POINTS].astype(np.float64)
+    points = scan.points[: SCAN_CHECK.period_points].astype(np.float64)
     # Intensities may have been scaled when they were read: their column only keeps its place.
     flat = (
         points if "intensity" not in scan.fields else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)
@@ -434,7 +465,7 @@ def _units(looks: Looks) -> Iterator[Finding]:
 def _counts(drive: Drive, looks: Looks) -> Iterator[Finding]:
     count, sensor = looks["count"], drive.sensor
     around = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(count, 4, mode="edge"), 9), axis=1)
-    cut = np.flatnonzero(count < _CUT_SHARE * around)
+    cut = np.flatnonzero(count < SCAN_CHECK.cut_share * around)
     if len(cut):
         k = int(cut[np.argmin(count[cut] / around[cut])])
         what = f"scan {looks['index'][k]} holds {count[k]} points, those around it {around[k]:.0f}: cut off?"
@@ -459,17 +490,17 @@ def _sectors(drive: Drive, looks: Looks) -> Iterator[Finding]:
     """Directions in which hardly any scan sees anything, and scans that lack what the others see."""
     sectors = looks["sectors"]
     mean = sectors.mean(axis=0)
-    empty = mean * _SECTORS < _EMPTY_SECTOR
-    blind_deg = 360.0 / _SECTORS * int(empty.sum())
+    empty = mean * SCAN_CHECK.sectors < SCAN_CHECK.empty_sector
+    blind_deg = 360.0 / SCAN_CHECK.sectors * int(empty.sum())
     if blind_deg >= 60.0:
         start_deg = -180.0 + 10.0 * int(np.argmax(empty & ~np.roll(empty, 1)))
         what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start_deg:.0f} deg counter-clockwise)"
         mend = "part of every revolution is missing? Sound only for a sensor that sees no more, or is hidden there"
-        middle = np.radians(-175.0 + 10.0 * np.arange(_SECTORS))
+        middle = np.radians(-175.0 + 10.0 * np.arange(SCAN_CHECK.sectors))
         facing = np.arctan2(mean @ np.sin(middle), mean @ np.cos(middle))
         looks_ahead = not drive.sensor.rings and abs(facing) < np.radians(30.0)
         yield Finding("note" if looks_ahead else "warning", what, mend)
-    lost_deg = ((sectors < _EMPTY_SECTOR * mean) & (mean * _SECTORS > 0.3)).sum(axis=1) * 10.0
+    lost_deg = ((sectors < SCAN_CHECK.empty_sector * mean) & (mean * SCAN_CHECK.sectors > 0.3)).sum(axis=1) * 10.0
     bad = np.flatnonzero(lost_deg >= 60.0)
     if 0 < len(bad) < 0.5 * len(lost_deg):
         k = int(bad[np.argmax(lost_deg[bad])])

@@ -9,29 +9,42 @@ before and after. A plane through all points nearby, of both cells, gives the si
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from mapvote.core.columns import column_bits, flat_cells
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
 from mapvote.core.kernel import kernel
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote, offered
 
 REACH_M = 0.45
 """How far about a point its plane is fitted, a voxel and a half: some eight points of a wall."""
-NEAR_M = 0.15
-"""As far as noise carries, half a cell: what lies deeper in its cell belongs there."""
-_BESIDE = 2
-"""Cells around one whose points its planes are fitted to."""
-_ENOUGH = 6
-_FLAT = 3.0
-"""A plane: as many points, whose variance is as many times as large along it as across it."""
-_UPRIGHT = 0.5
-"""Sine of how far a wall may lean."""
-_STAY = 0.05
-"""As large a part of a cell's points may stay in it: beside them stands no plane."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class NoiseRule:
+    """Numbers by which points of a wall's noise in a neighbouring cell are recognised."""
+
+    near_m: float = 0.15
+    """Reach of noise beyond the border of a cell, half a cell, metres: a point deeper in its cell belongs there."""
+    beside_cells: int = 2
+    """Cells around one whose points its planes are fitted to."""
+    enough_points: int = 6
+    """Points of a plane at least."""
+    flat: float = 3.0
+    """Variance of a plane's points along it as a multiple of that across it, at least."""
+    upright: float = 0.5
+    """Sine of the largest lean of a wall."""
+    stay_share: float = 0.05
+    """Share of a cell's points that may stay in it: beside them stands no plane."""
+
+
+NOISE_RULE = NoiseRule()
 
 
 def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
@@ -50,8 +63,8 @@ def without_spilled_in(cells: I64, states: U8, tile: Tile) -> U8:
     them: states elsewhere are NO_VOTE."""
     rows, cols = np.divmod(cells, TILE_CELLS)
     near = np.full(states.shape, NO_VOTE, dtype=np.uint8)
-    for i in range(-_BESIDE, _BESIDE + 1):
-        for j in range(-_BESIDE, _BESIDE + 1):
+    for i in range(-NOISE_RULE.beside_cells, NOISE_RULE.beside_cells + 1):
+        for j in range(-NOISE_RULE.beside_cells, NOISE_RULE.beside_cells + 1):
             at = (rows + i).clip(0, TILE_CELLS - 1), (cols + j).clip(0, TILE_CELLS - 1)
             near[at] = states[at]
     return without_spilled(np.where(near == int(CellState.CHANGED_EMPTY), near, np.uint8(NO_VOTE)), tile, ())
@@ -70,7 +83,7 @@ def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
             (_going(tile, flat), int(CellState.CHANGED_EMPTY)),
             (offered(votes, states, tile.window)[0], int(CellState.CHANGED_OCCUPIED)),
         )
-        if len(points) >= _ENOUGH
+        if len(points) >= NOISE_RULE.enough_points
     ]
     return np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
 
@@ -93,7 +106,7 @@ def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:
     stands = _on_planes(points, asked, np.concatenate([[0], np.cumsum(count)]), cells)
     own, to = cells[asked], flat_cells(window, stands.astype(np.float32))
     away = np.bincount(own[(to != own) & changed[to] & (count[to] > count[own])], minlength=CELLS)
-    return np.flatnonzero((away > 0) & (away >= (1.0 - _STAY) * count))
+    return np.flatnonzero((away > 0) & (away >= (1.0 - NOISE_RULE.stay_share) * count))
 
 
 def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool:
@@ -105,8 +118,8 @@ def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool
     within = CELL_SIZE * (points[:, :2] / np.float32(CELL_SIZE) % 1.0)
     for axis, step in ((0, 1), (1, wide)):
         for depth, across in ((within[:, axis], -step), (CELL_SIZE - within[:, axis], step)):
-            deep = np.bincount(cells[depth > NEAR_M], minlength=CELLS)
-            near = filled[deep[filled] <= _STAY * count[filled]]
+            deep = np.bincount(cells[depth > NOISE_RULE.near_m], minlength=CELLS)
+            near = filled[deep[filled] <= NOISE_RULE.stay_share * count[filled]]
             beside = held[(near // TILE_CELLS + 1) * wide + near % TILE_CELLS + 1 + across]
             found[near[beside > count[near]]] = True
     return found
@@ -120,9 +133,13 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
     _moments(points, asked, first, cells, n, mean, spread)
     variance, axes = np.linalg.eigh(spread)
     normal = axes[:, :, 0]
-    plane = (n >= _ENOUGH) & (variance[:, 1] > _FLAT * variance[:, 0]) & (np.abs(normal[:, 2]) < _UPRIGHT)
+    plane = (
+        (n >= NOISE_RULE.enough_points)
+        & (variance[:, 1] > NOISE_RULE.flat * variance[:, 0])
+        & (np.abs(normal[:, 2]) < NOISE_RULE.upright)
+    )
     off = (mean * normal).sum(axis=1)
-    plane &= np.abs(off) <= NEAR_M
+    plane &= np.abs(off) <= NOISE_RULE.near_m
     return np.asarray(about + np.where(plane, off, 0.0)[:, None] * normal)
 
 

@@ -20,18 +20,28 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.extras import require
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats.reading import first_line
 from mapvote.live.messages import READ, from_cdr, typestore
 from mapvote.live.ros_environment import ros_environment
 
-_DEPTH = 64
-"""Messages that a reader or a writer keeps: six seconds of clouds."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class DdsDepths:
+    """Lengths of queues of DDS."""
+
+    depth: int = 64
+    """Messages that a reader or a writer keeps: six seconds of clouds."""
+    taken: int = 640
+    """Messages that are taken at a time, at most."""
+
+
+DDS_DEPTHS = DdsDepths()
 _DEFAULTS = '<Domain id="any"><Internal><SocketReceiveBufferSize max="8MB"/></Internal></Domain>'
 """Cyclone DDS asks for 1 MB. A cloud of 64 beams has 3 MB, and waits in the socket while the process computes. The
 kernel gives no more than net.core.rmem_max."""
-_TAKEN = 640
-"""Messages that are taken at a time, at most."""
 _ALIVE, _ANY = 16, 0x7F
 """The instance state of a writer that exists; the mask of every sample, view and instance state."""
 
@@ -104,7 +114,7 @@ class Network:
             time.sleep(seconds)
 
     def subscribe(
-        self, topic: str, kind: str, *, reliable: bool, transient_local: bool = False, depth: int = _DEPTH
+        self, topic: str, kind: str, *, reliable: bool, transient_local: bool = False, depth: int = DDS_DEPTHS.depth
     ) -> Subscription:
         """Messages of ``topic`` from now on. A reader that requests more than its writers offer receives nothing."""
         qos = self._qos(reliable, transient_local, depth, 0)
@@ -119,7 +129,7 @@ class Network:
         *,
         reliable: bool = True,
         transient_local: bool = False,
-        depth: int = _DEPTH,
+        depth: int = DDS_DEPTHS.depth,
         patience_s: float = 1.0,
     ) -> Publication:
         """A writer of ``topic``; ``patience_s``: how long it waits for a slow reader, if it is reliable."""
@@ -212,13 +222,13 @@ class Subscription:
         self._topic, self._reader = topic, reader
         internal = require("cyclonedds.internal", "ros2", "DDS")
         self._library = internal.DDS._dll_handle
-        self._handles = (ctypes.c_void_p * _TAKEN)()
-        self._infos = (internal.dds_c_t.sample_info * _TAKEN)()
+        self._handles = (ctypes.c_void_p * DDS_DEPTHS.taken)()
+        self._infos = (internal.dds_c_t.sample_info * DDS_DEPTHS.taken)()
 
     def take(self) -> list[tuple[int, memoryview]]:
         """Every message that arrived since the last call: the time at which its writer sent it, nanoseconds since 1970
         by the writer's clock, and its bytes. The oldest are lost if there were too many."""
-        count: int = self._library.dds_takecdr(self._reader._ref, self._handles, _TAKEN, self._infos, _ANY)
+        count: int = self._library.dds_takecdr(self._reader._ref, self._handles, DDS_DEPTHS.taken, self._infos, _ANY)
         if count < 0:
             raise MapvoteError(f"{self._topic}: DDS cannot read it (error {count})")
         taken = zip(self._infos[:count], self._handles[:count], strict=True)

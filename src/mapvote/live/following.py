@@ -5,15 +5,27 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats.maps.autoware import Change
 from mapvote.live.log_lines import Repeated
 from mapvote.live.map_loader import LoaderService
 
-_ROUND_S = 0.2
-_TOLD_EVERY_S = 60.0
-"""Between two lines that no version has come yet."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class FollowingTimes:
+    """Times of a folder that follows a server's versions."""
+
+    round_s: float = 0.2
+    """Time of one round of the service of requests, seconds."""
+    log_every_s: float = 60.0
+    """Time between two log lines that no version has come yet, seconds."""
+
+
+FOLLOWING_TIMES = FollowingTimes()
 
 
 class Follower:
@@ -62,7 +74,7 @@ def serve_followed(
         except MapvoteError as error:
             repeated("table", f"{error}; the tiles before are served")
         if not service.exists and time.monotonic() >= told_s:
-            told_s = time.monotonic() + _TOLD_EVERY_S
+            told_s = time.monotonic() + FOLLOWING_TIMES.log_every_s
             say(f"no version of the map is here yet, and no service is offered: {follower.trouble or 'it is fetched'}")
-        service.serve(_ROUND_S)
+        service.serve(FOLLOWING_TIMES.round_s)
     service.close()

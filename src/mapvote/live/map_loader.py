@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats.listing import plain_name
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
@@ -37,12 +38,22 @@ from mapvote.live.dds import Network, Publication, Subscription
 from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
 
 log = logging.getLogger("mapvote.live")
-_DEPTH = 10
-"""Requests and answers that wait in DDS at most, as ROS 2's services have it."""
-_TRIES = 5
-"""An answer is sent so often; each time a reliable reader has a second to take it."""
-_DELIVERY_S = 5.0
-"""How long the last answers may take to arrive before the service ends."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class LoaderWaits:
+    """Numbers of the delivery of answers over DDS."""
+
+    depth: int = 10
+    """Requests and answers that wait in DDS at most, as ROS 2's services have it."""
+    tries: int = 5
+    """Deliveries of an answer; after each a reliable reader has a second to take it."""
+    delivery_s: float = 5.0
+    """Time for the last answers to arrive before the service ends, seconds."""
+
+
+LOADER_WAITS = LoaderWaits()
 DIFFERENTIAL, PARTIAL, SELECTED = (
     f"autoware_map_msgs/srv/{name}"
     for name in ("GetDifferentialPointCloudMap", "GetPartialPointCloudMap", "GetSelectedPointCloudMap")
@@ -224,8 +235,8 @@ class LoaderService:
         ]
         for kind, name in SERVICES.items():
             # Replies first: a client that finds the reader of requests can be answered.
-            replies = network.publish(f"rr{name}Reply", f"{kind}_Response", depth=_DEPTH)
-            requests = network.subscribe(f"rq{name}Request", f"{kind}_Request", reliable=True, depth=_DEPTH)
+            replies = network.publish(f"rr{name}Reply", f"{kind}_Response", depth=LOADER_WAITS.depth)
+            requests = network.subscribe(f"rq{name}Request", f"{kind}_Request", reliable=True, depth=LOADER_WAITS.depth)
             self._ends.append((kind, requests, replies))
 
     def serve(self, seconds: float) -> None:
@@ -241,8 +252,8 @@ class LoaderService:
         self.serve(0.0)
         for kind, requests, replies in self._ends:
             requests.close()
-            if not replies.delivered(_DELIVERY_S):
-                log.warning("%s: a client did not take its answer in %.0f s", SERVICES[kind], _DELIVERY_S)
+            if not replies.delivered(LOADER_WAITS.delivery_s):
+                log.warning("%s: a client did not take its answer in %.0f s", SERVICES[kind], LOADER_WAITS.delivery_s)
         self._ends = []
 
     def _reply(self, kind: str, data: memoryview) -> bytes:
@@ -261,9 +272,9 @@ class LoaderService:
 
     def _send(self, publication: Publication, data: bytes) -> None:
         """A message that a slow reader does not take is tried again: a client waits for its answer without an end."""
-        for tries in range(_TRIES):
+        for tries in range(LOADER_WAITS.tries):
             try:
                 publication.send(data)
                 return
             except MapvoteError as error:
-                log.warning("%s (%d of %d tries)", error, tries + 1, _TRIES)
+                log.warning("%s (%d of %d tries)", error, tries + 1, LOADER_WAITS.tries)

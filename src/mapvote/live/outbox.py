@@ -29,6 +29,7 @@ import msgspec
 
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, decode, encode, path_near
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.vehicle import stretch_name
@@ -36,12 +37,23 @@ from mapvote.vehicle import stretch_name
 log = logging.getLogger("mapvote.live")
 _RECORD = struct.Struct("<II")
 """Before each record of a journal: its length, and its CRC-32."""
-_RETRY_S = 60.0
-"""Between two attempts to send what waits, or to write what the disk did not take."""
-_HELD = 64
-"""Closed ballots that are held in memory while the disk takes none: with cuts of 10 minutes half a day."""
-_QUEUED = 256
-"""Pieces of work that wait for the disk: tiles of the open ballot are not added to more. It is half an hour of road."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class OutboxSizes:
+    """Numbers of the outbox of a live vehicle."""
+
+    retry_s: float = 60.0
+    """Time between two attempts to send waiting ballots, or to write again after a full disk, seconds."""
+    held: int = 64
+    """Closed ballots that are held in memory while the disk is full: with cuts of 10 minutes half a day."""
+    queued: int = 256
+    """Pieces of work that wait for the disk; tiles of the open ballot are not added to more. It is half an hour of
+    road."""
+
+
+OUTBOX_SIZES = OutboxSizes()
 _LAST = "the name of the last ballot"
 _NUMBERED = re.compile(r"(.+)-(\d{3,})")
 
@@ -128,7 +140,7 @@ class Outbox:
         client: MapClient | None = None,
         folder: Path | None = None,
         say: Callable[[str], None] = log.warning,
-        retry_s: float = _RETRY_S,
+        retry_s: float = OUTBOX_SIZES.retry_s,
     ) -> None:
         """MapvoteError if another process drives as this vehicle."""
         self.vehicle, self.report, self._client, self._folder, self._say = vehicle, OutboxReport(), client, folder, say
@@ -186,7 +198,7 @@ class Outbox:
         """``part``: the open ballot of some tiles. Returns at once. It is dropped while the disk hangs: the ballot is
         written whole when it is closed."""
         self._raise_if_broken()
-        if self._work.qsize() < _QUEUED:
+        if self._work.qsize() < OUTBOX_SIZES.queued:
             self._work.put(lambda: self._append(drive, part))
 
     def leave(self, drive: str, written: Callable[[], Ballot], following: str | None = None) -> None:
@@ -257,7 +269,7 @@ class Outbox:
             return
         self._say(f"{drive}: {ballot.scans_localised} of {ballot.scans} scans voted")
         self._unwritten[drive] = encode(ballot)
-        while len(self._unwritten) > _HELD:
+        while len(self._unwritten) > OUTBOX_SIZES.held:
             oldest = next(iter(self._unwritten))
             del self._unwritten[oldest]
             self.report.lost_ballots += 1

@@ -10,7 +10,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,20 +19,36 @@ from mapvote.client import Manifest, MapClient, Refused, Unreachable
 from mapvote.codec.ballot import tile_index
 from mapvote.core.grid import Lattice, TileIndex, window_around
 from mapvote.core.point_map import LazyTiles, PointMap
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.matching.ndt_map import tiles_within
 
 log = logging.getLogger("mapvote.live")
-KEPT_M = 300.0
-"""Tiles that touch a square reaching so far stay in memory; with those farther away their columns and words go, too."""
-_MOVED_M = 30.0
-AHEAD_M, NEEDED_M = KEPT_M, 160.0
-"""Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. The local
-map of a vehicle reaches two tiles, 154 m."""
-_POLL_S = 60.0
-"""Between two questions for the newest version where events do not come."""
-_RETRY_S = 5.0
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class RoadMapReach:
+    """Reaches and waits of the map around a live vehicle."""
+
+    kept_m: float = 300.0
+    """Half the side of the square whose tiles stay in memory, metres; the columns and words of farther tiles go,
+    too."""
+    moved_m: float = 30.0
+    """Distance after which the tiles are chosen anew, metres."""
+    ahead_m: float = kept_m
+    """Half the side of the square whose tiles are downloaded, metres."""
+    needed_m: float = 160.0
+    """Half the side of the square without whose tiles no scan is used, metres. The local map of a vehicle reaches two
+    tiles, 154 m."""
+    poll_s: float = 60.0
+    """Time between two requests of the newest version where events do not come, seconds."""
+    retry_s: float = 5.0
+    """Time between two attempts to reach a server, seconds."""
+
+
+ROAD_MAP_REACH = RoadMapReach()
 
 
 class Maps(Protocol):
@@ -62,7 +78,7 @@ class OneMap:
         """See :class:`Maps`. Frees what was computed from tiles far from there."""
         if position is not None and has_moved(position, self._position):
             self._position = position
-            self._tiles.keep_only(tiles_within(self._point_map, position, KEPT_M))
+            self._tiles.keep_only(tiles_within(self._point_map, position, ROAD_MAP_REACH.kept_m))
         return True
 
 
@@ -73,7 +89,7 @@ def _copied(tiles: Mapping[TileIndex, Tile]) -> LazyTiles:
 
 def has_moved(position: F64, since: F64 | None) -> bool:
     """Whether the vehicle is so far from where it was that other tiles matter."""
-    return since is None or float(np.abs(position[:2] - since[:2]).max()) > _MOVED_M
+    return since is None or float(np.abs(position[:2] - since[:2]).max()) > ROAD_MAP_REACH.moved_m
 
 
 class Version:
@@ -115,7 +131,7 @@ class RoadMap:
     drives on what it has. Two threads, of which one only listens for versions.
     """
 
-    def __init__(self, open_client: Callable[[], MapClient], *, poll_s: float = _POLL_S) -> None:
+    def __init__(self, open_client: Callable[[], MapClient], *, poll_s: float = ROAD_MAP_REACH.poll_s) -> None:
         """``open_client`` opens a connection: each thread, and who reads tiles, has its own. MapvoteError if the server
         is away and no version of its map is kept here."""
         self._reader, self._fetcher, self._listener = open_client(), open_client(), open_client()
@@ -161,9 +177,9 @@ class RoadMap:
         """See :class:`Maps`: of the version that was asked for last."""
         if position is None or has_moved(position, self._position):
             self._position, self._located = position, True
-            self._used.tiles.keep_only(self._used.around(position, KEPT_M))
+            self._used.tiles.keep_only(self._used.around(position, ROAD_MAP_REACH.kept_m))
             self._wake.set()
-        return not self._used.missing(position, NEEDED_M)
+        return not self._used.missing(position, ROAD_MAP_REACH.needed_m)
 
     @property
     def tiles(self) -> int:
@@ -192,7 +208,7 @@ class RoadMap:
             except (MapvoteError, OSError) as error:
                 if not self.away:
                     log.warning("%s. The vehicle drives on the %d tiles that it has", error, self.tiles)
-                self.away, wait_s = str(error), _RETRY_S
+                self.away, wait_s = str(error), ROAD_MAP_REACH.retry_s
             self._wake.wait(wait_s)
             self._wake.clear()
 
@@ -208,7 +224,7 @@ class RoadMap:
         if not self._located:
             return
         for version in dict.fromkeys((self._used, self._coming)):
-            for tile in version.missing(self._position, AHEAD_M):
+            for tile in version.missing(self._position, ROAD_MAP_REACH.ahead_m):
                 if self._ended.is_set():
                     return
                 try:

@@ -13,16 +13,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 
 log = logging.getLogger("mapvote.live")
-_MOST_DOMAIN = 232
-"""The highest DDS domain whose ports exist."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class DdsLimits:
+    """Limits of DDS domains."""
+
+    domain: int = 232
+    """Highest DDS domain whose ports exist."""
+    participants: int = 32
+    """Participants of one machine that discover each other, as rmw_cyclonedds has it."""
+
+
+DDS_LIMITS = DdsLimits()
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 _PEER = re.compile(r"[0-9A-Za-z.:\[\]%_-]+")
 """A host name or an address, with or without a port."""
-_PARTICIPANTS = 32
-"""Participants of one machine that find each other, as rmw_cyclonedds has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +69,10 @@ def _domain(text: str) -> int:
     if not text.strip():
         return 0
     domain = int(text) if text.strip().isascii() and text.strip().isdigit() else -1
-    if not 0 <= domain <= _MOST_DOMAIN:
+    if not 0 <= domain <= DDS_LIMITS.domain:
         raise MapvoteError(
-            f"ROS_DOMAIN_ID={text}: not a DDS domain; give a whole number from 0 to {_MOST_DOMAIN} (0 to 101 works on "
-            "every system), or unset it"
+            f"ROS_DOMAIN_ID={text}: not a DDS domain; give a whole number from 0 to {DDS_LIMITS.domain} (0 to 101 "
+            "works on every system), or unset it"
         )
     return domain
 
@@ -96,7 +107,7 @@ def _discovery(variables: Mapping[str, str]) -> str:
     if reach == "LOCALHOST":
         peers = ["localhost", *peers]
     named = "".join(f'<Peer address="{peer}"/>' for peer in peers)
-    index = f"<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>{_PARTICIPANTS}"
+    index = f"<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>{DDS_LIMITS.participants}"
     discovery = f"{index}</MaxAutoParticipantIndex>" + (f"<Peers>{named}</Peers>" if named else "")
     return f'<Domain id="any">{multicast}<Discovery>{discovery}</Discovery></Domain>'
 

@@ -18,6 +18,7 @@ import numpy as np
 from mapvote.core.extras import require
 from mapvote.core.geometry import inverse
 from mapvote.core.kernel import call_while_compiling
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.live.dds import Network, Publication
 from mapvote.live.drive import Counts, LiveDrive
@@ -29,11 +30,28 @@ from mapvote.live.subscriptions import Subscriptions
 log = logging.getLogger("mapvote.live")
 DIAGNOSTICS, POSE = "diagnostic_msgs/msg/DiagnosticArray", POSE_WITH_COVARIANCE
 _OK, _WARN, _ERROR = 0, 1, 2
-_MINUTE_S, _SILENT_S = 60.0, 2.0
-_RECENT = 600
-"""Scans of a minute."""
-_BEAT_S, _EXTENDED_S, _START_S = 1.0, 30.0, 900.0
-"""Between two beats; the time that systemd grants a start from each of them on; how long a start may take."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class StatusTimes:
+    """Times of the status of a live vehicle."""
+
+    minute_s: float = 60.0
+    """Time over which the status looks back, seconds."""
+    silent_s: float = 2.0
+    """Time without a cloud after which a topic is silent, seconds."""
+    recent: int = 600
+    """Scans of that time."""
+    beat_s: float = 1.0
+    """Time between two beats, seconds."""
+    extended_s: float = 30.0
+    """Time that systemd grants a start from each beat on, seconds."""
+    start_s: float = 900.0
+    """Longest start, seconds."""
+
+
+STATUS_TIMES = StatusTimes()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +99,7 @@ class Status:
 
     def troubles(self) -> list[tuple[int, str, str]]:
         """(level of diagnostic_msgs, subject, message) of each part of the drive."""
-        counts, silent = self.counts, self.silent_s > _SILENT_S
+        counts, silent = self.counts, self.silent_s > STATUS_TIMES.silent_s
         arriving = f"{self.scans_hz:.1f} Hz, {counts.missing} never came"
         localised = f"{_percent(self.localised_share)} localised, sigma {_metres(self.sigma_m)}"
         spooled = f"{self.outbox.spooled} ballots in the spool"
@@ -159,12 +177,12 @@ class StatusBoard:
         """The status now, seconds of any steady clock."""
         counts = live.counts
         self._past.append((now, counts.scans, counts.localised, counts.lost))
-        while now - self._past[0][0] > _MINUTE_S:
+        while now - self._past[0][0] > STATUS_TIMES.minute_s:
             self._past.popleft()
         then, scans, localised, lost = self._past[0]
         localised, lost = counts.localised - localised, counts.lost - lost
-        sigmas = [] if live.vehicle is None else live.vehicle.report.sigmas_m[-_RECENT:]
-        recent = list(live.latencies_s)[-_RECENT:]
+        sigmas = [] if live.vehicle is None else live.vehicle.report.sigmas_m[-STATUS_TIMES.recent :]
+        recent = list(live.latencies_s)[-STATUS_TIMES.recent :]
         if isinstance(self._maps, RoadMap):
             version, tiles, away = self._maps.version, self._maps.tiles, self._maps.away
         else:
@@ -288,13 +306,13 @@ class Heartbeat:
     def __call__(self) -> None:
         """Called once a round."""
         if self._ready.is_set() and time.monotonic() >= self._next_s:
-            self._next_s = time.monotonic() + _BEAT_S
+            self._next_s = time.monotonic() + STATUS_TIMES.beat_s
             self._notify("WATCHDOG=1")
 
     def _start(self) -> None:
-        end = time.monotonic() + _START_S
-        while not self._ready.wait(_BEAT_S) and time.monotonic() < end:
-            self._notify(f"EXTEND_TIMEOUT_USEC={int(1e6 * _EXTENDED_S)}")
+        end = time.monotonic() + STATUS_TIMES.start_s
+        while not self._ready.wait(STATUS_TIMES.beat_s) and time.monotonic() < end:
+            self._notify(f"EXTEND_TIMEOUT_USEC={int(1e6 * STATUS_TIMES.extended_s)}")
 
     def _notify(self, text: str) -> None:
         if not self._address:

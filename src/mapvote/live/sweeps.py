@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.record import record
 from mapvote.core.types import F64
 from mapvote.formats.drives.point_fields import point_cloud_table
 
@@ -45,11 +46,22 @@ class PacketRule:
 
 
 RULE = PacketRule()
-_SWEEP = 0.55
-"""Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
-_BINS = 36
-_SAMPLED = 400
-"""Points of a cloud whose directions are looked at."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class SweepRule:
+    """Numbers by which clouds are joined to a revolution."""
+
+    revolutions: float = 0.55
+    """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
+    bins: int = 36
+    """Bins of directions of a turn."""
+    sampled: int = 400
+    """Points of a cloud whose directions are examined."""
+
+
+SWEEP_RULE = SweepRule()
 
 
 class Packets:
@@ -130,15 +142,15 @@ class Packets:
 def direction_of(message: Any) -> tuple[float, float]:
     """The azimuth of the middle of a PointCloud2, radians, and the share of the circle in which it has points."""
     table = point_cloud_table("a cloud", message)
-    some = table[:: max(1, len(table) // _SAMPLED)]
+    some = table[:: max(1, len(table) // SWEEP_RULE.sampled)]
     x = some["x"].astype(np.float64)
     y = some["y"].astype(np.float64)
     seen = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0.0)
     azimuth = np.arctan2(y[seen], x[seen])
     if not len(azimuth):
         return 0.0, 0.0
-    bins = np.unique(np.floor((azimuth + np.pi) / (2.0 * np.pi) * _BINS).astype(np.int64) % _BINS)
-    return float(np.arctan2(np.sin(azimuth).mean(), np.cos(azimuth).mean())), len(bins) / _BINS
+    bins = np.unique(np.floor((azimuth + np.pi) / (2.0 * np.pi) * SWEEP_RULE.bins).astype(np.int64) % SWEEP_RULE.bins)
+    return float(np.arctan2(np.sin(azimuth).mean(), np.cos(azimuth).mean())), len(bins) / SWEEP_RULE.bins
 
 
 def _wrapped(angles: F64) -> F64:
@@ -168,7 +180,7 @@ class Sweeps:
             if cloud.lidar == 0:
                 self._firsts.append(cloud.stamp_ns)
                 if len(self._firsts) > 2:
-                    self._reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
+                    self._reach_ns = SWEEP_RULE.revolutions * float(np.median(np.diff(sorted(self._firsts))))
             start_ns = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
             apart = abs(cloud.stamp_ns - start_ns) > self._reach_ns or cloud.lidar in {c.lidar for c in self._open}
             if self._open and apart:

@@ -13,12 +13,14 @@ import ipaddress
 import re
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import structlog
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import key_form
 from mapvote_server.api.connections import identify, step_aside
@@ -29,10 +31,23 @@ from mapvote_server.api.services import RateLimit, Services
 from mapvote_server.errors import Forbidden, TooMany, Unauthorised, Unavailable
 from mapvote_server.store import keys
 
-_REMEMBERED = 10_000
-_PAUSE_S = 1.0
-_WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
-"""Wrong keys from one address that are answered at once; further ones wait :data:`_PAUSE_S` for their answer."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class KeyGuess:
+    """Numbers of the defence against guessed keys."""
+
+    remembered: int = 10_000
+    """Keys that are remembered as right."""
+    pause_s: float = 1.0
+    """Pause before the answer to a wrong key of an address that sent too many, seconds."""
+    per_minute: float = 60.0
+    """Wrong keys of one address per minute that are answered without a pause."""
+    at_once: int = 120
+    """Wrong keys of one address at once that are answered without a pause."""
+
+
+KEY_GUESS = KeyGuess()
 
 
 class Guard:
@@ -52,7 +67,7 @@ class Guard:
         self._opened = opened
         self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
         self._known: dict[str, keys.Key] = {}
-        self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
+        self._wrong = RateLimit(KEY_GUESS.per_minute, KEY_GUESS.at_once, "wrong keys")
 
     async def who(
         self, authorization: str | None, peer: str, *, ballot: bool = False
@@ -76,7 +91,7 @@ class Guard:
         key = self._known.get(digest) if ballot else None
         if key is None:
             key = await self._look_up(digest, peer)
-            if len(self._known) > _REMEMBERED:
+            if len(self._known) > KEY_GUESS.remembered:
                 self._known.clear()
             self._known[digest] = key
         return key, digest
@@ -90,7 +105,7 @@ class Guard:
                 self._wrong.take(peer)
             except TooMany:
                 step_aside()
-                await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of sending more
+                await asyncio.sleep(KEY_GUESS.pause_s)  # a flood waits for its answers instead of sending more
                 raise
             raise
 

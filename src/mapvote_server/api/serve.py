@@ -9,6 +9,7 @@ import resource
 import socket
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -18,6 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote_server.api.app import create_app
@@ -28,13 +30,22 @@ from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import Gate
 from mapvote_server.store.store import Store
 
-_FILES = 300
-"""Descriptors beside those of connections: a database's connections, libraries, logs."""
-_SWITCH_S = 5e-4
-"""How long a computing thread may keep the interpreter while others wait (Python's default: 5 ms). An answer takes some
-twenty such turns."""
-_PATIENCE_S = 5
-"""A stopping server waits this long for answers under way. Ballots take milliseconds."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ServerTimes:
+    """Numbers of the process of a server."""
+
+    files: int = 300
+    """File descriptors beside those of connections: a database's connections, libraries, logs."""
+    switch_s: float = 5e-4
+    """Time that a computing thread may keep the interpreter while others wait, seconds (Python's default: 5 ms). An
+    answer takes some twenty such turns."""
+    patience_s: int = 5
+    """Time that a stopping server waits for answers under way, seconds. Ballots take milliseconds."""
+
+
+SERVER_TIMES = ServerTimes()
 
 
 def open_or_create(
@@ -112,11 +123,11 @@ def serve(
         access_log=False,
         proxy_headers=False,  # mapvote_server.api.proxies reads them
         log_level="warning",
-        timeout_graceful_shutdown=_PATIENCE_S,
+        timeout_graceful_shutdown=SERVER_TIMES.patience_s,
         server_header=False,
         headers=list(HEADERS),
     )
-    sys.setswitchinterval(_SWITCH_S)
+    sys.setswitchinterval(SERVER_TIMES.switch_s)
     with listener:
         _Server(config, app.state.services.stop_fusing).run(sockets=[listener])
 
@@ -134,11 +145,11 @@ def settle() -> None:
 def _room_for(connections: int) -> int:
     """The wanted number of connections, or what the system allows this process beside its files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = connections + _FILES
+    needed = connections + SERVER_TIMES.files
     if soft < needed:
         soft = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    return min(connections, soft - _FILES)
+    return min(connections, soft - SERVER_TIMES.files)
 
 
 class _Server(uvicorn.Server):

@@ -21,6 +21,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.requests import ClientDisconnect
 
 from mapvote.config import Settings
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote_server.api.lanes import Budget, Lane
 from mapvote_server.api.probe import Probe
@@ -210,7 +211,26 @@ class Metrics:
             self.quarantined.labels(kind).set(counts[kind])
 
 
-_KEPT = 16
+@record()
+@dataclass(frozen=True, slots=True)
+class ServiceSizes:
+    """Sizes of the queues between requests and the store."""
+
+    kept: int = 16
+    """Manifests that are kept."""
+    batch: int = 64
+    """Ballots written in one transaction at most."""
+    burst: float = 0.1
+    """Share of a minute's ballots that a vehicle may send at once."""
+    uploads: int = 8
+    """Largest bodies that fit into the memory for all ballots on their way."""
+    keys: int = 256
+    """Keys looked up in one query at most."""
+    readers: int = 1024
+    """Requests answered by one query of the newest version."""
+
+
+SERVICE_SIZES = ServiceSizes()
 
 
 class Made(NamedTuple):
@@ -241,7 +261,7 @@ class Manifests:
             if made is None:
                 manifest = self._store.manifest(number, since=since)
                 made = Made(msgspec.json.encode(manifest), manifest.tag(since))
-                while len(self._made) >= _KEPT:
+                while len(self._made) >= SERVICE_SIZES.kept:
                     del self._made[next(iter(self._made))]
                 self._made[number, since] = made
         return made
@@ -299,18 +319,6 @@ class Publishing:
         return len(stopped)
 
 
-_BATCH = 64
-"""Ballots written in one transaction at most."""
-_BURST = 0.1
-"""Share of a minute's ballots that a vehicle may send at once."""
-_UPLOADS = 8
-"""Largest bodies that fit into the memory for all ballots on their way."""
-_KEYS = 256
-"""Keys looked up in one query at most."""
-_READERS = 1024
-"""Requests answered by one query of the newest version."""
-
-
 class Services:
     """The parts that live as long as the app, on an open store; :func:`services` gives them to a route.
 
@@ -343,17 +351,19 @@ class Services:
         """The executor that fuses tiles."""
         quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
         self.intake = Intake(store, quota)
-        self.writer: Batcher[Incoming, Receipt] = Batcher(self.intake.write, _BATCH, self._writing)
+        self.writer: Batcher[Incoming, Receipt] = Batcher(self.intake.write, SERVICE_SIZES.batch, self._writing)
         """Writes ballots, many in one transaction."""
-        self.newest: Batcher[None, int] = Batcher(lambda asked: [store.current()] * len(asked), _READERS, self.lookups)
+        self.newest: Batcher[None, int] = Batcher(
+            lambda asked: [store.current()] * len(asked), SERVICE_SIZES.readers, self.lookups
+        )
         """The number of the newest version, read once for all requests that wait for it."""
-        self.known_keys: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _KEYS, self.lookups)
+        self.known_keys: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), SERVICE_SIZES.keys, self.lookups)
         """Whose keys these are, by their hashes; Unauthorised for those that open nothing."""
         self.manifests = Manifests(store)
         self.publishing = Publishing()
         self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()
-        self.limit = RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute))
-        self.uploads = Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes)
+        self.limit = RateLimit(most.ballots_per_minute, max(1.0, SERVICE_SIZES.burst * most.ballots_per_minute))
+        self.uploads = Uploads(most.max_body_bytes, SERVICE_SIZES.uploads * most.max_body_bytes)
         self._probe = Probe(store.database)
         self.streams: TallyOf[str] = TallyOf()
         """Streams of events under way, by the name on their key."""

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_fields_plane
 from mapvote.core.brightness import in_bytes
 from mapvote.core.grid import Lattice, TileIndex
+from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, MapvoteError
 from mapvote.shapes.packed_cloud import Levels, came_and_went, make_levels
@@ -20,15 +22,26 @@ from mapvote_server.errors import Unavailable
 from mapvote_server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote_server.store.store import Store
 
-OVERVIEW_POINTS = 150_000
-"""Most points of an overview: 1.2 MB, one to two seconds of a slow connection."""
-_SPARE = 4
-"""While an overview is made, a tile keeps at most this multiple of its even share: a map of any size fits in memory."""
-_AT_ONCE = 2
-"""Threads for an overview: reading and sorting release the interpreter."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class OverviewSizes:
+    """Sizes of the overview of a map."""
+
+    points: int = 150_000
+    """Points of an overview: 1.2 MB, one to two seconds of a slow connection."""
+    spare: int = 4
+    """Points that a tile keeps while an overview is made, as a multiple of its even share: a map of any size fits in
+    memory."""
+    threads: int = 2
+    """Threads for an overview: reading and sorting release the interpreter."""
+    kept_bytes: int = 256_000_000
+    """Memory of overviews that are kept, bytes."""
+
+
+OVERVIEW_SIZES = OverviewSizes()
 _ANYWHERE = Lattice().tile((0, 0))
 """Coordinates of levels begin at the tile's corner, so the window does not matter."""
-_KEPT_BYTES = 256_000_000
 _HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
 _OVERVIEW_MAGIC = 0x3143564F
 
@@ -39,7 +52,7 @@ class Clouds:
     A tile's levels follow from its hashes alone, so the cache is never stale.
     """
 
-    def __init__(self, store: Store, kept_bytes: int = _KEPT_BYTES) -> None:
+    def __init__(self, store: Store, kept_bytes: int = OVERVIEW_SIZES.kept_bytes) -> None:
         self._store = store
         self._room = kept_bytes
         self._lock, self._making = threading.Lock(), threading.Lock()
@@ -93,10 +106,10 @@ class Clouds:
 
         def made(index: TileIndex) -> list[tuple[TileIndex, Levels]]:
             sound = [] if stop() else self._sound(tiles[index])
-            most = _SPARE * OVERVIEW_POINTS // len(tiles)
+            most = OVERVIEW_SIZES.spare * OVERVIEW_SIZES.points // len(tiles)
             return [(index, make_levels(t.points, t.ground_z, most, self._bright(tiles[index], t))) for t in sound]
 
-        with ThreadPoolExecutor(_AT_ONCE, "coarse") as pool:
+        with ThreadPoolExecutor(OVERVIEW_SIZES.threads, "coarse") as pool:
             parts = list(pool.map(made, tiles))
         return None if stop() else [part for of_tile in parts for part in of_tile]
 
@@ -149,9 +162,9 @@ def _drawn(hashes: TileHashes) -> TileHashes:
 
 def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
     ends = np.array([levels.ends for _, levels in made]).reshape(len(made), -1)
-    fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_POINTS)
+    fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_SIZES.points)
     finest = int(fits[-1]) if len(fits) else -1
-    share = OVERVIEW_POINTS // max(len(made), 1)
+    share = OVERVIEW_SIZES.points // max(len(made), 1)
     rows, clouds, bright = [], [], []
     any_bright = any(levels.bright is not None for _, levels in made)
     for index, levels in made:
