@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hand_made import Cell, Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import pack_path
 from mapvote.codec.planes import unpack_bytes
-from mapvote.codec.tile_planes import MAX_PLANE_BYTES
+from mapvote.codec.tile_planes import TILE_PLANE_SIZES
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
@@ -145,7 +145,7 @@ class Street:
             digest = shown[which % len(shown)]
             data = bytes(connection.execute(sa.select(b.c.data).where(b.c.hash == digest)).scalar_one())
             if digest not in self.lost:
-                self.lost[digest] = unpack_bytes(data, MAX_PLANE_BYTES, "plane")
+                self.lost[digest] = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "plane")
             connection.execute(b.update().where(b.c.hash == digest).values(data=b"spoilt"))
         self.store.change_policy({"fuse.min_votes": 1 + self.store.policy().fuse.min_votes % 3})
 
