@@ -16,6 +16,7 @@ from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
 from mapvote_server.api.schemas import (
     AS_CSV,
+    MOST_SEQ,
     PLAIN,
     Ask,
     DeskAnswer,
@@ -40,7 +41,7 @@ class ReviewAsk(Ask):
     change: str = Field(max_length=100, pattern=PLAIN, description="id of a change on the desk")
     verdict: Literal["accepted", "held", "rejected"]
     comment: str = Field(default="", max_length=300, pattern=PLAIN)
-    after: int | None = Field(default=None, ge=0, lt=1 << 62, description="the verdict that it had when you looked")
+    after: int | None = Field(default=None, ge=0, le=MOST_SEQ, description="the verdict that it had when you looked")
 
 
 @router.get(
@@ -109,7 +110,7 @@ async def decide(by: Reviewer, parts: Parts, ask: ReviewAsk) -> VerdictGiven:
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
 @on("commands")
-def take_back(by: Reviewer, parts: Parts, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> VerdictGiven:
+def take_back(by: Reviewer, parts: Parts, seq: Annotated[int, Path(ge=0, le=MOST_SEQ)]) -> VerdictGiven:
     """The change is pending again."""
     undo(parts.store, seq, by=by)
     return VerdictGiven(seq=seq)

@@ -16,7 +16,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 from standardwebhooks import Webhook
 
-from mapvote_server.api.schemas import problems
+from mapvote_server.api.schemas import MOST_SEQ, problems
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import TooMany, Unauthorised, Unavailable
 from mapvote_server.questions.history import Event, newest_event, take, taken_up_to, without_names
@@ -24,7 +24,6 @@ from mapvote_server.store.keys import Key, any_issued
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0
-_MOST = (1 << 62) - 1
 router = APIRouter()
 
 
@@ -38,8 +37,8 @@ async def listen(
     request: Request,
     parts: Parts,
     named: Known,
-    after: Annotated[int | None, Query(ge=0, le=_MOST)] = None,
-    last_event_id: Annotated[int | None, Header(ge=0, le=_MOST)] = None,
+    after: Annotated[int | None, Query(ge=0, le=MOST_SEQ)] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, le=MOST_SEQ)] = None,
 ) -> StreamingResponse:
     """Ballots, verdicts, versions and held publishes. The id of an event is its number in the log.
 

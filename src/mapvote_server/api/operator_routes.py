@@ -31,6 +31,7 @@ from mapvote_server.api.schemas import (
     KeysAnswer,
     KeysRevoked,
     Log,
+    Metres,
     MinCells,
     Newest,
     Passes,
@@ -75,6 +76,7 @@ from mapvote_server.store.store import Store
 from mapvote_server.store.votes import withdraw
 
 _MOST_EVIDENCE = 50
+Everybody = Annotated[bool, Query(json_schema_extra={"const": True})]
 router = APIRouter()
 
 
@@ -190,7 +192,7 @@ def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_
 
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
 @on("questions")
-def cell(parts: Parts, known: Known, x: float, y: float) -> Response:
+def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     return as_json(explain_cell(parts.store, x, y, known=known))
 
@@ -289,7 +291,7 @@ async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) 
 
 
 @router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
-async def begin_anew(by: Operator, parts: Parts, everybody: bool) -> Withdrawn:
+async def begin_anew(by: Operator, parts: Parts, everybody: Everybody) -> Withdrawn:
     """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
     if not everybody:
         raise MapvoteError("name a vehicle in the path, or say everybody=true")
@@ -329,7 +331,7 @@ def listed_keys(by: Operator, parts: Parts) -> Response:
     return as_json({"keys": told})
 
 
-@router.post("/v1/keys", response_model=KeyIssued, responses=problems(403), summary="Issue a key")
+@router.post("/v1/keys", response_model=KeyIssued, responses=problems(403, 409), summary="Issue a key")
 @on("commands")
 def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
     """The answer is the only place where the key is ever seen: the store keeps its hash."""

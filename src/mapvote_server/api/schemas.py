@@ -33,9 +33,11 @@ from mapvote_server.errors import (
     Unauthorised,
     Unavailable,
 )
+from mapvote_server.questions.explain import FARTHEST_M
 from mapvote_server.questions.vehicles import VehicleStanding
 from mapvote_server.store import keys
 from mapvote_server.store.integrity import Damage
+from mapvote_server.store.policy import Policy, names_in
 from mapvote_server.work import count_rows
 
 STATUS: Mapping[type[MapvoteError], int] = {
@@ -52,6 +54,8 @@ STATUS: Mapping[type[MapvoteError], int] = {
 """An entry also holds for the subclasses of its class."""
 LEAST, MOST = 1, (1 << 31) - 1
 """Range of a version's number."""
+MOST_SEQ = (1 << 53) - 1
+"""The largest number of an event: up to here every JSON reader keeps integers exact."""
 PLAIN = r"^[^\x00-\x1f]*$"
 """No control characters: PostgreSQL stores no NUL."""
 
@@ -69,12 +73,15 @@ To = Annotated[int, Query(alias="to", ge=LEAST, le=MOST)]
 Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
 """As :data:`To`, the newest version if it is left out."""
 MinCells = Annotated[int, Query(ge=1, le=100_000)]
+_ON_EARTH = {"exclusiveMinimum": -FARTHEST_M, "exclusiveMaximum": FARTHEST_M}
+Metres = Annotated[float, Query(description="in the map's frame", json_schema_extra=_ON_EARTH)]
+"""A range that is declared only, as that of days: the store's own refusal says more than FastAPI's."""
 
 
 class Ask(BaseModel):
-    """A body; members that it does not name are refused."""
+    """A body; members that it does not name are refused, and so are values of another JSON type."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 Reason = Annotated[str, Field(max_length=200, pattern=PLAIN)]
@@ -99,7 +106,11 @@ class ReplayAsk(Ask):
 class PolicyAsk(Ask):
     """Changes of the policy."""
 
-    values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
+    values: dict[str, str | int | float | bool] = Field(
+        max_length=100,
+        description="by section.key: fuse.min_votes",
+        json_schema_extra={"propertyNames": {"enum": [*names_in(Policy())]}},
+    )
     reason: Reason = ""
 
 
@@ -108,14 +119,20 @@ class IssueAsk(Ask):
 
     name: NameOf
     role: keys.Role = "vehicle"
-    days: float | None = Field(default=None, description="the key expires after so many days; null: never")
+    days: float | None = Field(
+        default=None,
+        description="the key expires after so many days; null: never",
+        json_schema_extra={"exclusiveMinimum": 0, "maximum": keys.MOST_DAYS},
+    )
 
 
 class RotateAsk(Ask):
     """Whose key is replaced."""
 
     name: NameOf
-    overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
+    overlap_days: float = Field(
+        default=1.0, ge=0, le=keys.MOST_DAYS, description="the old keys work for so many more days"
+    )
 
 
 class RevokeAsk(Ask):

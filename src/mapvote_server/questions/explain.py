@@ -152,11 +152,15 @@ class _Now:
     """The decision of the next version, if it were published now."""
 
 
+FARTHEST_M = 1e7
+"""No place of a map lies farther from its origin."""
+
+
 def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> CellStory:
     """The votes behind the cell that holds (x, y), map metres. ``known``: with the names of vehicles and exact times,
     else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
-    if not (abs(x) < 1e7 and abs(y) < 1e7):
-        raise MapvoteError(f"({x}, {y}): give map metres, within 10,000 km of the map's origin")
+    if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M):
+        raise MapvoteError(f"({x}, {y}): give map metres, within {FARTHEST_M / 1e3:,.0f} km of the map's origin")
     rows, cols = store.lattice.cells_of(np.array([[x, y]]))
     row, col = int(rows[0]), int(cols[0])
     index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)

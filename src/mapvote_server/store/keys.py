@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote_server.errors import NotFound, Unauthorised
+from mapvote_server.errors import Conflict, NotFound, Unauthorised
 from mapvote_server.store import schema
 from mapvote_server.store.queries import end_votes, log_event
 from mapvote_server.store.store import Store
@@ -25,7 +25,8 @@ all."""
 ROLES: tuple[Role, ...] = get_args(Role)
 UNKNOWN = "this key is unknown, revoked or past its end: ask the operator for a new one (mapvote keys)"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_MOST_DAYS = 36_500
+MOST_DAYS = 36_500
+"""A key is good for at most so many days, a century, or until it is revoked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ class Key:
 
 def issue(store: Store, name: str, role: Role, *, by: str = "operator", days: float | None = None) -> str:
     """A new key, good for so many days (None: until it is revoked); the only time that it is seen. A name may hold
-    several, all of one role. MapvoteError for a name that cannot be one, or that has valid keys of another role."""
+    several, all of one role: Conflict if it has valid keys of another. MapvoteError for a name that cannot be one."""
     with store.database.writing() as connection:
         return put_in(connection, store.clock(), name, role, by, days)
 
@@ -56,11 +57,11 @@ def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, 
         raise MapvoteError(f"{name!r} is no name: 1-64 of letters, digits, dot, underscore, dash")
     if role not in ROLES:
         raise MapvoteError(f"{role!r} is no role; choose one of {', '.join(ROLES)}")
-    if days is not None and not 0 < days <= _MOST_DAYS:
-        raise MapvoteError(f"a key for {days:g} days: give more than 0 and at most {_MOST_DAYS}, or leave it out")
+    if days is not None and not 0 < days <= MOST_DAYS:
+        raise MapvoteError(f"a key for {days:g} days: give more than 0 and at most {MOST_DAYS}, or leave it out")
     others = {key.role for key in _keys_of(connection, name) if key.valid_at(now)} - {role}
     if others:
-        raise MapvoteError(f"{name!r} has a valid key of a {others.pop()}: a name has one role; revoke that one first")
+        raise Conflict(f"{name!r} has a valid key of a {others.pop()}: a name has one role; revoke that one first")
     secret = secrets.token_urlsafe(32)
     end = None if days is None else now + round(days * DAY_NS)
     row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now, "expires_ns": end}

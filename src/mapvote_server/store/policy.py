@@ -116,13 +116,18 @@ def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, r
     return seq
 
 
+def names_in(policy: Policy) -> list[str]:
+    """Every value of a policy, as "section.key"."""
+    return [f"{section}.{key}" for section, keys in policy.model_dump().items() for key in keys]
+
+
 def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
     """The policy with some values changed, by "section.key"; texts are read as numbers where these are meant.
 
     MapvoteError naming the key, and the nearest one that exists.
     """
     sections = policy.model_dump()
-    known = [f"{section}.{key}" for section, keys in sections.items() for key in keys]
+    known = names_in(policy)
     for name, value in values.items():
         if name not in known:
             raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")

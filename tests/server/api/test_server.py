@@ -106,7 +106,7 @@ def test_the_whole_story(site: Site, tmp_path: Path) -> None:
         ("a", "changed_empty", False),
         ("b", "changed_empty", False),
     ]
-    assert cell["decisions"] == [{"version": 2, "state": "changed_empty", "edit": None}]
+    assert cell["decisions"] == [{"version": 2, "state": "changed_empty", "edit": None, "fell": ""}]
     tiles = site.ask("GET", "/v1/coverage", site.operator).json()["tiles"]
     assert [(t["vehicles"], t["last_seen"] is not None) for t in tiles] == [(2, True), (0, False)]
     assert site.ask("POST", "/v1/rollback", site.operator, json={"to": 1}).json() == {"version": 3}

@@ -10,7 +10,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote_server.errors import NotFound, Unauthorised
+from mapvote_server.errors import Conflict, NotFound, Unauthorised
 from mapvote_server.store import keys
 from mapvote_server.store.admission import Intake
 from mapvote_server.store.examination import examine
@@ -63,7 +63,7 @@ def test_rotation_gives_a_new_key_of_the_same_role_and_the_old_one_an_end(store:
 
 def test_a_name_has_one_role(store: Store) -> None:
     keys.issue(store, "ann", "reviewer")
-    with pytest.raises(MapvoteError, match="a name has one role"):
+    with pytest.raises(Conflict, match="a name has one role"):
         keys.issue(store, "ann", "vehicle")
     keys.revoke(store, "ann")
     keys.issue(store, "ann", "vehicle")
