@@ -65,6 +65,7 @@ ADVICE: list[tuple[str, str, Callable[[re.Match[str], re.Match[str]], Mend]]] = 
     (r"", r"turn the points back by the prior's rotation", lambda w, m: lambda r: replace(
         r, scans=[np.column_stack([s[:, :3] @ T[:3, :3], s[:, 3:]]) for s, T in zip(r.scans, r.T, strict=True)])),
     (rf"divide x, y, z by {NUMBER}", r"", lambda w, m: points(lambda p: p / float(w[1]))),
+    (rf"multiply x, y, z by {NUMBER}", r"", lambda w, m: points(lambda p: p * float(w[1]))),
     (rf"positions are {NUMBER} times", r"multiply the points by that", lambda w, m: points(lambda p: p * float(w[1]))),
     (r"", rf"multiply their points by {NUMBER}", lambda w, m: points(lambda p: p * float(m[1]))),
     (r"", r"p_lidar = inverse\(T_map_lidar\)", lambda w, m: lambda r: replace(r, scans=[
@@ -72,6 +73,7 @@ ADVICE: list[tuple[str, str, Callable[[re.Match[str], re.Match[str]], Mend]]] = 
         for s, T in zip(r.scans, r.T, strict=True)])),
     # of the prior
     (r"", r"write T_map_lidar, the inverse of each matrix", lambda w, m: poses(inverses)),
+    (r"put KITTI's calib.txt into", r"", lambda w, m: poses(lambda T: CAMERA_TO_LIDAR @ T @ CAMERA_TO_LIDAR.T)),
     (r"", r"put KITTI's calib.txt into", lambda w, m: poses(lambda T: CAMERA_TO_LIDAR @ T @ CAMERA_TO_LIDAR.T)),
     (r"", r"transpose the 3 x 3 rotations", lambda w, m: rotations(lambda R: np.swapaxes(R, 1, 2))),
     (r"", r"use yaw = 90 deg - bearing", lambda w, m: yaws(lambda a: np.pi / 2 - a)),

@@ -41,10 +41,15 @@ def poses() -> F64:
 
 @pytest.fixture(scope="module")
 def sound() -> Recording:
+    return seen_along(poses())
+
+
+def seen_along(T_map_lidar: F64) -> Recording:
+    """What a sensor sees of the street at poses (24, 4, 4)."""
     rng = np.random.default_rng(9)
     points = sound_street()
     scans = []
-    for T in poses():
+    for T in T_map_lidar:
         local = geometry.transform(geometry.inverse(T), points)
         away = np.linalg.norm(local, axis=1)
         near = local[(away < 40) & (away > 3)]
@@ -52,7 +57,7 @@ def sound() -> Recording:
         seen = chosen + rng.normal(0, 0.02, chosen.shape)
         scans.append(np.column_stack([seen, rng.random(len(seen))]))
     about = {"sensor": "hdl32e", "motion_compensated": True, "prior_sigma_m": 0.1}
-    return Recording(scans, poses(), np.linspace(0.0, 2.3, N), about)
+    return Recording(scans, T_map_lidar, np.linspace(0.0, 2.3, N), about)
 
 
 def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
@@ -61,6 +66,25 @@ def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
     assert serious(found) == []
     assert any("mistakes of the prior show from " in f.what for f in found), found
     assert serious(diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings) == []
+
+
+STRAIGHT = ["inverse poses", "rows in reverse order", "points facing backwards", "y of positions negated"]
+
+
+@pytest.mark.parametrize(
+    "kind", [k if k == "inverse poses" else pytest.param(k, marks=pytest.mark.slow) for k in STRAIGHT]
+)
+def test_what_a_straight_drive_leaves_open_its_map_decides(tmp_path: Path, kind: str) -> None:
+    """The map lies about the middle of the drive: a prior that is read otherwise lays scans elsewhere."""
+    T = np.array([geometry.from_xyz_rpy(0.8 * (k - N // 3), 3.0, 1.8) for k in range(N)])
+    (named,), change = kinds_of("drives")[kind]
+    broken(seen_along(T), change, tmp_path / "d")
+    found = diagnose(tmp_path / "d", None, map_from_points(sound_street())).findings
+    errors = [finding.what for finding in found if finding.severity == "error"]
+    assert len(errors) == 1, errors
+    assert re.search(named, errors[0])
+    assert "scans checked fit the map" in errors[0]
+    assert "; or " not in errors[0]
 
 
 MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (0, 270, 0), (45, 45, 45), (0, 0, 90), (20, 100, 200)]

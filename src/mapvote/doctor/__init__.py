@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from mapvote.core.types import MapvoteError
+
+if TYPE_CHECKING:
+    from mapvote.doctor.prior import Reading
 
 Severity = Literal["error", "warning", "note"]
 Progress = Callable[[str, int, int], None]
@@ -26,6 +29,8 @@ class Finding:
     mend: str = ""
     map_tells: bool = False
     """Whether a map can decide what the drive cannot: on one that it lies well on, nothing of this is left."""
+    readings: tuple[Reading, ...] = ()
+    """Of a prior and its scans, among which the drive cannot decide; its map may."""
 
 
 def any_error(found: Iterable[Finding]) -> bool:

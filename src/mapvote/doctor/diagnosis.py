@@ -25,6 +25,7 @@ from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
 from mapvote.doctor.maps import check_cloud, check_map, classified_ground, examine_map, tile_by_tile
 from mapvote.doctor.prior_fit import agreement, check_attitude
+from mapvote.doctor.reading_on_map import decided_by_map
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
 from mapvote.formats import is_cloud, open_drive_on
 from mapvote.formats.drives.rosbag import open_rosbag
@@ -61,6 +62,7 @@ def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[
         if not any_error(found) or (
             mount.lean_deg > ROAD_BELOW.lean_deg and turned.road.up == "+z" and turned.road.is_there
         ):
+            found = [replace(f, readings=()) for f in found]  # of the turned prior
             return in_order([*cheap, *found]), e.T if T is turned.T or T is None else T @ mount.C
     found, T = _by_scans(e)
     return in_order([*cheap, *found]), T
@@ -148,6 +150,9 @@ def _with_map(
     of_points = [f for f in check_cloud(tile_by_tile(point_map), classified_ground(point_map)) if f.severity != "note"]
     of_map = of_points + [f for f in check_map(point_map) if f.severity != "note"]
     named = [replace(f, what=f"the map: {f.what}") for f in of_map]
+    if drive is not None and not any_error(of_points):
+        found, T_read = decided_by_map(found, drive, point_map, progress)
+        T = T if T_read is None else T_read
     if drive is None or T is None or any_error(found):
         return found + named, T
     if any_error(of_points):  # as it is, no scan can fit it

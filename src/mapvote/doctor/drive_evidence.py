@@ -398,7 +398,10 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
         yield Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's")
     if road.depth_m > _HIGHEST_M:
         what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
-        yield Finding("warning", what, f"are the points in feet (then it is {0.3048 * road.depth_m:.1f} m)?")
+        mend = (
+            f"multiply their points by 0.3048 if they are feet (the road then lies {0.3048 * road.depth_m:.1f} m below)"
+        )
+        yield Finding("warning", what, mend)
     if T is None:
         return
     normal = np.mean([T[i, :3, :3] @ road.normal for i in e.some], axis=0)

@@ -388,6 +388,8 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     parts = ", ".join(words for words, _, _ in surely)
     what = f"the map is {parts} against the prior, at the middle of the drive ({places} places)"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
+    if any(words is scale for words, _, _ in surely):
+        mend = f"if the map is right, multiply their points by {d.scale:.4f}; else the map's by {1.0 / d.scale:.4f}"
     return Finding("error" if any(by > error for _, by, error in surely) else "warning", what, mend)
 
 

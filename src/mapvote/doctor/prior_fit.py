@@ -42,6 +42,7 @@ _POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
 """Errors of a prior's pose against a chain: they weigh positions against rotations."""
 _CHAIN_SCALE, _CHAIN_RAD = 0.003, np.radians(0.15)
 """What the chain itself may err by."""
+FEET_M = 0.3048
 _FIRSTS = 6
 """Readings that are tried as the first of two faults."""
 _HEIGHT_M = (0.8, 4.0)
@@ -133,11 +134,13 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
         behind = replace(behind, what=f"and once that is mended: {behind.what}")
         return [first, behind], other.reading.poses(one.reading.poses(T))
     group = _like_the_best(best, fits, length_m, runs)
-    found, mended = [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
+    named = replace(_named(group, as_it_is, best, length_m), readings=_for_a_map(group, fits, as_it_is, T))
+    found, mended = [named], best.reading.poses(T)
     right_handed = bool(np.linalg.det(mended[0, :3, :3]) > 0)
     if len(group) == 1 and right_handed and best.median > 0.1 + 0.02 * length_m:  # another fault may hide behind it
         more, twice_mended = compare(e, mended)
-        more = [replace(f, what=f"and once that is mended: {f.what}") for f in more if f.severity == "error"]
+        errors = [f for f in more if f.severity == "error"]
+        more = [replace(f, what=f"and once that is mended: {f.what}", readings=()) for f in errors]
         found, mended = found + more, twice_mended if more else mended
     return found, mended
 
@@ -207,6 +210,19 @@ def _like_the_best(best: _Fit, fits: Sequence[_Fit], length_m: float, runs: Sequ
     return sorted(chosen, key=lambda h: h.median)
 
 
+def _for_a_map(group: Sequence[_Fit], fits: Sequence[_Fit], as_it_is: _Fit, T: F64) -> tuple[Reading, ...]:
+    """The readings that a map may decide among: those that are named, then others that leave much less than the prior
+    as it is. Of those that lay the scans alike the first."""
+    others = [h for h in sorted(fits, key=lambda h: h.median) if h.special and h.median < 0.5 * as_it_is.median]
+    out: list[Reading] = []
+    for h in [*group, *others]:
+        poses = h.reading.poses(T)
+        alike = any(np.allclose(poses, one.poses(T), atol=1e-6) for one in out)
+        if not alike and len(out) < _FIRSTS + len(group):
+            out.append(h.reading)
+    return tuple(out)
+
+
 def _forward_deg(runs: Sequence[Run]) -> float:
     """The azimuth in the scans towards which the vehicle moves, median over the runs' first steps."""
     ahead = np.array([run.T_first_lidar[1, :2, 3] for run in runs])
@@ -234,18 +250,28 @@ def _reading_of(number: Number, T: F64, runs: Sequence[Run], road: Road) -> Read
     return Reading(what, f"turn its rotations by {-value:.1f} deg about z", number.poses, angle=True)
 
 
+def _unit_near(m: Number) -> float:
+    """The factor between feet and metres that a scale is within its error, or 5 %; 0 if it is none."""
+    errors = max(0.05, LIKELY * m.off[1])
+    return next((unit for unit in (FEET_M, 1.0 / FEET_M) if abs(np.log(m.value / unit)) < errors), 0.0)
+
+
 def _scale_words(m: Number, road: Road) -> tuple[str, str]:
     """Which side has the wrong scale shows by the sensor's height over the road."""
     low, high = _HEIGHT_M
     size = f"{m.value:.3f} times (+-{m.sigma:.3f})" if 0.1 < m.value < 10 else f"{m.value:.3g} times"
     usual, other = low <= road.depth_m <= high, low <= road.depth_m * m.value <= high
+    unit = _unit_near(m)
     if road.is_there and other and not usual:
         what = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
-        mend = f"multiply their points by {m.value:.4f} (feet are 0.3048 m)"
+        mend = f"multiply their points by {m.value:.4f}, or by the exact factor if you know it"
+        if unit:
+            mend = f"multiply their points by {unit:.5g} ({'they are' if unit < 1.0 else 'they were taken for'} feet)"
         return f"{what}: by them the road lies {road.depth_m:.1f} m below", mend
     what = f"the prior's positions are {size} too large"
     if road.is_there and usual and not other:
-        return what, f"divide its positions by {m.value:.5g}"
+        feet = " (they are feet)" if unit > 1.0 else " (they were taken for feet)"
+        return what, f"divide its positions by {unit:.5g}{feet}" if unit else f"divide its positions by {m.value:.5g}"
     mend = (
         f"divide its positions by {m.value:.5g}, or multiply the points by that: compare with a length that you know "
     )
@@ -256,7 +282,7 @@ def _scale_words(m: Number, road: Road) -> tuple[str, str]:
 def _named(group: Sequence[_Fit], as_it_is: _Fit, best: _Fit, length_m: float) -> Finding:
     names = "; or ".join(h.reading.name for h in group)
     mends = "; or ".join(dict.fromkeys(h.reading.mend for h in group))
-    apart = " (this drive cannot decide which: a turn would)" if len(group) > 1 else ""
+    apart = " (this drive cannot decide which: a turn would, or its map: --map)" if len(group) > 1 else ""
     so = f": so {best.median:.2f} m remain over {length_m:.0f} m driven, else {as_it_is.median:.2f} m"
     return Finding("error", names + apart + so, mends)
 
@@ -384,4 +410,5 @@ def _cannot_tell(as_it_is: _Fit, fits: Sequence[_Fit], length_m: float, e: Drive
     what = f"{CANNOT_TELL}: {'; '.join(reading.name for reading in like)}"
     if any(r.left_handed for r in like) and np.median(e.looks["turns"]) > 0.5 and e.drive.sensor.clockwise:
         what += " (the points go round counter-clockwise, most sensors clockwise)"
-    yield Finding("note", what, "check with a drive that turns, or against a map (--map)", map_tells=True)
+    mend = "check with a drive that turns, or against a map (--map)"
+    yield Finding("note", what, mend, map_tells=True, readings=tuple(like))

@@ -13,6 +13,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64
 from mapvote.doctor.scans import Looking, cheap_checks
 from mapvote.formats import open_drive
+from mapvote.formats.drives.ring_axis import level_by_axis, ring_axis
 
 HDL = SENSORS["hdl32e"]
 
@@ -61,6 +62,19 @@ def test_points_that_were_turned_keep_their_times(tmp_path: Path, rpy: tuple[int
     assert (np.minimum(apart, 0.1 - apart) < 1e-4).all()  # at the seam a point may be the first or the last
 
 
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(10, 0), (0, -6), (4, 7)])
+def test_points_that_were_tilted_keep_their_times(tmp_path: Path, roll_deg: int, pitch_deg: int) -> None:
+    """But for one constant: two small turns about x and y are a little turn about z, too."""
+    sound = open_drive(_written(tmp_path / "sound", np.eye(4), np.eye(4), False))
+    turned = open_drive(_written(tmp_path / "tilted", mount(roll_deg, pitch_deg, 0), np.eye(4), False))
+    expected, found = sound.read_scan(1).time_s, turned.read_scan(1).time_s
+    assert expected is not None
+    assert found is not None
+    apart = (found - expected + 0.05) % 0.1 - 0.05
+    assert abs(np.median(apart)) < 1e-4
+    assert np.abs(apart - np.median(apart)).max() < 1e-4
+
+
 def test_a_sensor_that_hangs_upside_down_turns_about_its_own_axis(tmp_path: Path) -> None:
     sound = open_drive(_written(tmp_path / "sound", np.eye(4), np.eye(4), True))
     hanging = open_drive(_written(tmp_path / "hanging", np.eye(4), mount(180, 0, 0), True))
@@ -74,3 +88,12 @@ def test_a_named_sensor_whose_points_were_turned_over_is_no_other_one(tmp_path: 
     drive = open_drive(_written(tmp_path / "turned", mount(180, 0, 0), np.eye(4), True))
     found = cheap_checks(drive, Looking(drive).look(range(4)))
     assert not [finding.what for finding in found if "beams" in finding.what]
+
+
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0, 0), (10, 0), (-3, 8), (0.7, -0.4)])
+def test_the_axis_of_the_rings_of_tilted_points_is_found(roll_deg: float, pitch_deg: float) -> None:
+    turned = mount(roll_deg, pitch_deg, 0.0)
+    axis = ring_axis(transform(turned, _scan(3)[:, :3]))
+    assert np.degrees(np.arccos(np.clip(axis @ turned[:3, 2], -1.0, 1.0))) < 0.15
+    assert np.allclose(level_by_axis(axis) @ axis, [0.0, 0.0, 1.0], atol=1e-12)
+    assert np.allclose(level_by_axis(axis) @ level_by_axis(axis).T, np.eye(3), atol=1e-12)

@@ -275,7 +275,8 @@ def make_drive(
     sigmas = None if prior_sigmas is None else prior_sigmas[chosen]
     sigma_m, sigma_deg = _usual_sigmas(options, sigmas)
     if options.motion_compensated is False and T_map_lidar is not None:
-        sensor = turning_about(sensor, T_map_lidar, read_scan(int(chosen[len(chosen) // 2]), sensor))
+        middle = read_scan(int(chosen[len(chosen) // 2]), replace(sensor, rings=True))  # whether or not it has any
+        sensor = turning_about(sensor, T_map_lidar, middle)
 
     return Drive(
         path=path,

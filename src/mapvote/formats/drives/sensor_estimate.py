@@ -11,6 +11,7 @@ from mapvote.core.mount import mount_of_prior
 from mapvote.core.record import record
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Scan
+from mapvote.formats.drives.ring_axis import level_by_axis, ring_axis
 
 UNKNOWN_SENSOR = Sensor("unknown", (0.0,), 0.2, min_range_m=0.5)
 """Reads the scans that are used."""
@@ -137,11 +138,12 @@ def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan, rule: RingRule =
     """The sensor with the axes in which azimuths tell times, by the mount that poses (n, 4, 4) state and one ``scan``.
 
     A sensor that leans turns about its own z if its rings lie about that, else its points were turned, and it turns
-    about the vertical. It faces the way driven in the middle of a revolution.
+    about the vertical. It faces the way driven in the middle of a revolution. Points without rings may have been
+    tilted by some degrees, which hides them.
     """
     mount = mount_of_prior(T_map_lidar)
     if mount is None:
-        return sensor
+        return sensor if sensor.rings else _tilted(sensor, scan.by_lidar()[0][1], rule)
     if mount.lean_deg > rule.upright_deg:
         first = scan.by_lidar()[0][1]
         own = estimate_sensor([first], sensor.rate_hz, rule)
@@ -152,6 +154,18 @@ def turning_about(sensor: Sensor, T_map_lidar: F64, scan: Scan, rule: RingRule =
             return sensor
     forward, left, up = mount.in_steps().C[:3, :3].tolist()
     return replace(sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
+
+
+def _tilted(sensor: Sensor, scan: Scan, rule: RingRule) -> Sensor:
+    """The sensor without rings whose points were tilted, with the rings that they lie on about another axis, if they
+    do."""
+    R = level_by_axis(ring_axis(scan.points))
+    level = replace(scan, points=np.ascontiguousarray(scan.points @ R.T, dtype=np.float32))
+    found = estimate_sensor([level], sensor.rate_hz, rule)
+    if not found.sensor.rings or found.on_rings < rule.sure:
+        return sensor
+    forward, left, up = R.tolist()
+    return replace(found.sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
 
 
 def _angles(scan: Scan) -> tuple[F64, F64, F64]:
