@@ -248,12 +248,12 @@ def long_drive(n: int = 60) -> Drive:
 def test_a_drive_cut_into_ballots_has_every_scan_in_exactly_one_whenever_they_are_written() -> None:
     """What a stretch says is fixed when it is cut: nothing that comes later changes a bit of it."""
     drive_, point_map, cuts = long_drive(), street_map(), Cuts(length_m=7.0)
-    ballots = [written() for _, written in vote_in_stretches(drive_, make(point_map), cuts)]
+    ballots = [stretch.written() for stretch in vote_in_stretches(drive_, make(point_map), cuts)]
     assert [ballot.drive for ballot in ballots] == ["d-001", "d-002", "d-003"]
     assert sum(ballot.scans_localised for ballot in ballots) == sum(b.scans for b in ballots) == len(drive_)
     assert [b.end_ns < later.start_ns for b, later in pairwise(ballots)] == [True] * 2
     assert all(6.5 < (b.length_m or 0.0) < 7.5 for b in ballots[:-1])
-    later = [written() for _, written in list(vote_in_stretches(drive_, make(point_map), cuts))]
+    later = [stretch.written() for stretch in list(vote_in_stretches(drive_, make(point_map), cuts))]
     assert list(map(encode, ballots)) == list(map(encode, later))
 
 

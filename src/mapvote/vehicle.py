@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from mapvote.codec.planes import compress, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
-from mapvote.core.mount import Mount, mount_of_prior
 from mapvote.core.point_map import PointMap
 from mapvote.core.points import Values, attributes_among, point_field
 from mapvote.core.reference import LocalMap, reference_window
@@ -31,7 +31,7 @@ from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U64, CellState, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voting import to_wire
-from mapvote.formats.drives.sensor_estimate import sensor_upright
+from mapvote.formats.drives.upright import upright
 from mapvote.matching.localiser import Localise, Localiser
 from mapvote.matching.prior_frame import PriorFrame
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
@@ -39,6 +39,20 @@ from mapvote.perception.moving_objects import MovingFilter
 from mapvote.rules.voter import NewPoints, TileVotes, make_voter, points_in
 
 NOTHING = np.uint64(0)
+
+
+class ClosedStretch(NamedTuple):
+    """The road of one ballot that is closed."""
+
+    drive_id: str
+    written: Callable[[], Ballot]
+    """Writes the ballot: it may be called later and in another thread, and raises MapvoteError if no scan has voted."""
+    report: DriveReport
+    """Of its scans."""
+    point_map: PointMap
+    """The map that it was driven on."""
+    prior_in_map: bool
+    """Whether the priors were in the map's frame."""
 
 
 class Vehicle:
@@ -101,6 +115,16 @@ class Vehicle:
             frame.is_unknown = True
 
     @property
+    def prior_in_map(self) -> bool:
+        """Whether the priors are in the map's frame, not in one of their own."""
+        frame = self.prior_frame
+        return frame is None or not (frame.is_own or frame.is_unknown)
+
+    def last_stretch(self) -> ClosedStretch:
+        """The stretch of the ballot that is open, which the end of the drive closes: after :meth:`finish`."""
+        return ClosedStretch(self.drive_id, self.ballot, self.report, self.point_map, self.prior_in_map)
+
+    @property
     def done(self) -> int:
         """How many scans of the report have voted or are lost; those after them still wait."""
         return self._frontend.done
@@ -120,23 +144,24 @@ class Vehicle:
         """The drive has ended: the scans that still wait vote now."""
         self._vote(self._frontend.finish())
 
-    def cut(self, next_drive_id: str, point_map: PointMap | None = None) -> Callable[[], Ballot]:
+    def cut(self, next_drive_id: str, point_map: PointMap | None = None) -> ClosedStretch:
         """End this ballot and begin the next one on the same track: the drive goes on.
 
-        Scans that have voted are in the ballot that ends; those that wait vote in the next. Returns what writes the
-        ballot: it may be called later and in another thread, and raises MapvoteError if no scan has voted.
+        Scans that have voted are in the stretch that ends, which is returned; those that wait vote in the next.
         ``point_map``: another version of the map, which the next ballot holds to.
         """
-        ended = partial(
+        report = self._frontend.cut()
+        written = partial(
             write_ballot,
             self.name,
             self.drive_id,
             self.point_map,
             self.settings,
-            self._frontend.cut(),
+            report,
             self._voter.each(),
             self._new_points,
         )
+        ended = ClosedStretch(self.drive_id, written, report, self.point_map, self.prior_in_map)
         self.drive_id = next_drive_id
         if point_map is not None and point_map is not self.point_map:
             self.point_map = point_map
@@ -297,15 +322,12 @@ def vote_drive(
 ) -> tuple[Ballot, DriveReport]:
     """Every scan of ``drive`` observed by one Vehicle. ``progress(done, total)`` is called after each scan.
 
-    A sensor that its prior mounts upside down, on its side or turned is localised in axes with x ahead and z up; the
-    report has its own again.
+    A sensor that its prior, or its T_base_lidar, mounts upside down, on its side or turned is localised in axes with x
+    ahead and z up; the report has its own again.
     """
-    prior = drive.T_map_lidar_prior
-    states_attitude = prior is not None and drive.prior_sigmas is None
-    mount = mount_of_prior(prior) if localise is None and prior is not None and states_attitude else None
-    if mount is not None:
-        mount = mount.in_steps()
-        drive = _upright(drive, mount)
+    mount = None
+    if localise is None:
+        drive, mount = upright(drive)
     vehicle = vehicle_on(drive, point_map, settings, localise=localise)
     for i, scan in enumerate(drive):
         vehicle.observe(scan, PosePrior.of(drive, i))
@@ -315,16 +337,8 @@ def vote_drive(
     report = vehicle.report
     ballot = vehicle.ballot()
     if mount is not None:
-        report.T_map_lidar[:] = [np.asarray(T @ mount.C) for T in report.T_map_lidar]
+        report.turn(mount.C)
     return ballot, report
-
-
-def _upright(drive: Drive, mount: Mount) -> Drive:
-    """``drive`` in axes with x ahead and z up, with the model of its sensor in them."""
-    turned = mount.turned(drive)
-    measured = drive.sensor_told.startswith("measured")
-    middle = turned.read_scan(len(turned) // 2).by_lidar()[0][1]
-    return replace(turned, sensor=sensor_upright(drive.sensor, measured, middle, mount.lean_deg))
 
 
 def vehicle_on(
@@ -348,9 +362,9 @@ def vehicle_on(
 
 def vote_in_stretches(
     drive: Drive, vehicle: Vehicle, cuts: Cuts, progress: Callable[[int, int], None] | None = None
-) -> Iterator[tuple[str, Callable[[], Ballot]]]:
-    """Every scan of ``drive`` observed by ``vehicle``; where a live drive would close a ballot, its name and what
-    writes it. The ballots are named DRIVE-001, DRIVE-002 and so on."""
+) -> Iterator[ClosedStretch]:
+    """Every scan of ``drive`` observed by ``vehicle``: the stretches whose ballots a live drive would close. They are
+    named DRIVE-001, DRIVE-002 and so on."""
     number = 1
     vehicle.drive_id = stretch_name(drive.drive_id, number)
     road = RoadDriven(cuts)
@@ -359,12 +373,11 @@ def vote_in_stretches(
         if progress:
             progress(i + 1, len(drive))
         if road.is_full(vehicle.report, vehicle.done):
-            closed = vehicle.drive_id
             number += 1
             road = RoadDriven(cuts)
-            yield closed, vehicle.cut(stretch_name(drive.drive_id, number))
+            yield vehicle.cut(stretch_name(drive.drive_id, number))
     vehicle.finish()
-    yield vehicle.drive_id, vehicle.ballot
+    yield vehicle.last_stretch()
 
 
 def stretch_name(drive_id: str, k: int) -> str:

@@ -18,7 +18,7 @@ import pytest
 from bag_recorder import START, Recorder
 from command_line import type_in
 from mapvote.codec.ballot import encode
-from mapvote.core.geometry import from_xyz_rpy, interpolate, inverse
+from mapvote.core.geometry import from_xyz_rpy, interpolate, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
@@ -71,23 +71,26 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
         player.wait(120)
     drive = open_drive(bag, sensor="hdl32e", vehicle="car", prior="/odometry")
     voter = Vehicle("car", SENSORS["hdl32e"], read_map(tmp_path / "map"), drive_id="day")
-    wanted = [written() for _, written in vote_in_stretches(replace(drive, drive_id="day"), voter, Cuts(length_m=12.0))]
+    named = replace(drive, drive_id="day")
+    wanted = [stretch.written() for stretch in vote_in_stretches(named, voter, Cuts(length_m=12.0))]
     assert " 0 scans left out, 0 without odometry" in said
     assert len(wanted) >= 2
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {f"car~{b.drive}.ballot": encode(b) for b in wanted}
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("roll_rad", [0.0, np.pi], ids=["upright", "upside down"])
 def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_ballots_are_equal_bit_for_bit(
-    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch, roll_rad: float
 ) -> None:
     """Odometry at 50 Hz in a frame of its own, a LiDAR that sits on the vehicle by /tf_static, a sensor to measure."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    mount = from_xyz_rpy(1.2, 0.1, 1.5, 0.0, 0.02, 0.05)
+    hung = from_xyz_rpy(0.0, 0.0, 0.0, roll_rad)
+    mount = from_xyz_rpy(1.2, 0.1, 1.5, 0.0, 0.02, 0.05) @ hung
     T_odom_map = from_xyz_rpy(100.0, 50.0, 0.0, 0.0, 0.0, 0.6)
     recorder, poses = Recorder(tmp_path / "bag"), path(SCANS)
     recorder.write_raw("/tf_static", TF, START, frames_message(START, {"lidar": mount}))
-    bodies = [T_odom_map @ T @ inverse(mount) for T in poses]
+    bodies = [T_odom_map @ T @ hung @ inverse(mount) for T in poses]
     for i, T in enumerate(poses):
         ns = START + i * 100_000_000
         for k in range(5):
@@ -95,8 +98,8 @@ def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_
             T_body = interpolate(bodies[i], bodies[min(i + 1, SCANS - 1)], 0.2 * k)
             recorder.write_raw("/wheels", ODOMETRY, at_ns, odometry_message(at_ns, T_body, "odom"))
             if k == 0:
-                scan = sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns)
-                recorder.write_raw("/lidar", CLOUD, ns, cloud_message(Scan(ns, scan.points), "lidar"))
+                points = transform(inverse(hung), sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns).points)
+                recorder.write_raw("/lidar", CLOUD, ns, cloud_message(Scan(ns, points.astype(np.float32)), "lidar"))
     recorder.bag.close()
     write_map(map_from_points(street(1)), tmp_path / "map")
     for folder in ("live", "offline"):

@@ -19,7 +19,7 @@ from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.live import drive as drive_module
-from mapvote.live.drive import Counts, LiveDrive, WaitingScan
+from mapvote.live.drive import Counts, FirstSeconds, LiveDrive, WaitingScan
 from mapvote.live.outbox import Outbox, ballot_of
 from mapvote.live.road_map import OneMap
 from mapvote.live.thinning import THINNING, Thinning
@@ -136,6 +136,27 @@ def test_scans_are_shed_evenly_and_the_oldest_and_newest_stay() -> None:
     waiting = deque(range(91))
     assert thinning.shed(waiting) == 81
     assert list(waiting) == list(range(0, 91, 10))
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_no_ballot_leaves_of_a_road_on_which_the_vehicle_did_not_know_where_it_was(
+    tmp_path: Path, checked: bool
+) -> None:
+    """Scans and poses come in another order than they were driven: each finds its place, and the path leaps."""
+    live = Live(tmp_path, first=FirstSeconds("stated") if checked else None)
+    order = np.roll(np.arange(SCANS), SCANS // 2).tolist()
+    scans, poses = [live.scans[k] for k in order], live.poses[order]
+    live.poses = poses
+    live.scans = [replace(scan, stamp_ns=live.scans[i].stamp_ns) for i, scan in enumerate(scans)]
+    for i in range(SCANS):
+        live.give(i)
+        live.drain()
+    live.live.first_findings()
+    live.live.finish()
+    live.outbox.close()
+    assert len(list((tmp_path / "out").iterdir())) == (0 if checked else 1)
+    assert not list((tmp_path / "state/car").glob("*.journal"))
+    assert any("the localised path leaps" in line and "--unchecked" in line for line in live.said) == checked
 
 
 def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_on(tmp_path: Path) -> None:

@@ -229,6 +229,32 @@ def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(domain: 
     assert np.allclose(transform(T["left"], origin[None])[0], T["right"][:3, 3])
 
 
+@pytest.mark.parametrize("roll_deg", [0, 180, 90])
+def test_a_lidar_that_hangs_on_the_vehicle_by_tf_static_is_read_in_axes_with_z_up(domain: int, roll_deg: int) -> None:
+    world = np.random.default_rng(1).uniform((4, 4, 0), (30, 30, 5), (500, 3))
+    T_base_lidar = from_xyz_rpy(1.0, 0.7, 1.9, np.radians(roll_deg), 0.02, 0.05)
+    vehicle = Vehicle(domain, (POINTS, CLOUD), (POSES, ODOMETRY), ("/tf_static", TF))
+    vehicle.send("/tf_static", frames_message(0, {"lidar": T_base_lidar}))
+    topics, scans = subscriptions(domain, [POINTS]), list[list[Cloud]]()
+    vehicle.until_subscribed()
+    seen = transform(inverse(T_base_lidar), world).astype(np.float32)
+    vehicle.send(POINTS, cloud_message(Scan(START, seen), "lidar"))
+    vehicle.send(POSES, odometry_message(START, np.eye(4)))
+
+    def has_come() -> bool:
+        scans.extend(topics.take_scans())
+        topics.take_poses()
+        return bool(scans and topics.poses)
+
+    until(has_come)
+    topics.stand_upright(None, scans)
+    T = T_base_lidar if topics.mount is None else T_base_lidar @ inverse(topics.mount.C)
+    scan = topics.waiting(scans[0]).read()
+    assert T[2, 2] > 0.99
+    assert T[0, 0] > 0.99
+    assert np.abs(transform(T, scan.points) - world).max() < 1e-4
+
+
 def test_a_drive_to_which_no_cloud_comes_ends_after_the_idle_time(tmp_path: Path, domain: int) -> None:
     chosen = Chosen((PublishedTopic(POINTS, CLOUD, 1, True, False),), None)
     topics = Subscriptions(Network(domain), chosen, SENSORS["hdl32e"])

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle
+from mapvote.core.mount import Mount
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, MapvoteError, PosePrior, Scan
@@ -87,6 +88,23 @@ def test_the_map_has_one_point_a_voxel_on_the_streets_surfaces_and_none_where_it
         assert not (content.free & reference.occupied).any()
         known += int(np.bitwise_count(content.free).sum())
     assert known > 1000
+
+
+@pytest.mark.parametrize("with_prior", [True, False])
+def test_a_sensor_that_hangs_upside_down_makes_the_map_of_one_that_stands(with_prior: bool) -> None:
+    poses = path(8, -15.0)
+    standing = drive_along(poses, 6, poses if with_prior else None, sigma_m=0.02, sigma_deg=0.05)
+    over = from_xyz_rpy(0.0, 0.0, 0.0, roll=np.pi)
+    elevations_deg = tuple(-e for e in reversed(standing.sensor.elevations_deg))
+    hanging = replace(
+        Mount(over, 180.0).turned(standing), sensor=replace(standing.sensor, elevations_deg=elevations_deg)
+    )
+    (map_a, report_a), (map_b, report_b) = build_map([standing]), build_map([hanging])
+    points_a, points_b = all_points(map_a), all_points(map_b)
+    assert len(points_b) == pytest.approx(len(points_a), rel=1e-3)  # rounding carries a point over its voxel's face
+    assert (cKDTree(points_b).query(points_a)[0] < 1e-3).mean() > 0.999
+    turned_back = report_b.tracks[0].T_map_lidar @ over
+    assert np.abs(turned_back - report_a.tracks[0].T_map_lidar).max() < 1e-4
 
 
 def test_without_a_prior_the_first_scan_is_the_frame() -> None:

@@ -251,7 +251,7 @@ def _drive_once(
     with usable_drives([drive], unchecked=unchecked) as (drive,), progress("voting") as tell:
         ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
     if not trust_prior:
-        require_localised(LocalisedDrive.of_report(drive, report), drive, point_map, unchecked)
+        require_localised(LocalisedDrive.of_vote(drive, report), drive, point_map, unchecked)
     require_straight(drive, report, point_map, unchecked=unchecked)
     return ballot, report
 
@@ -270,15 +270,21 @@ def _vote_in_cuts(drive: Drive, point_map: PointMap, settings: Settings, every_m
     """The ballots that a live drive by the same scans would close, each written or sent as soon as it is known that
     the drive can be used."""
     from mapvote.codec.ballot import encode
+    from mapvote.doctor.localised import LocalisedDrive, written_if_localised
     from mapvote.formats.atomic import write_whole
+    from mapvote.formats.drives.upright import upright
     from mapvote.vehicle import Cuts, vehicle_on, vote_in_stretches
 
     with usable_drives([drive], unchecked=outlets.unchecked) as (looked,), progress("voting") as tell:
-        vehicle = vehicle_on(looked, point_map, settings)
-        closed = list(vote_in_stretches(looked, vehicle, Cuts(length_m=every_m), tell))
-    for drive_id, written in closed:
+        turned, _ = upright(looked)
+        vehicle = vehicle_on(turned, point_map, settings)
+        closed = list(vote_in_stretches(turned, vehicle, Cuts(length_m=every_m), tell))
+    for stretch in closed:
+        drive_id = stretch.drive_id
+        localised = LocalisedDrive.of_report(stretch.report, prior_in_map=stretch.prior_in_map)
+        checked = written_if_localised(stretch.written, localised, stretch.point_map)
         try:
-            ballot = written()
+            ballot = stretch.written() if outlets.unchecked else checked()
         except MapvoteError as error:
             print(f"{drive_id}: no ballot ({error})")
             continue

@@ -111,7 +111,10 @@ def drive(
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="show a live view in the terminal instead of the log")] = False,
     unchecked: Annotated[
-        bool, typer.Option("--unchecked", help="vote even if the checks of the first ten seconds fail")
+        bool,
+        typer.Option(
+            "--unchecked", help="vote even if the checks of the first ten seconds, or of the places of scans, fail"
+        ),
     ] = False,
     domain: Domain = None,
     namespace: Annotated[

@@ -91,6 +91,25 @@ def mount_of_prior(T: F64, rules: MountRules = MOUNT_RULES) -> Mount | None:
     return Mount(C, lean_deg)
 
 
+def mount_of_base(T_base_lidar: F64, rules: MountRules = MOUNT_RULES) -> Mount | None:
+    """The mount of a LiDAR at T_base_lidar (4, 4) on a vehicle with x ahead and z up; None if it is the usual one."""
+    R = T_base_lidar[:3, :3]
+    lean_deg = float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0))))
+    turned_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+    if lean_deg <= rules.usual_deg and abs(turned_deg) <= rules.usual_deg:
+        return None
+    C = np.eye(4)
+    C[:3, :3] = R
+    return Mount(C, lean_deg)
+
+
+def mount_of_drive(drive: Drive) -> Mount | None:
+    """The mount that the prior of a drive states, where that knows no attitude its T_base_lidar; None if usual."""
+    if drive.T_map_lidar_prior is not None and drive.prior_sigmas is None:
+        return mount_of_prior(drive.T_map_lidar_prior)
+    return mount_of_base(drive.T_base_lidar)
+
+
 def _rotations(step_deg: int) -> F64:
     """(n, 3, 3) rotations by roll, pitch and yaw in steps about each axis, and their inverses."""
     angles = np.radians(np.arange(0, 360, step_deg)).tolist()

@@ -7,17 +7,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from mapvote.core.types import MapvoteError
-
-if TYPE_CHECKING:
-    from mapvote.doctor.prior import Reading
+from mapvote.core.types import F64, MapvoteError
 
 Severity = Literal["error", "warning", "note"]
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, in all)."""
 _ORDER = {"error": 0, "warning": 1, "note": 2}
+
+
+Rule = Callable[[F64], F64]
+"""Poses (n, 4, 4) from poses (n, 4, 4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What may be wrong, and how to mend it."""
+
+    name: str
+    mend: str
+    poses: Rule
+    told_by: str = "prior"
+    """Which side is wrong: "prior", "scans", or "order"."""
+    catch_all: bool = False
+    """Fits much that is wrong otherwise: named only where nothing more special fits."""
+    angle: bool = False
+    """Tells by how many degrees something is turned: a straight drive shows many a mistake as that."""
+    left_handed: bool = False
+    """The side that breaks the convention of axes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,14 +7,15 @@ such a defect outvote any quorum. Sound drives pass: a prior may be off by a con
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
+from mapvote.codec.ballot import Ballot
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, I64, Bool, Drive
+from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
 from mapvote.doctor import Finding
 from mapvote.perception.frontend import DriveReport
 
@@ -58,7 +59,7 @@ class LocalisedDrive:
     sure: Bool
     """(n,) which of them are trusted."""
     T_prior: F64 | None
-    """(n, 4, 4) believed."""
+    """(n, 4, 4) believed; NaN where nothing was."""
     sigma_m: float
     sigma_deg: float
     """The prior's, as stated."""
@@ -66,15 +67,43 @@ class LocalisedDrive:
     @classmethod
     def of(cls, drive: Drive, T_map_lidar: Sequence[F64] | F64, sure: Bool) -> LocalisedDrive:
         """Of a recorded ``drive`` whose scans were found at poses (n, 4, 4), those that are ``sure`` (n,)."""
-        prior, sigmas = drive.T_map_lidar_prior, (drive.prior_sigma_m, drive.prior_sigma_deg)
-        return cls(drive.stamps_ns, np.asarray(T_map_lidar), sure, prior, *sigmas)
+        prior, sigma_m, sigma_deg = drive.T_map_lidar_prior, drive.prior_sigma_m, drive.prior_sigma_deg
+        if prior is not None and drive.prior_sigmas is not None:  # fixes, which know no attitude
+            fixed = np.isfinite(drive.prior_sigmas[:, 0])
+            prior = np.where(fixed[:, None, None], prior, np.nan)
+            sigma_m = float(drive.prior_sigmas[fixed, 0].max(initial=0.0))
+            sigma_deg = np.inf
+        return cls(drive.stamps_ns, np.asarray(T_map_lidar), sure, prior, sigma_m, sigma_deg)
 
     @classmethod
-    def of_report(cls, drive: Drive, report: DriveReport) -> LocalisedDrive:
+    def of_vote(cls, drive: Drive, report: DriveReport) -> LocalisedDrive:
         """Of a recorded ``drive`` that has voted."""
+        if not drive.prior_in_map:
+            return cls.of_report(report, prior_in_map=False)
         sure = np.ones(len(drive), dtype=np.bool_)
         sure[report.lost] = False
         return cls.of(drive, report.T_map_lidar, sure)
+
+    @classmethod
+    def of_report(cls, report: DriveReport, *, prior_in_map: bool = True) -> LocalisedDrive:
+        """Of the scans of ``report`` that are decided. Priors that are not in the map's frame say nothing of a scan
+        that has no sure place: where their frame lies is learnt from those that have one."""
+        n = len(report.T_map_lidar)
+        sure = np.ones(n, dtype=np.bool_)
+        sure[[i for i in report.lost if i < n]] = False
+        given = [prior for prior in report.priors[:n] if prior is not None]
+        T_prior = None
+        if given:
+            T_prior = np.full((n, 4, 4), np.nan)
+            for i, prior in enumerate(report.priors[:n]):
+                if prior is not None and (prior_in_map or sure[i]):
+                    T_prior[i] = prior.T_map_lidar
+        sigma_m = max((prior.sigma_m for prior in given), default=np.inf)
+        # Fixes know no attitude.
+        sigmas_rad = [np.inf if prior.is_planar else prior.sigma_rad for prior in given]
+        sigma_deg = float(np.degrees(max(sigmas_rad, default=np.inf)))
+        stamps_ns = np.array(report.stamps_ns[:n], dtype=np.int64)
+        return cls(stamps_ns, np.array(report.T_map_lidar).reshape(n, 4, 4), sure, T_prior, sigma_m, sigma_deg)
 
 
 def check_localised(
@@ -90,16 +119,36 @@ def check_localised(
         return
     yield from _leaps(drive, found, rules)
     if drive.T_prior is not None:
+        found = found[np.isfinite(drive.T_prior[found]).all(axis=(1, 2))]
+        if len(found) < rules.least_scans:
+            return
         yield from _ways(drive, found, rules)
         yield from _attitude(drive, found, rules)
         yield from _positions(drive, found, rules)
 
 
+def written_if_localised(
+    written: Callable[[], Ballot], localised: LocalisedDrive, point_map: PointMap
+) -> Callable[[], Ballot]:
+    """What writes the ballot of a closed stretch of road: it raises MapvoteError, too, if the vehicle did not know
+    where it was."""
+
+    def checked() -> Ballot:
+        for finding in check_localised(localised, point_map):
+            raise MapvoteError(f"{finding.what}. {finding.mend} --unchecked votes all the same")
+        return written()
+
+    return checked
+
+
 def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRules) -> Iterator[Finding]:
     on_map = np.ones(len(drive.stamps_ns), dtype=np.bool_)
     if point_map is not None:
-        believed = drive.T_map_lidar if drive.T_prior is None else drive.T_prior
-        on_map = np.isfinite(point_map.ground_under(believed[:, :3, 3])) | drive.sure
+        believed = drive.T_map_lidar[:, :3, 3].copy()
+        if drive.T_prior is not None:
+            told = np.isfinite(drive.T_prior).all(axis=(1, 2))
+            believed[told] = drive.T_prior[told, :3, 3]
+        on_map = np.isfinite(point_map.ground_under(believed)) | drive.sure
     scans, sure = int(on_map.sum()), int(drive.sure.sum())
     if scans >= rules.least_scans and sure < rules.least_share * scans:
         what = f"only {sure} of {scans} scans that lie on the map have a sure place in it"

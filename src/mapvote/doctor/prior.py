@@ -17,10 +17,9 @@ import scipy
 from mapvote.core.geometry import from_xyz_rpy, inverse, inverses, log, poses_at
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64
+from mapvote.doctor import Reading, Rule
 from mapvote.doctor.drive_evidence import Run
 
-Rule = Callable[[F64], F64]
-"""Poses (n, 4, 4) from poses (n, 4, 4)."""
 CAMERA_TO_LIDAR = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From x right, y down, z forward to x forward, y left, z up."""
 
@@ -49,23 +48,6 @@ PRIOR_CHECK = PriorCheck()
 LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
 """Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
 X_FORWARD = "turn the points, or T_base_lidar, so that x is forward"
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """What may be wrong, and how to mend it."""
-
-    name: str
-    mend: str
-    poses: Rule
-    told_by: str = "prior"
-    """Which side is wrong: "prior", "scans", or "order"."""
-    catch_all: bool = False
-    """Fits much that is wrong otherwise: named only where nothing more special fits."""
-    angle: bool = False
-    """Tells by how many degrees something is turned: a straight drive shows many a mistake as that."""
-    left_handed: bool = False
-    """The side that breaks the convention of axes."""
 
 
 def scaled(factor: float) -> Rule:

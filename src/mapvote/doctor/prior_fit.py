@@ -15,7 +15,7 @@ import scipy
 
 from mapvote.core.geometry import poses_at
 from mapvote.core.types import F64, Drive
-from mapvote.doctor import Finding, Severity
+from mapvote.doctor import Finding, Reading, Severity
 from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
 from mapvote.doctor.prior import (
     AS_IT_IS,
@@ -24,7 +24,6 @@ from mapvote.doctor.prior import (
     READINGS,
     X_FORWARD,
     Number,
-    Reading,
     at_times,
     drift_angle_deg,
     fit_similarity,

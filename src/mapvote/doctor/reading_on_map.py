@@ -14,9 +14,9 @@ import numpy as np
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.doctor import Finding, Progress
+from mapvote.doctor import Finding, Progress, Reading
 from mapvote.doctor.map_fit import MapEvidence, fitting
-from mapvote.doctor.prior import AS_IT_IS, Reading
+from mapvote.doctor.prior import AS_IT_IS
 
 
 @record()

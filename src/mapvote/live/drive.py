@@ -20,6 +20,7 @@ from mapvote.core.grid import TileIndex, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.doctor import Finding, any_error, in_order
+from mapvote.doctor.localised import LocalisedDrive, written_if_localised
 from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.formats.drives.fixes import FIX_RULES, Fixes
@@ -28,7 +29,7 @@ from mapvote.live.outbox import Outbox
 from mapvote.live.priors import Priors, pose_in
 from mapvote.live.road_map import Maps
 from mapvote.live.thinning import THINNING, Thinning
-from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
+from mapvote.vehicle import ClosedStretch, Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
 _FIXES = 400
@@ -178,7 +179,8 @@ class LiveDrive:
     ) -> None:
         """``make_vehicle`` makes a vehicle that has driven nowhere yet. ``with_poses``: scans wait for odometry's.
         ``T_base_lidar`` (4, 4): the LiDAR on what odometry tracks. ``first``: no ballot leaves before
-        :meth:`first_findings` was asked."""
+        :meth:`first_findings` was asked, and none of a stretch on which the vehicle did not know where it was. Without
+        it nothing is checked."""
         self.counts, self._maps, self._outbox = Counts(), maps, outbox
         self.latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         """From stamp to vote, of the last scans that voted during the drive. Those of its last second vote at its
@@ -211,6 +213,7 @@ class LiveDrive:
         self._repeated = Repeated(log.warning)
         self.first = first
         """None once :meth:`first_findings` was asked."""
+        self._checked = first is not None
         self._held = list[tuple[str, Callable[[], Ballot], str | None]]()
         self.checked_now = False
         """Whether the first seconds are over and their findings were not asked for."""
@@ -268,7 +271,7 @@ class LiveDrive:
         if self.vehicle is not None:
             self.vehicle.finish()
             self._count_votes(self.vehicle, ended=True)
-            self._leave(self.vehicle.ballot)
+            self._leave(self.vehicle.last_stretch())
         self.vehicle = None
         self._place = None
         self._observed.clear()
@@ -301,7 +304,7 @@ class LiveDrive:
             self.vehicle.finish()
             self._count_votes(self.vehicle, ended=True)
             self.counts.ballots += 1
-            self._held.append((self.drive_id, self.vehicle.ballot, None))
+            self._held.append((self.drive_id, self._written(self.vehicle.last_stretch()), None))
             self._release()
 
     def first_findings(self) -> list[Finding]:
@@ -427,13 +430,20 @@ class LiveDrive:
             self._frames_begun = frame.begun
             self._repeated("frame", f"odometry is in a frame of its own. Its origin in the map: {frame.told()}")
 
-    def _leave(self, written: Callable[[], Ballot]) -> None:
+    def _written(self, stretch: ClosedStretch) -> Callable[[], Ballot]:
+        """What writes the ballot of a stretch that is closed."""
+        if not self._checked:
+            return stretch.written
+        localised = LocalisedDrive.of_report(stretch.report, prior_in_map=stretch.prior_in_map)
+        return written_if_localised(stretch.written, localised, stretch.point_map)
+
+    def _leave(self, stretch: ClosedStretch) -> None:
         """A ballot is closed, and the next one begins."""
         closed = self.drive_id
         self.number += 1
         self.counts.ballots += 1
         self._touched.clear()
-        self._held.append((closed, written, self.drive_id))
+        self._held.append((closed, self._written(stretch), self.drive_id))
         if self.first is None:
             self._release()
 

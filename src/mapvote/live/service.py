@@ -46,7 +46,8 @@ class Plan:
     idle_s: float = 0.0
     """End after so long without a cloud; 0: never."""
     checked: bool = True
-    """Whether the first seconds are checked, and an error among them ends the drive."""
+    """Whether the first seconds are checked, and an error among them ends the drive; and whether a ballot leaves only
+    if the vehicle knew where it was."""
 
 
 Watcher = Callable[[LiveDrive, Subscriptions], None]
@@ -146,6 +147,7 @@ def run(
     scans, poses = prepare(topics, plan, ended, voice)
     if ended() or not scans or topics.sensor is None:
         return None
+    topics.stand_upright(plan.T_base_lidar, scans)
     live = _live_drive(plan, topics, maps, outbox)
     needs = Needs(plan, maps)
     last_s = time.monotonic()
@@ -175,7 +177,7 @@ def run(
 
 
 def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -> LiveDrive:
-    sensor = topics.sensor
+    sensor = topics.upright_sensor or topics.sensor
     assert sensor is not None
 
     def make_vehicle(point_map: PointMap) -> Vehicle:
@@ -188,7 +190,7 @@ def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -
         name=plan.name,
         cuts=plan.cuts,
         with_poses=topics.chosen.odometry is not None,
-        T_base_lidar=plan.T_base_lidar,
+        T_base_lidar=None if plan.T_base_lidar is None else _upright(plan.T_base_lidar, topics),
         first=FirstSeconds(topics.sensor_told) if plan.checked else None,
     )
 
@@ -203,8 +205,13 @@ def _mounted(live: LiveDrive, topics: Subscriptions, plan: Plan) -> bool:
         return True
     T = topics.T_base_lidar()
     if T is not None:
-        live.T_base_lidar = T
+        live.T_base_lidar = _upright(T, topics)
     return T is not None
+
+
+def _upright(T_base_lidar: F64, topics: Subscriptions) -> F64:
+    """T_base_lidar (4, 4) of a LiDAR in the axes in which scans are given."""
+    return T_base_lidar if topics.mount is None else np.asarray(T_base_lidar @ topics.mount.C.T)
 
 
 class Needs:

@@ -13,12 +13,19 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.mount import Mount, mount_of_base
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
-from mapvote.formats.drives.sensor_estimate import RING_RULE, UNKNOWN_SENSOR, estimate_sensor, rate_of_first
+from mapvote.formats.drives.sensor_estimate import (
+    RING_RULE,
+    UNKNOWN_SENSOR,
+    estimate_sensor,
+    rate_of_first,
+    sensor_upright,
+)
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.choice import Chosen
 from mapvote.live.dds import Network
@@ -103,6 +110,10 @@ class Subscriptions:
         self.sensor_told = "stated" if sensor is not None else ""
         self.lidar_frames: list[str] = [""] * len(chosen.points)
         """The frame of each LiDAR, from its clouds."""
+        self.mount: Mount | None = None
+        """By which scans are turned to x ahead and z up; None: not at all."""
+        self.upright_sensor: Sensor | None = None
+        """The first LiDAR in the axes in which scans are given; None: as ``sensor``."""
         self.base_frame, self.map_frame = "", ""
         """The frame that odometry tracks, and its parent."""
         self.clocks = Clocks()
@@ -247,6 +258,27 @@ class Subscriptions:
             for transform in from_cdr(TF, data).transforms:
                 self.frames.add(transform, fixed=fixed)
 
+    def stand_upright(self, T_base_lidar: F64 | None, scans: Sequence[list[Cloud]]) -> None:
+        """From here on scans are given in axes with x ahead and z up, if the first LiDAR sits otherwise on the vehicle:
+        as ``T_base_lidar`` (4, 4) states, else as frames tell. Its model is measured anew in the first of ``scans``."""
+        T = self.T_base_lidar() if T_base_lidar is None else T_base_lidar
+        if T_base_lidar is None and self.chosen.odometry is None:
+            T = self.frames.between(BASE_FRAME, self.lidar_frames[0])
+        mount = None if T is None else mount_of_base(T)
+        read = None if mount is None else self._first_usable(scans)
+        if mount is None or read is None or self.sensor is None:
+            return
+        self.mount = mount.in_steps()
+        measured = self.sensor_told.startswith("measured")
+        first = self.mount.scan(read).by_lidar()[0][1]
+        self.upright_sensor = sensor_upright(self.sensor, measured, first, mount.lean_deg)
+
+    def _first_usable(self, scans: Sequence[list[Cloud]]) -> Scan | None:
+        for sweep in scans:
+            with self._some_unusable(CLOUD):
+                return self._read(sweep)
+        return None
+
     def T_base_lidar(self) -> F64 | None:
         """(4, 4) the first LiDAR on what odometry tracks, or from the antenna of fixes; the identity if both are one
         frame, or nobody names what odometry tracks. None if no frames join the two."""
@@ -294,7 +326,8 @@ class Subscriptions:
                     raise MapvoteError(f"no frame says where {self.lidar_frames[cloud.lidar]} sits")
                 scan = scan.seen_from(mounts[cloud.lidar])
             scans.append(scan)
-        return scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
+        scan = scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
+        return scan if self.mount is None else self.mount.scan(scan)
 
     def _scan_of(self, cloud: Cloud, sensor: Sensor) -> Scan:
         """The scan of one LiDAR, of its packets where it sends packets: one without a usable point is left out."""

@@ -88,6 +88,11 @@ class DriveReport:
         sigmas_m = [prior.sigma_m for prior in self.priors if prior is not None]
         return float(np.median(sigmas_m)) if sigmas_m else None
 
+    def turn(self, C: F64) -> None:
+        """Poses and priors T become T C (4, 4): those of a sensor in other axes."""
+        self.T_map_lidar[:] = [np.asarray(T @ C) for T in self.T_map_lidar]
+        self.priors[:] = [p and replace(p, T_map_lidar=np.asarray(p.T_map_lidar @ C)) for p in self.priors]
+
     def split(self, n: int) -> DriveReport:
         """Keep the first ``n`` scans, all of which have voted or are lost; returns the report of those after them."""
         later = DriveReport(

@@ -23,11 +23,13 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
+from mapvote.core.mount import Mount
 from mapvote.core.point_map import PointMap, lattice_of, map_from_points
 from mapvote.core.record import record
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
+from mapvote.formats.drives.upright import upright
 from mapvote.matching.ndt_map import NdtMap
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Fix, Tracker
@@ -95,7 +97,7 @@ def build_map(
     progress: Progress | None = None,
     numbers: Survey = SURVEY,
 ) -> tuple[PointMap, BuildReport]:
-    """One map of all ``drives``, in the frame of their priors (without any, the first scan's lidar frame).
+    """One map of all ``drives``, in the frame of their priors (without any, the first scan's lidar frame, z up).
 
     ``progress(done, total)`` is called after each scan of each of the two passes. Raises MapvoteError if there is
     nothing to map, or if fewer than half of a drive's scans could be registered.
@@ -104,6 +106,9 @@ def build_map(
     scans = sum(len(drive) for drive in drives)
     if scans == 0:
         raise MapvoteError("nothing to map: no drive with at least one scan")
+    # Sensors in whatever position are surveyed in axes with x ahead and z up.
+    sources = list(drives)
+    drives, mounts = zip(*map(upright, sources), strict=True)
     # A precise prior that its scans contradict is used as a coarser one.
     wrong = [wrong_attitude(drive) for drive in drives]
     drives = [
@@ -130,7 +135,16 @@ def build_map(
         replace(track, heights=_agreed_heights(track, point_map, numbers.most_off), wrong_attitude=error)
         for track, error in zip(tracks, wrong, strict=True)
     ]
+    tracks = [_as_mounted(*each) for each in zip(tracks, sources, mounts, strict=True)]
     return point_map, BuildReport(tuple(tracks), point_map.n_points, bent_m, two_levels(road) if len(road) else None)
+
+
+def _as_mounted(track: DriveTrack, source: Drive, mount: Mount | None) -> DriveTrack:
+    """The track of a drive that was turned upright, with the poses of the sensor in its own axes."""
+    if mount is None:
+        return track
+    drive = replace(source, prior_sigma_deg=track.drive.prior_sigma_deg)
+    return replace(track, drive=drive, T_map_lidar=np.asarray(track.T_map_lidar @ mount.C))
 
 
 def _go_through(scans: Iterable[None], progress: Progress | None, done: int, total: int) -> None:
