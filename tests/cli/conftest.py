@@ -38,6 +38,20 @@ from_m = 8.0
 to_m = 22.0
 """
 
+LANELETS = "".join(
+    [
+        "<osm>",
+        *(
+            f"<node id='{k}'><tag k='local_x' v='{x}'/><tag k='local_y' v='{y}'/></node>"
+            for k, (x, y) in enumerate([(0, 5), (9, 5), (0, 1), (9, 1)])
+        ),
+        *(f"<way id='{k}'><nd ref='{2 * k}'/><nd ref='{2 * k + 1}'/></way>" for k in (0, 1)),
+        "<relation id='7'><member type='way' role='left' ref='0'/><member type='way' role='right' ref='1'/>",
+        "<tag k='type' v='lanelet'/></relation></osm>",
+    ]
+)
+"""One lanelet over the wall that the store's second version lacks."""
+
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -64,6 +78,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         make_store(Path("STORE"))
         for copy in ("fleet.db", "BACKUP", "backup.db"):
             shutil.copy("STORE", copy)
+        type_in("mapvote log STORE --from 1 --out changes.geojson")
+        Path("lanelet2_map.osm").write_text(LANELETS)
         Path("key").write_text("mv_" + "0" * 40)
     finally:
         os.chdir(home)

@@ -64,7 +64,7 @@ def test_points_that_a_guess_refuses_are_imported_unchecked_and_then_taken_by_ev
     typed("export", tmp_path / "taken", tmp_path / "b.ply")
     points[::2] = np.nan
     write_pcd(tmp_path / "b.pcd", Cloud(points))
-    with pytest.raises(MapvoteError, match=r"not finite, more than 5%.* --unchecked"):
+    with pytest.raises(MapvoteError, match=r"not finite or no coordinates, more than 5%.* --unchecked"):
         typed("import", tmp_path / "b.pcd", tmp_path / "n")
     typed("import", tmp_path / "b.pcd", tmp_path / "n", "--unchecked")
 

@@ -18,7 +18,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
     os.environ.setdefault(_threads, "1")
 
-from mapvote.cli import drives, files, live, setup  # noqa: E402
+from mapvote.cli import drives, files, lanelets, live, setup  # noqa: E402
 from mapvote.cli.options import Panel  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
@@ -35,7 +35,7 @@ app = typer.Typer(
 VERBS = {
     Panel.DRIVE: (
         drives.build, drives.vote, live.send, live.topics, live.play, live.drive, live.autoware, drives.diff,
-        drives.merge, files.doctor,
+        drives.merge, lanelets.affected, files.doctor,
     ),
     Panel.MAP: (files.import_map, files.export, files.info, files.update),
     Panel.SETUP: (setup.config, setup.warmup),

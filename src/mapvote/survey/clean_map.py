@@ -331,11 +331,14 @@ def specks(points: F64, times: I32, lattice: Lattice, largest: int = CLEANING.la
 
 def lone_points(tile: Tile) -> Bool:
     """(n,) which points of a tile of somebody's map are specks: an obstacle that is alone in its voxel, and whose voxel
-    touches no other. Points within a voxel of the tile's edge are none: they may touch points of the next tile."""
-    within = tile.points[:, :2].astype(np.float64)
-    far = (within >= CELL_SIZE).all(axis=1) & (within < (TILE_CELLS - 1) * CELL_SIZE).all(axis=1)
-    once = np.ones(len(within), dtype=np.int32)
-    return np.asarray(far & tile.columns[1] & specks(tile.points_map, once, tile.window.lattice, largest=1))
+    touches no other. Points within a voxel of the tile's edge are none: they may touch points of the next tile.
+
+    Voxels are counted from the tile's corner: a map may hold a point 900 km away, beyond the keys of its lattice.
+    """
+    points = tile.points.astype(np.float64)
+    inside = (points[:, :2] >= CELL_SIZE).all(axis=1) & (points[:, :2] < (TILE_CELLS - 1) * CELL_SIZE).all(axis=1)
+    once = np.ones(len(points), dtype=np.int32)
+    return np.asarray(inside & tile.columns[1] & specks(points, once, Lattice(0.0, 0.0), largest=1))
 
 
 def without_lone_points(point_map: PointMap) -> tuple[PointMap, int]:
