@@ -38,6 +38,7 @@ def test_the_picture_is_the_same_each_time_and_shows_the_map(tmp_path: Path, dia
     assert (tmp_path / "one.png").read_bytes() != (tmp_path / "without_map.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_what_is_not_known_is_said(tmp_path: Path, diagnosis: Diagnosis) -> None:
     unmended = replace(diagnosis, T_mended=None)
     for less in (

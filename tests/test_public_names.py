@@ -21,6 +21,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]
 
 
+@pytest.mark.slow
 def test_a_client_and_a_server_start_without_the_parts_of_scipy_that_few_requests_need() -> None:
     """They would be a fifth of their start. ``import scipy`` loads a part when it is first asked for."""
     for room in ("mapvote.client", "mapvote_server.api.serve"):

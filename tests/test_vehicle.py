@@ -200,6 +200,7 @@ def test_a_lost_scan_casts_no_vote() -> None:
     assert vehicle.ballot().scans == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["paper", "surfaces"])
 def test_asking_for_a_ballot_in_mid_drive_says_what_has_voted_so_far_and_changes_nothing(
     method: Literal["paper", "surfaces"],

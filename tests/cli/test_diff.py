@@ -29,6 +29,7 @@ def test_diff_says_where_b_lies_how_it_decided_and_what_left(tmp_path: Path) -> 
     assert "<canvas" in (tmp_path / "d.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_map_without_ground_cannot_be_compared_and_says_so(tmp_path: Path) -> None:
     court = made_court()
     above = court[court[:, 2] - 0.01 * court[:, 0] - 0.005 * court[:, 1] > 0.4]
@@ -38,6 +39,7 @@ def test_a_map_without_ground_cannot_be_compared_and_says_so(tmp_path: Path) -> 
         typed("diff", tmp_path / "a.pcd", tmp_path / "b.pcd")
 
 
+@pytest.mark.slow
 def test_a_cloud_votes_by_its_file_and_says_that_no_free_space_is_learned(tmp_path: Path) -> None:
     write_pcd(tmp_path / "map.pcd", Cloud(made_court()))
     write_pcd(tmp_path / "robot.pcd", Cloud(made_court(CARS[1:], seed=2)))

@@ -32,6 +32,7 @@ def drive(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_ballot_goes_to_the_server_whose_map_it_was_cast_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_map(map_from_points(street(20.05), map_id="street"), tmp_path / "map")

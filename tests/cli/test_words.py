@@ -31,6 +31,7 @@ NOT_RUN = {
     r"^(systemctl|sqlite3|pg_dump|mkdir) ": "another program's command",
     r"^(colcon|ros2) ": "needs ROS 2: tests/live/test_ros_node.py runs the node with stand-ins for rclpy",
     r"postgresql\+psycopg://mapvote@db": "names a machine that is not here; tests/server runs PostgreSQL",
+    r"\bmy_bag\b": "needs a recorded bag: tests/live/test_drive.py votes with one as it was heard live",
     r"\.\./shared/data/kitti": "needs the KITTI scans: tests/evaluation/real runs it where they are",
     r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/real runs it",
     r"^mapvote evaluate court ": "needs the clouds of the real court (docs/diff.md), and takes minutes",

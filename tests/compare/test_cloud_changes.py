@@ -33,6 +33,7 @@ def at(found: list[CloudChange], x: float, y: float) -> list[str]:
     return [d.kind for d in found if d.box[0] - 0.5 < x < d.box[2] + 0.5 and d.box[1] - 0.5 < y < d.box[3] + 0.5]
 
 
+@pytest.mark.slow
 def test_a_car_that_left_and_one_that_came_are_found_and_nothing_else_is() -> None:
     before = map_from_points(made_court())
     after = transform(from_xyz_rpy(12.0, 3.0, 1.0, yaw=2.0), made_court((*CARS[1:], NEW), seed=2))

@@ -63,6 +63,7 @@ def test_the_shift_is_told_in_the_middle_of_the_overlap_and_not_at_a_far_origin(
     assert "A's x 38" in said
 
 
+@pytest.mark.slow
 def test_maps_far_from_the_origin_are_adjusted_about_their_middles() -> None:
     corner = np.array(SYSTEMS["UTM zone 33 north"])
     T = from_xyz_rpy(*corner) @ from_xyz_rpy(20.0, -4.0, 2.0, yaw=1.2) @ from_xyz_rpy(*-corner)

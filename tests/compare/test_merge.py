@@ -19,6 +19,7 @@ def part(cloud: F64, low: float, high: float) -> F64:
     return cloud[(cloud[:, 0] > low) & (cloud[:, 0] < high)]
 
 
+@pytest.mark.slow
 def test_two_halves_in_frames_of_their_own_become_the_whole_with_one_point_a_voxel() -> None:
     T = from_xyz_rpy(30.0, -4.0, 2.0, yaw=1.2)
     west, east = part(made_court(), -40.0, 27.0), part(made_court(seed=2), -28.0, 40.0)
@@ -50,6 +51,7 @@ def test_times_of_points_tell_no_frame() -> None:
     assert not np.array_equal(T_elsewhere, T)
 
 
+@pytest.mark.slow
 def test_free_space_of_every_map_comes_along_and_a_point_of_any_map_wins_over_it() -> None:
     def knowing(point_map: PointMap) -> PointMap:
         every = {i: replace(t, free=~t.obstacle_words & np.uint64(0xFF0)) for i, t in point_map.tiles.items()}
@@ -86,6 +88,7 @@ def test_noise_that_one_survey_hit_once_goes_when_the_other_passed_as_near_and_w
     assert left(times=0) == 2  # of an import: nobody counted
 
 
+@pytest.mark.slow
 def test_maps_that_contradict_each_other_are_refused_with_how_far_and_where() -> None:
     broken = made_court(seed=2)
     broken[broken[:, 1] > 4.0, 0] += 0.8

@@ -59,6 +59,7 @@ def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_b
     assert np.median(np.abs(moved.points - before + [0.8, 0.0, 0.0])[before[:, 1] > 6.0, 0]) < 0.25
 
 
+@pytest.mark.slow
 def test_what_a_turn_of_half_a_degree_at_the_path_explains_is_no_bend() -> None:
     straight, cloud = drifted()
     for from_path_m, is_bent in ((10.0, True), (150.0, False)):

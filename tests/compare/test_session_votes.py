@@ -33,6 +33,7 @@ def in_box(point_map: PointMap, x0: float, y0: float, x1: float, y1: float) -> i
     return int((above & (p[:, 0] > x0) & (p[:, 0] < x1) & (p[:, 1] > y0) & (p[:, 1] < y1)).sum())
 
 
+@pytest.mark.slow
 def test_two_sessions_publish_what_both_saw_and_one_alone_publishes_nothing() -> None:
     before = map_from_points(made_court())
     ballots = [session(seed, before, made_court((*CARS[1:], NEW), seed=seed)) for seed in (2, 3)]
@@ -57,6 +58,7 @@ def test_a_tree_crown_over_a_car_that_left_stays() -> None:
     assert high.sum() > 750
 
 
+@pytest.mark.slow
 def test_rays_of_a_trajectory_make_free_what_they_pass_and_nothing_behind_a_wall() -> None:
     court = map_from_points(made_court(()))
     driven = np.column_stack([np.arange(-20.0, 21.0, 1.0), np.zeros(41), np.full(41, 1.8)])

@@ -55,6 +55,7 @@ def test_lidars_that_sit_as_stated_are_sound(tmp_path: Path, sound: Recording, n
     assert told(sound, tmp_path / "b", names, PLACES) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [("front", "left"), ("left", "rear")])
 def test_swapped_frames_are_named_and_the_line_that_is_advised_mends_them(
     tmp_path: Path, sound: Recording, pair: tuple[str, str]
@@ -67,6 +68,7 @@ def test_swapped_frames_are_named_and_the_line_that_is_advised_mends_them(
     assert what_of(tmp_path / "b", names) == []
 
 
+@pytest.mark.slow
 def test_a_lidar_off_its_stated_place_is_measured_and_the_line_that_is_advised_mends_it(
     tmp_path: Path, sound: Recording
 ) -> None:

@@ -52,6 +52,7 @@ def planes(ballot: Ballot) -> list[tuple[object, ...]]:
     return [(tile.tile, tile.states, tile.tally, tile.gone, tile.free) for tile in ballot.tiles]
 
 
+@pytest.mark.slow
 def test_each_case_says_what_a_vehicle_of_its_own_would_have_said(street: PointMap, drive: Drive) -> None:
     cases, _ = choose_cases(Settings(), "1,1 column,3,5,surfaces")
     shared = SharedPass(drive, street, Settings(), cases, localise=GivenPoses(STAMPS, POSES))

@@ -36,6 +36,7 @@ def _crosses(drive: Drive, low: F64, high: F64) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_cast_rays_cross_no_porous_crown_and_no_ground_that_the_session_did_not_survey() -> None:
     rng = np.random.default_rng(3)
     middle, wide = np.array([4.0, -12.0, 1.8]), np.array([1.2, 1.2, 0.8])

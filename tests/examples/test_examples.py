@@ -75,6 +75,7 @@ def test_a_cloud_message_becomes_a_scan() -> None:
         scan_from_point_cloud2(cloud(points, 1, cut=7), SENSOR)
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom() -> None:
     cells = json.loads((EXAMPLES / "live_vehicle.ipynb").read_text())["cells"]
     names: dict[str, Any] = {}

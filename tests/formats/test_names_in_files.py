@@ -202,6 +202,7 @@ def open_nothing_else(folders: Path, cases: int, seed: int) -> None:
         assert not wrong, f"{reader.__name__}, {name!r} opened {wrong}"
 
 
+@pytest.mark.slow
 def test_no_name_in_a_file_opens_anything_else(folders: Path) -> None:
     open_nothing_else(folders, 300, 1)
 

@@ -62,6 +62,7 @@ def new_version(store: Store) -> None:
         rollback(store, store.current() - 1)
 
 
+@pytest.mark.slow
 def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_before_is_served(
     tmp_path: Path, store: Store, domain: int
 ) -> None:

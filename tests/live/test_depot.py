@@ -30,6 +30,7 @@ def depot(tmp_path: Path, drives: int) -> Path:
     return tmp_path / "depot"
 
 
+@pytest.mark.slow
 def test_a_folder_is_sent_whole_and_a_second_run_finds_all_of_it_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,6 +64,7 @@ def test_tiles_come_as_the_vehicle_drives_and_a_version_when_it_is_published(sto
         road.close()
 
 
+@pytest.mark.slow
 def test_without_a_network_the_vehicle_drives_on_what_it_has_and_polls_until_it_is_back(
     store: Store, tmp_path: Path
 ) -> None:
@@ -83,6 +84,7 @@ def test_without_a_network_the_vehicle_drives_on_what_it_has_and_polls_until_it_
         road_map(url, tmp_path / "another")
 
 
+@pytest.mark.slow
 def test_closed_in_the_middle_of_a_request_it_lets_that_end(
     store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -183,6 +183,7 @@ def subscriptions(domain: int, points: list[str], rules: TimeRules | None = None
     return Subscriptions(network, chosen, SENSORS["hdl32e"], rules=rules or TimeRules())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compensated", [None, True, False])
 def test_a_live_topic_obeys_what_is_stated_of_motion(domain: int, compensated: bool | None) -> None:
     """Clouds without times, 20 times a second, of a sensor whose data sheet says ten."""

@@ -129,6 +129,7 @@ def test_every_scan_votes_though_odometry_is_in_its_own_frame_and_drifts_by_2_pe
     assert (frame.is_own, frame.begun) == (True, 1)
 
 
+@pytest.mark.slow
 def test_odometry_that_begins_anew_on_the_road_costs_no_scan() -> None:
     poses = path(SCANS, start_x=-25.0)
     said = odometry(poses, np.eye(4))
@@ -139,6 +140,7 @@ def test_odometry_that_begins_anew_on_the_road_costs_no_scan() -> None:
     assert vehicle.prior_frame.begun == 2
 
 
+@pytest.mark.slow
 def test_without_a_prior_scans_before_the_first_place_are_followed_back() -> None:
     poses = path(SCANS, start_x=-25.0)
     _, voted, error_m = drive(None, poses)

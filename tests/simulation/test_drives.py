@@ -102,6 +102,7 @@ def test_same_seed_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 
+@pytest.mark.slow
 def test_a_street_where_nothing_is_built_has_no_changed_cell(tmp_path: Path) -> None:
     calm = FEW | {"clutter": {"visitor_share": 0.0}, "vehicles": 1}
     simulate("corner", tmp_path / "out", seed=6, overrides=calm)

@@ -54,6 +54,7 @@ def surveyed() -> tuple[PointMap, BuildReport]:
     )
 
 
+@pytest.mark.slow
 def test_a_precise_prior_holds_the_map_in_its_frame_and_drift_is_told_against_it(
     surveyed: tuple[PointMap, BuildReport],
 ) -> None:

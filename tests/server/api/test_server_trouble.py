@@ -97,6 +97,7 @@ def test_no_room_for_the_file_to_grow(tmp_path: Path) -> None:
         assert_well_again(http, url, acknowledged)
 
 
+@pytest.mark.slow
 def test_a_store_on_a_read_only_disk_is_not_served(small_disk: Path) -> None:
     Store.create(f"sqlite:///{small_disk / 'store.db'}", two_walls()).close()
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)

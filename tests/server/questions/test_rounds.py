@@ -82,6 +82,7 @@ class Counted:
         return self.fused, self.statements
 
 
+@pytest.mark.slow
 def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
     make: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_the_tail_is_the_binomial_tail(mine: int, others: int, share: float) -> 
     )
 
 
+@pytest.mark.slow
 def test_honest_vehicles_with_equal_noise_are_named_less_often_than_the_significance_says() -> None:
     """100 rounds of nine vehicles that all see random ghosts at the same rate: false alarms stay below 1 %."""
     rng = np.random.default_rng(1)

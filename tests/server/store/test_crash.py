@@ -27,6 +27,7 @@ def crash(kills: int, database: str) -> None:
     assert int(found[2]) > 1
 
 
+@pytest.mark.slow
 def test_three_kills() -> None:
     crash(3, "sqlite")
 

@@ -39,6 +39,7 @@ def disagreements(make: MakeStore, seeds: range, steps: int = 25, *, troubled: b
     return [found for seed in seeds if (found := live(seed, make, steps, troubled=troubled)) is not None]
 
 
+@pytest.mark.slow
 def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
     assert disagreements(sqlite_stores, range(4)) == []
 
@@ -89,6 +90,7 @@ def test_the_rules_object_to_a_store_that_hears_copies(
     assert disagreements(sqlite_stores, range(3, 4)) != []
 
 
+@pytest.mark.slow
 def test_the_rules_object_to_a_store_that_lets_votes_count_twice(
     sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
