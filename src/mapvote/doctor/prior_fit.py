@@ -251,7 +251,7 @@ def _reading_of(number: Number, T: F64, runs: Sequence[Run], road: Road) -> Read
 
 def _unit_near(m: Number) -> float:
     """The factor between feet and metres that a scale is within its error, or 5 %; 0 if it is none."""
-    errors = max(0.05, LIKELY * m.off[1])
+    errors = max(0.05, PRIOR_CHECK.likely * m.off[1])
     return next((unit for unit in (FEET_M, 1.0 / FEET_M) if abs(np.log(m.value / unit)) < errors), 0.0)
 
 
