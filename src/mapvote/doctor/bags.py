@@ -1,4 +1,4 @@
-"""What is wrong with a bag: its files, topics, rates and clocks, and what joins the frames of poses and LiDARs."""
+"""Faults of a bag: its files, topics, rates, clocks, and the transforms between the frames of poses and LiDARs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LATE_S = 0.5
 
 _Orders = Mapping[str, StampOrder]
 _Times = Mapping[str, I64]
-"""Of each topic (messages, 2): the stamp in its header and the time of its receipt, nanoseconds."""
+"""(messages, 2) of each topic: the stamp in its header and the time of its receipt, nanoseconds."""
 
 
 def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:

@@ -3,7 +3,7 @@
 At 10 m/s a scan that is not de-skewed is bent by a metre. Whoever reads it as motion-compensated votes walls away that
 stand. Nothing in a file tells that its points are compensated, or that its times run backwards. So some scans along the
 drive are registered once more, each with other times: none, and those of a sensor that spins clockwise or
-counter-clockwise. Of 8 scans of a simulated street at 11 m/s none fits better than with its own times: compensated
+counter-clockwise. None of 8 scans of a simulated street at 11 m/s fits better than with its own times: compensated
 points fit .04 to .08 worse with times from azimuths, others as much better.
 """
 
@@ -48,8 +48,8 @@ _AS_READ, _NONE, _CLOCKWISE, _COUNTER = "as read", "none", "clockwise", "counter
 def check_bent(
     drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap, *, localised: bool = True
 ) -> Iterator[Finding]:
-    """What other times of points fit the map clearly better than those of the drive. ``T_map_lidar``: of its scans, (4,
-    4) each, as localised; else as a prior has them, which may be off by a metre."""
+    """Other times of points that fit the map clearly better than those of the drive. ``T_map_lidar``: the localised
+    poses of its scans, (4, 4) each; else those of a prior, which may be off by a metre."""
     poses = np.array(T_map_lidar)
     stamps_ns = drive.stamps_ns[: len(poses)]
     if len(poses) < 3:
@@ -110,7 +110,7 @@ def _best(scores: dict[str, list[float]]) -> str | None:
 
 
 def _finding(best: str, how: str, as_read: F64, fits: F64) -> Finding:
-    """In words. What somebody stated is only doubted."""
+    """The finding in words: a warning if the user stated the times."""
     shown = f"{(fits > as_read).sum()} of {len(fits)} scans fit the map better ({np.median(fits):.2f}, as read "
     shown += f"{np.median(as_read):.2f})"
     grave: Severity = "warning" if how in ("compensated", "azimuth") else "error"

@@ -14,20 +14,20 @@ from mapvote.doctor import Finding
 
 @dataclass(frozen=True, slots=True)
 class RoadBelow:
-    """What counts as a road below a sensor that leans."""
+    """Limits of a road below a sensor that leans."""
 
     lean_deg: float = 30.0
-    """Of the sensor, from which on a road is looked for."""
+    """Lean of the sensor from which a road is searched for."""
     near_m: float = 15.0
     """The road is looked for in points no farther than this."""
     own_m: float = 2.0
     """Nearer points may be the vehicle's."""
     depth_m: tuple[float, float] = (0.2, 12.0)
-    """Of a road below the sensor."""
+    """Depth of a road below the sensor."""
     bin_m: float = 0.2
     """Thickness of a layer of points."""
     share: float = 0.1
-    """Of the near points, in the layer that is the road."""
+    """Share of the near points in the layer that is the road."""
 
 
 RULES = RoadBelow()

@@ -44,7 +44,7 @@ RULES = SweepRules()
 def check_lidars(
     drive: Drive, topics: Sequence[str], T_base_lidars: F64, rules: SweepRules = RULES
 ) -> Iterator[Finding]:
-    """Of a drive of several LiDARs: ``topics``, and where (n, 4, 4) they are stated to sit on the vehicle."""
+    """Findings on a drive of several LiDARs: ``topics``, and their stated mounts (n, 4, 4) on the vehicle."""
     sweeps = list(_sweeps(drive, T_base_lidars, rules))
     if not sweeps:
         return

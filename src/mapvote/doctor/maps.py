@@ -138,7 +138,7 @@ def classified_ground(point_map: PointMap) -> Pieces:
 
 
 def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
-    """Of points in map metres, as somebody's file holds them. ``ground``: those of them that it classifies as such."""
+    """Findings on points in map metres, as a file holds them. ``ground``: the points that it classifies as ground."""
     n = sum(map(len, pieces()))
     if n < MAP_CHECK.few_points:
         return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
@@ -297,8 +297,8 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
 
 
 def check_map(point_map: PointMap) -> Iterator[Finding]:
-    """Of a map whose ground has been measured. Of one larger than memory, ground and copies are checked around the
-    middle."""
+    """Findings on a map whose ground has been measured. Ground and copies of a map larger than memory are checked
+    around its middle."""
     some = _around_the_middle(point_map)
     points = all_points(some)
     tiles = [some.tiles[index] for index in sorted(some.tiles)]
@@ -345,7 +345,7 @@ def _around_the_middle(point_map: PointMap) -> PointMap:
 
 
 def _ground(points: F64, height: F64) -> Iterator[Finding]:
-    """Of points (n, 3) and their ``height`` (n,) over the ground: how much of them the ground explains."""
+    """Findings on the share of points (n, 3) that the ground explains, by their ``height`` (n,) over it."""
     known = float(np.isfinite(height).mean())
     if known < 0.5:
         what = f"the ground is known under {known:.0%} of the points only"
@@ -409,7 +409,7 @@ def _lean(standing: F64) -> Iterator[Finding]:
     sides = _sides(standing)
     if len(sides) < 3 * LEAN_CHECK.alike:
         return
-    # What stands along (a, b, 1) has sides n with n_x a + n_y b = -n_z: Cauchy's robust least squares.
+    # An object along (a, b, 1) has sides n with n_x a + n_y b = -n_z: Cauchy's robust least squares.
     A, b = sides[:, :2], -sides[:, 2]
     lean: F64 = np.zeros(2)
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""What one look at every scan of a drive, its times and its prior show, without registering anything.
+"""Findings from one look at every scan of a drive, its times and its prior, without registering anything.
 
 A scan that is cut off, empty, doubled or half missing; columns or units that are mistaken; points in the map's frame;
 holes in the times; jumps of the prior. A verb looks while it reads the scans (:func:`looked_at`). No scipy here: its
@@ -71,7 +71,7 @@ _UNTOLD = {
     True: TimesTold("field", "times of points"),
     False: TimesTold("none", "of a scan that was not read from fields"),
 }
-"""Of scans that no reader made."""
+"""Times of scans that no reader made."""
 _LOOK = np.dtype(
     [
         ("index", "i8"),  # which scan
@@ -96,7 +96,7 @@ _LOOK = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """What a look at each of some scans showed."""
+    """Results of a look at each of some scans."""
 
     rows: NDArray[np.void]
     """(m,) of ``_LOOK``: of every scan that could be read, in their order."""
@@ -222,7 +222,7 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
 
 
 def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
-    """What ``looks`` at a drive's scans, its times and its prior show."""
+    """Findings from ``looks`` at a drive's scans, its times and its prior."""
     T = drive.T_map_lidar_prior
     if T is not None and len(looks) and _in_map_frame(T, looks):
         return [IN_MAP_FRAME]
@@ -351,7 +351,7 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
 
 
 def _times_of_points(times: Counter[TimesTold]) -> Iterator[Finding]:
-    """What was assumed of the times of points, where nothing was stated."""
+    """The assumption on the times of points, where the user stated none."""
     state = "if they are not, set motion_compensated = false in drive.toml; if they are, true"
     for told in times:
         named = " or ".join(told.fields)

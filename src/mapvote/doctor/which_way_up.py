@@ -47,8 +47,8 @@ _UPSIDE_DOWN = Finding(
 
 
 def which_way_up(some: F64, wide: F64, ground: F64) -> Iterator[Finding]:
-    """What is wrong with the axes of points ``some`` (n, 3) of extent ``wide`` (3,). ``ground`` (m, 3): those that
-    their file classifies as ground, which outweigh every guess: a city of flat roofs looks alike from below."""
+    """Faults of the axes of points ``some`` (n, 3) of extent ``wide`` (3,). ``ground`` (m, 3): those that their file
+    classifies as ground, which outweigh every guess: a city of flat roofs looks alike from below."""
     above = _share_above(some, ground)
     if above is not None:
         if above < 1.0 - RULE.mostly:

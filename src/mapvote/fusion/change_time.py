@@ -10,8 +10,8 @@ Temporary objects. A new object enters the map once it is expected to stay. Ever
 vehicles saw appear and disappear there, and how long these stayed. An object whose stay is exponentially distributed
 (as in Rosen, Mason and Leonard, "Towards lifelong feature-based mapping in semi-static environments", 2016), with
 ``prior_stay_days`` expected beforehand, is expected to stay (prior + all past stays + its own age) / (1 + number of
-past stays). Below ``stay_days`` it is *temporary* and stays out of the map. What the map holds is deleted by its own
-rule: that it stood for a year does not outweigh a quorum that sees through it.
+past stays). Below ``stay_days`` it is *temporary* and stays out of the map. Points of the map are deleted by their own
+rule: a stay of a year does not outweigh a quorum that sees through them.
 
 Where objects appear and disappear, the last observation decides: if two vehicles saw a car that had left before the
 third passed, it waits for the fourth. This holds for new objects and for what vehicles added; what was surveyed is
@@ -58,7 +58,7 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
 
 
 def said_in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
-    """What drives say of flat ``cells`` (n,), in the order in which they ended: (states (m, n), ends (m,) ns, vehicles
+    """The votes of drives on flat ``cells`` (n,), in the order of their ends: (states (m, n), ends (m,) ns, vehicles
     (m,) as numbers)."""
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
     names = {name: i for i, name in enumerate(sorted({drive.vehicle for drive in ordered}))}
@@ -115,10 +115,11 @@ def history_days(settings: FuseSettings) -> float:
 
 
 def seen_since(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, I64]:
-    """(n,) the first and (n,) the last sighting, seconds, of what is seen in flat ``cells`` (n,) without a break; -1
-    where nothing is.
+    """(n,) the first and (n,) the last sighting, seconds, of the object seen in flat ``cells`` (n,) without a break; -1
+    where there is none.
 
-    Of all ``drives`` that count there, each by itself. ``breaks`` drives in a row that see nothing end a thing.
+    All ``drives`` that count there are considered, each by itself. An object ends with ``breaks`` drives in a row that
+    see nothing.
     """
     since, last, absent = (np.full(len(cells), value, np.int64) for value in (-1, -1, 0))
     said, ends_ns, _ = said_in_order([drive for drive in drives if drive.states is not None], cells)

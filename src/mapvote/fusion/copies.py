@@ -19,8 +19,8 @@ once in a drive, few occur in another drive.
 Points and free space are compared by what does not depend on the place, so that moving by whole cells hides nothing.
 Honest drives stay well away from all three bounds (docs/measurements/votes.md).
 
-Of several copies the one counts that agrees best with all others: moved or added cells agree less. At most one of their
-vehicles is honest. So all but one of those that do not count are liars for sure, and the quorum falls by as many.
+The copy that agrees best with all others counts: moved or added cells agree less. At most one of their vehicles is
+honest. So all but one of those that do not count are liars for sure, and the quorum falls by as many.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Copy:
 
     vehicle: str
     digest: str
-    """Of its ballot."""
+    """Hash of its ballot."""
     heard_vehicle: str
     heard_digest: str
 
@@ -217,7 +217,7 @@ def find_shared(marks: U64, first: I64, whose: I64, share: float, alike: Bool) -
 
 def masks_of(planes: Iterable[U8]) -> U64:
     """(n, 256, 4) words of what n planes of states determined, the first column in the lowest bit."""
-    # Of all states only 4 (undetermined) and 255 (no vote) have the third bit set.
+    # Only the states 4 (undetermined) and 255 (no vote) have the third bit set.
     bits = [np.packbits((plane & np.uint8(4)) == 0, bitorder="little") for plane in planes]
     return np.concatenate(bits).view(np.uint64).reshape(len(bits), TILE_CELLS, TILE_CELLS // 64)
 
@@ -290,8 +290,9 @@ def find_alike(moved: I64, looked: U64, whose: I64, least: float, least_moved: i
 
 
 def _look(masks: U64) -> tuple[I64, U64]:
-    """Of masks (n, 256, 4), in the rows compared: by how many cells each would differ from itself if shifted (n,), and
-    (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is not."""
+    """Measures of masks (n, 256, 4), in the rows compared: (n,) the cells by which each would differ from itself if
+    shifted, and (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is
+    not."""
     looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), np.uint64)
     moved, east = np.empty(len(masks), np.int64), np.empty_like(looked[0])
     _look_at(masks, looked, moved, east)

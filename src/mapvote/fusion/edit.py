@@ -1,9 +1,9 @@
 """How a tile's points come and go: which voxels lose their points, and which of the points offered are added.
 
-A cell that was emptied loses all that its voters saw gone; a cell that stands loses what is left of gone things. In a
+An emptied cell loses all points that its voters deleted; a standing cell loses the remains of removed objects. In a
 cell that stands one vehicle may have seen past what another hit: a twig, a ledge, the edge of a wall. So half of the
-vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so, those
-among them who have the whole cell empty.
+vehicles can delete only voxels that stand apart. A voxel next to a remaining one is deleted only if more than 2/3 of
+the vehicles delete it, counting those to whom the whole cell is empty.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _represent(
 
 @inlined
 def _nearest_to_mean(points: F32, numbers: U64, order: I64, start: int, stop: int) -> int:
-    """Of the points ``order[start:stop]``, see :func:`_represent`."""
+    """The representative of the points ``order[start:stop]``, see :func:`_represent`."""
     x, y, z = np.int64(0), np.int64(0), np.int64(0)  # micrometres
     for k in range(start, stop):
         x += np.int64(np.rint(np.float64(points[order[k], 0]) * 1e6))

@@ -53,7 +53,7 @@ History = Callable[[], Sequence[TileVote]]
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the vehicles decided about one tile, and what came of it."""
+    """The vehicles' decision on one tile, and its effects."""
 
     states: U8
     """(256, 256) CellState or NO_VOTE; where noise spilled over what the world is, not what was voted
@@ -154,7 +154,7 @@ def fuse_tile(
 def decide_tile(
     tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings, history: History | None = None
 ) -> Decision:
-    """What the votes decide: counted, then in the order of time, then within the budget of false deletions.
+    """The decision of the votes: counted, then in the order of time, then within the budget of false deletions.
 
     ``drives`` are the votes that count on this tile (``newest_votes`` in fusion/tile_vote.py, ``unspent`` in
     fusion/fuse.py), any order. ``history``: called, where objects are temporary, for all votes that count of the last
@@ -239,8 +239,8 @@ def _let_fall(decided: Decision, tile: Tile, edited: Tile, falling: Falling) -> 
 def fall_besides(
     decided: Decision, tile: Tile, edited: Tile, fallen: Fallen, version: int
 ) -> tuple[Decision, Tile] | None:
-    """What :func:`fuse_tile` makes of a tile if it is given ``fallen`` too, from what it made without: ``decided`` and
-    ``edited``, of a tile that other tiles decide.
+    """The result of :func:`fuse_tile` with ``fallen``, from its result without: ``decided`` and ``edited``, of a tile
+    that other tiles decide.
 
     None if votes are needed again: to say how long something stood that vehicles had put there, and that falls now.
     """

@@ -164,7 +164,7 @@ def fall_within(index: TileIndex, left: Remains, gravity: Gravity = GRAVITY) -> 
     rows, cols = (np.flatnonzero(left.deleted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return Fallen.none(), frozenset()
-    # What falls has a voxel in the box around all that was deleted, or a little beyond.
+    # A falling group has a voxel in the box around all deleted voxels, or a little beyond.
     margin = 2 * gravity.reach_cells + gravity.touch_voxels + 1
     within = min(rows[0], cols[0]) >= margin and max(rows[-1], cols[-1]) < TILE_CELLS - margin
     box = slice(rows[0] - margin, rows[-1] + margin + 1), slice(cols[0] - margin, cols[-1] + margin + 1)
@@ -179,7 +179,7 @@ def fall_across(
     remains_at: Callable[[TileIndex], Remains],
     gravity: Gravity = GRAVITY,
 ) -> dict[TileIndex, Fallen]:
-    """What falls besides, by tile.
+    """Further voxels that fall, by tile.
 
     ``undecided``: the remains of tiles for which :func:`fall_within` misses others. ``remains_at`` gives those of any
     other tile; it is asked only for tiles that matter.
@@ -212,7 +212,7 @@ def _fall_in(
         limits = read_only(body.tops), *body.corner, body.key, gravity.longest_cells
         _drop_inside(*window.shown, *limits, *window.memory, *window.found)
     fallen = {tile: window.fallen_in(tile) for tile in sites if window.words[window.slices_of(tile)].any()}
-    # What leaves the tiles around is too long.
+    # A group that leaves the tiles around is too long.
     around = gravity.longest_object_cells // TILE_CELLS + 1
     near = {t for t in window.missing() if max(abs(t[0] - index[0]), abs(t[1] - index[1])) <= around}
     return fallen, frozenset(near)
@@ -253,7 +253,7 @@ class _Window:
         return _slices(index[0] - self.corner[0], index[1] - self.corner[1])
 
     def fallen_in(self, index: TileIndex) -> Fallen:
-        """What falls in a tile."""
+        """Voxels that fall in a tile."""
         own = self.slices_of(index)
         return Fallen.of(self.words[own], self.beside[own])
 

@@ -1,9 +1,9 @@
 """The probability that a decided cell really changed, and the deletions that wait because of it.
 
-Confidence. Votes decide; the confidence of the voters refines the probability of the decision. One of
-them may lie, so the agreed confidence is the least that a quorum states: the median of those who voted for a change,
-the lower one of two, and never more than a quorum of them states. As one of the quorum is honest, no liar raises a
-probability above what an honest vehicle states.
+Confidence. Votes decide; the confidence of the voters refines the probability of the decision. One of them may lie, so
+the agreed confidence is the least that a quorum states: the median of those who voted for a change, the lower one of
+two, and never more than a quorum of them states. One of the quorum is honest, so no liar raises a probability above the
+statement of an honest vehicle.
 
 Probabilities. Two logistic curves, calibrated on simulated streets with known truth (docs/measurements/probability.md).
 The input of the first is the confidence or, where none is stated, the numbers of votes for and against and of the eight
@@ -33,8 +33,8 @@ from mapvote.fusion.tile_vote import TileVote
 
 
 def agreed_odds(votes: Sequence[TileVote], states: U8, quorum: int) -> Odds:
-    """Of the cells decided as changed, ``states`` (256, 256): the agreed confidence of those who voted for it, one of
-    ``votes`` a vehicle. None for a cell of which fewer than ``quorum`` state theirs."""
+    """The agreed confidence of the vehicles that voted for each changed cell of ``states`` (256, 256), one of ``votes``
+    a vehicle. No confidence for a cell where fewer than ``quorum`` state theirs."""
     cells = changed_cells_of(states)
     saying = [vote for vote in votes if vote.odds is not None and vote.states is not None]
     if len(saying) < max(quorum, 1) or not len(cells):
@@ -144,13 +144,13 @@ class PendingDeletions:
         return cls(np.empty(0, dtype=np.int64), np.empty(0))
 
     def at(self, cell: tuple[int, int]) -> float | None:
-        """Of one cell (row, col) of the tile; None if it does not wait."""
+        """Probability of the waiting deletion of one cell (row, col) of the tile; None if it does not wait."""
         found = np.flatnonzero(self.cells == cell[0] * TILE_CELLS + cell[1])
         return float(self.probability[found[0]]) if len(found) else None
 
 
 def beyond_budget(states: U8, odds: Odds, settings: FuseSettings) -> PendingDeletions:
-    """Of the cells that ``states`` (256, 256) empty those that are beyond the budget.
+    """The cells that ``states`` (256, 256) empty and that are beyond the budget.
 
     ``odds``: how sure those are who voted so, see :func:`mapvote.fusion.loss_budget.agreed_odds`.
     """
@@ -182,11 +182,11 @@ class Waypoint:
     y: float
     cells: int
     probability: float
-    """Of the likeliest of them."""
+    """Probability of the likeliest of them."""
 
 
 def waypoints(pending: Mapping[TileIndex, PendingDeletions], lattice: Lattice) -> list[Waypoint]:
-    """What waits on some tiles, by squares of WAYPOINT_CELLS cells, those with the most cells first."""
+    """Waiting deletions on some tiles, by squares of WAYPOINT_CELLS cells, those with the most cells first."""
     found = [(tile, waits) for tile, waits in pending.items() if len(waits.cells)]
     if not found:
         return []

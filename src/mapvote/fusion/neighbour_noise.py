@@ -59,8 +59,8 @@ def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
 
 
 def without_spilled_in(cells: I64, states: U8, tile: Tile) -> U8:
-    """As :func:`without_spilled` of demolished surfaces alone, and of points in the flat ``cells`` (n,) or next to
-    them: states elsewhere are NO_VOTE."""
+    """The result of :func:`without_spilled` for demolished surfaces alone, and for points in the flat ``cells`` (n,) or
+    next to them: states elsewhere are NO_VOTE."""
     rows, cols = np.divmod(cells, TILE_CELLS)
     near = np.full(states.shape, NO_VOTE, dtype=np.uint8)
     for i in range(-NOISE_RULE.beside_cells, NOISE_RULE.beside_cells + 1):

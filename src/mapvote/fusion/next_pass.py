@@ -41,7 +41,7 @@ class Stretch:
 
     tile: TileIndex
     heading_rad: float
-    """Of the drive, from the x axis of the map towards y: a multiple of 45 deg."""
+    """Direction of the drive, from the x axis of the map towards y: a multiple of 45 deg."""
     built: int
     """Cells that one more vote would decide changed-occupied."""
     gone: int

@@ -32,7 +32,7 @@ class TileVote(Planes):
     digest: str
     """Hash of the ballot: breaks ties between drives that end at the same moment."""
     version: int = 0
-    """Of the map that the vehicle drove with."""
+    """Version of the map that the vehicle drove with."""
     unrestricted: U8 | None = None
     """Its states as they were sent, where :func:`silenced` left some out."""
 
@@ -229,7 +229,7 @@ def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
 
 
 def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
-    """Of drives in the order of time, the flat cells (65536,) in which each has a vote and none after it has."""
+    """The flat cells (65536,) in which each drive has a vote and no later one has; drives in the order of time."""
     since, found = np.zeros(CELLS, dtype=np.bool_), []
     for mine in reversed(spoken):
         found.append(mine > since)
@@ -247,7 +247,7 @@ def _laid_over(planes: Sequence[U8 | None]) -> U8:
 
 
 def _marked(drive: TileVote, mine: Bool) -> Words:
-    """What a drive deletes, and its remnants, in the flat cells ``mine`` (65536,)."""
+    """The voxels that a drive deletes, and its remnants, in the flat cells ``mine`` (65536,)."""
     if drive.gone is None:
         return drive.deletes(Words.whole(mine))
     marked = drive.gone.within(mine)

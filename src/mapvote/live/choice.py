@@ -43,7 +43,7 @@ _UNREAD = {
     "RslidarScan": "start the part of the driver that makes PointCloud2 of packets",
     "LaserScan": "a scanner of one plane cannot vote: choose a LiDAR in 3D",
 }
-"""What to do with a message type that holds points but is not read, by a part of its name."""
+"""The mend for a message type that holds points but is not read, by a part of its name."""
 
 
 class Voice:
@@ -179,7 +179,7 @@ def _only(clouds: list[PublishedTopic], poses: list[PublishedTopic], wish: Wish)
 
 
 def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int) -> str:
-    """What is missing of the LiDARs' topics, what is heard, and what to type; "" if nothing is missing."""
+    """The missing LiDAR topics, those that are heard, and the option to type; "" if none is missing."""
     if not published:
         return (
             f"no topic is sent in DDS domain {domain}. Check that ROS_DOMAIN_ID is the same here and there, that "
@@ -203,7 +203,7 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
 
 
 def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish) -> str:
-    """What is missing of the topic of poses, and what to type."""
+    """The missing topic of poses, and the option to type."""
     if wish.odometry is not None:
         return _lack_of(wish.odometry, (*POSES, GNSS, TF), published, "--odometry")
     fixes = _fixes(published, wish)
@@ -242,7 +242,7 @@ def _listed(published: Sequence[PublishedTopic]) -> str:
 
 
 def missing_for_drive(rates: Sequence[TopicRate], domain: int = 0) -> list[str]:
-    """What a vehicle needs and does not receive, a sentence each; empty if nothing is missing."""
+    """Topics that a vehicle needs and does not receive, a sentence each; empty if none is missing."""
     text = lack_of_clouds([one.published for one in rates], Wish(), domain)
     if not rates:
         return [text]

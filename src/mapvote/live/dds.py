@@ -279,7 +279,7 @@ def ros_type(type_name: str) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class TopicRate:
-    """What was received of a topic."""
+    """Statistics of a topic that was received."""
 
     published: PublishedTopic
     messages: int

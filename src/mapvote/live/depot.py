@@ -15,7 +15,7 @@ _OF_THE_KEY = (401, 403)
 
 @dataclass(slots=True)
 class Delivery:
-    """What came of some ballots."""
+    """Outcome of some ballots."""
 
     taken: int = 0
     """Ballots that the server took now."""

@@ -1,4 +1,4 @@
-"""What Autoware's pointcloud_map_loader answers, from a folder that is kept at the newest version; no ROS is needed.
+"""The answers of Autoware's pointcloud_map_loader, from a folder that is kept at the newest version; no ROS is needed.
 
 Autoware's own loader reads its table of tiles once, when it starts, and takes the path of a tile for its identity. But
 its clients take, keep and drop whatever ids the service answers. Here an id is a file's name, X_Y_HASH8.pcd, which
@@ -137,11 +137,11 @@ class MapLoader:
         return found
 
     def hash(self) -> str:
-        """Of all tiles: SHA-256 over their names, which are hashes; "" without a map."""
+        """Digest of all tiles: SHA-256 over their names, which are hashes; "" without a map."""
         return hashlib.sha256("\n".join(self.cells).encode()).hexdigest() if self.cells else ""
 
     def answer(self, service: str, request: Any) -> dict[str, Any]:
-        """What a service of this type answers: the members of its response by name, clouds as messages of
+        """The answer of a service of this type: the members of its response by name, clouds as messages of
         :mod:`mapvote.live.messages`. ``request``: any object with the request's members. Raises nothing.
 
         The differential one sends the tiles in the area that are not cached, and names the cached ones to remove: those

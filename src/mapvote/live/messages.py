@@ -38,7 +38,7 @@ READ |= {
 MAP_FRAME = "map"
 LIDAR_FRAME = "lidar"
 _DATATYPES = {"<f4": 7, "<u2": 4}
-"""Of a sensor_msgs/PointField."""
+"""Types of a sensor_msgs/PointField."""
 _MAP_MSGS = "autoware_map_msgs"
 _AUTOWARE = {
     f"{_MAP_MSGS}/msg/AreaInfo": "float32 center_x, float32 center_y, float32 radius",
@@ -54,7 +54,7 @@ _AUTOWARE = {
     f"{_MAP_MSGS}/srv/GetSelectedPointCloudMap_Response": "NUMBERED, Header header, TILES",
     "tier4_external_api_msgs/msg/MapHash": "string lanelet, string pcd",
 }
-"""What rosbags does not bring. Requests and responses begin with the client's number and the request's."""
+"""Message types that rosbags lacks. Requests and responses begin with the client's number and the request's."""
 _SHORT = {
     "NUMBERED": "uint64 guid, int64 seq",
     "AREA": f"{_MAP_MSGS}/AreaInfo area",

@@ -183,8 +183,8 @@ class Outbox:
         return number
 
     def close(self) -> None:
-        """Write what was given, try once to send what waits, and end. What could not be sent stays in the spool. An
-        outbox that never began has nothing to write."""
+        """Write the ballots in memory, try once to send those that wait, and end. Ballots that could not be sent stay
+        in the spool. An outbox that never began has nothing to write."""
         if self._begun:
             self._work.put(None)
             self._writer.join()
@@ -237,7 +237,7 @@ class Outbox:
                 self.report.recovered += 1
                 self._say(
                     f"{drive}: was cut off. Its journal holds {ballot.scans_localised} scans up to stamp "
-                    f"{ballot.end_ns}: they vote. What came later is missing, at most 30 s"
+                    f"{ballot.end_ns}: they vote. Later votes are missing, at most 30 s"
                 )
                 self._put_down(drive, encode(ballot))
         journal.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """A recorded drive, sent on DDS as a vehicle would send it.
 
-Of a ROS 2 bag the bytes of its messages go out as they were recorded, at the times of their receipt. Of any other drive
-clouds are made of its scans, odometry of its prior, and /tf_static of its mount.
+Messages of a ROS 2 bag are sent byte for byte, at the times of their receipt. For any other drive clouds are made of
+its scans, odometry of its prior, and /tf_static of its mount.
 """
 
 from __future__ import annotations

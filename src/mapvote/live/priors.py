@@ -1,4 +1,4 @@
-"""What odometry or fixes say of the place of a scan: the last poses, and the last fixes of a receiver."""
+"""The prior of a scan by odometry or fixes: the last poses, and the last fixes of a receiver."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The map of a live vehicle: from a file or store, or a server's.
 
-Of a server's the tiles ahead come before the vehicle does, and newer versions as they are published.
+A server's tiles are downloaded before the vehicle arrives, and newer versions when they are published.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class RoadMap:
 
     @property
     def version(self) -> int:
-        """Of the map that the open ballot holds to."""
+        """Version of the map that the open ballot is cast on."""
         return self._used.point_map.version or 0
 
     def _version(self, manifest: Manifest) -> Version:

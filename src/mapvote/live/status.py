@@ -65,7 +65,7 @@ class Status:
     scans_hz: float
     """Scans that arrived."""
     localised_share: float
-    """Of the decided scans, those that have a sure place; NaN without any."""
+    """Share of the decided scans that have a sure place; NaN without any."""
     sigma_m: float
     """Median standard deviation of their positions; NaN without any."""
     latency_s: float
@@ -116,7 +116,7 @@ class Status:
         ]
 
     def table(self, name: str) -> Any:
-        """As a table for a terminal."""
+        """The status as a table for a terminal."""
         from rich.table import Table
 
         table = Table(title=f"{name}: map version {self.map_version}", show_header=False)

@@ -22,7 +22,7 @@ class Cloud:
     stamp_ns: int
     sent_ns: int
     message: Any
-    """Of several packets that of the first."""
+    """Stamp of the first of several packets."""
     packets: tuple[Cloud, ...] = ()
     """The packets in the order of their stamps; () if it came whole."""
 

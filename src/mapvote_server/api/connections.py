@@ -1,4 +1,4 @@
-"""What each connection may do: time limits, a strict head, one request at a time; and a limit on their number.
+"""Limits of each connection: time, a strict head, one request at a time; and a limit on their number.
 
 uvicorn limits only the pause between two requests. :class:`Connection` stands between the socket and uvicorn's
 protocol. It uses the interface of :class:`asyncio.Protocol`, and asks h11 what came after a request. :func:`tracked`
@@ -6,8 +6,8 @@ calls it when a request begins and ends. h11 limits what uvicorn keeps of an unf
 trailers) to :data:`HEAD_BYTES`, too.
 
 Requests are parsed in one thread, so their order decides who waits. A request that came before the answer to the one
-before it (pipelining) is not read: its connection is closed after that answer, as RFC 9112, 9.3.2 lets a server do. Of
-one address only a few requests are under way at a time until their key is known (:class:`Line`).
+before it (pipelining) is not read: its connection is closed after that answer, as RFC 9112, 9.3.2 lets a server do.
+Only a few requests of one address are under way at a time until their key is known (:class:`Line`).
 """
 
 from __future__ import annotations
@@ -272,7 +272,7 @@ class Connection(asyncio.Protocol):
             self._start(self._patience.header_s)
 
     def eof_received(self) -> bool | None:
-        """As the server wishes."""
+        """Close the connection as the server wishes."""
         return self._inner.eof_received()
 
     def connection_lost(self, error: Exception | None) -> None:
@@ -313,7 +313,7 @@ class Connection(asyncio.Protocol):
         return self._pipelined or (conn.their_state is h11.DONE and bool(conn.trailing_data[0]))
 
     def end_request(self) -> None:
-        """Its answer is sent. What is left of an unread body stays under its clock; h11 throws it away."""
+        """Its answer is sent. The rest of an unread body stays under its clock; h11 discards it."""
         if not self._answering:
             return
         self._answering = False
@@ -346,8 +346,8 @@ class Connection(asyncio.Protocol):
             self._refuse(_TOO_SLOW)
 
     def _refuse(self, answer: bytes) -> None:
-        """Answer and hang up. What still comes is thrown away for a moment: to close at once would reset the line, and
-        the client would never read the answer."""
+        """Answer and hang up. Further bytes are discarded for a moment: to close at once would reset the line, and the
+        client would never read the answer."""
         self._refused = True
         self._stop()
         if not self.transport.is_closing():

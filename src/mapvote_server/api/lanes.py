@@ -59,7 +59,7 @@ class Budget:
         self._limits = {"seconds of work": seconds_a_minute, "rows": rows_a_minute}
         self._clock = clock
         self._spent: dict[tuple[str, str], tuple[float, float]] = {}
-        """What a key has used of a limit, and when that was noted."""
+        """A key's use of a limit, and the time of that note."""
 
     def check(self, name: str) -> None:
         """TooMany, with the time to wait, if a bucket of ``name`` is empty."""

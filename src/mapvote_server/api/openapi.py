@@ -1,4 +1,4 @@
-"""What FastAPI leaves out: keys in the OpenAPI document, and every method of a path in the Allow of a 405."""
+"""Additions to FastAPI: keys in the OpenAPI document, and every method of a path in the Allow of a 405."""
 
 from __future__ import annotations
 

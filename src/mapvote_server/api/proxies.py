@@ -42,7 +42,7 @@ class Proxies:
         return named[0] if len(set(named)) == 1 else peer
 
     def _last(self, addresses: Sequence[str], peer: str) -> str:
-        """Of the addresses on the way, nearest last: the nearest that is no proxy's."""
+        """The nearest address on the way that is no proxy's; the last is the nearest."""
         for name in reversed(addresses):
             found = _ADDRESS.fullmatch(name.strip())
             if found is None:

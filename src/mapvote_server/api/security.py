@@ -161,7 +161,7 @@ class Hosts:
         if not host or not self._ours(host):
             raise Forbidden(f"{(host or '')[:80]!r} is not a name of this server: {_MEND}")
         theirs = "" if origin is None else origin.partition("://")[2].lower()
-        # Of IP addresses only the one that was addressed: another machine's page has an address too.
+        # An Origin that is an IP address must equal the Host: another machine's page has an address too.
         foreign = theirs != host.lower() and _name_in(theirs) not in self._allowed - {"localhost"}
         if origin is not None and foreign:
             raise Forbidden(f"pages of {origin[:80]!r} may not use this server: {_MEND}")

@@ -1,1 +1,1 @@
-"""What changed, who says so, and why."""
+"""Questions on changes: where, by whom and why."""

@@ -1,4 +1,4 @@
-"""What waits for one more vote: the changes, the drives that saw them, and the road from which to see them again."""
+"""Changes that wait for one more vote, the drives that saw them, and the road from which to see them again."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _Waits:
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """What one more pass would decide on one tile."""
+    """Changes that one more pass would decide on one tile."""
 
     waits: _Waits | None
     stretches: Sequence[Stretch] = ()
@@ -52,7 +52,7 @@ class _Tile:
 
 
 class _Kept:
-    """What waits on the tiles of one store, where anything does."""
+    """Waiting changes on the tiles of one store, where there are any."""
 
     def __init__(self) -> None:
         self.few: KeptTiles[_Tile] = KeptTiles()
@@ -132,7 +132,7 @@ def _waits(drives: Sequence[TileVote], states: Sequence[U8], quorum: int) -> _Wa
 
 
 def _together(tiles: Iterable[_Tile], quorum: int) -> Waiting | None:
-    """What lacks only the quorum, over some tiles."""
+    """Changes that lack only the quorum, over some tiles."""
     found = [tile.waits for tile in tiles if tile.waits is not None]
     drives = frozenset[str]().union(*(waits.drives for waits in found))
     vehicles = frozenset[str]().union(*(waits.vehicles for waits in found))
@@ -177,7 +177,7 @@ MOST_STRETCHES = 1_000
 def _look(
     connection: sa.Connection, store: Store, asked: Electorate, index: TileIndex, path_of: Callable[[int], F64]
 ) -> _Tile | None:
-    """What one more pass would decide on a tile; None if nothing."""
+    """Changes that one more pass would decide on a tile; None without any."""
     window, quorum = store.lattice.tile(index), asked.settings.min_votes
     drives = _counting(connection, store, asked, index)
     if drives is None:

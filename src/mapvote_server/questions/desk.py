@@ -42,7 +42,7 @@ class Desk:
     held: list[str]
     """The policy's reasons to hold the version."""
     doubts: list[str]
-    """What a reviewer should know about the voters."""
+    """Warnings on the voters for a reviewer."""
     waits: str
     """Changes that lack only the quorum, if a publish would change nothing; else ""."""
     pending: dict[str, Any]

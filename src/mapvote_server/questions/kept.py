@@ -1,6 +1,7 @@
-"""What a question finds on each tile, kept until an event touches the tile: an answer costs what has changed since.
+"""Results of a question by tile, kept until an event touches the tile: the cost of an answer grows with the changes
+since the last one.
 
-What was found by the time a question ran out of time stays, so the next one goes on from there.
+Results stay when a question runs out of time, so the next one goes on from there.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """What the kept tiles follow from."""
+    """State that the kept tiles follow from."""
 
     mark: int
     """The last event that they know of."""
     version: int
     rules: tuple[FuseSettings, RoundPolicy]
-    """Of the policy: what decides which votes count."""
+    """Part of the policy that decides which votes count."""
     until_ns: int | None
     """When the next ballot is old enough to count; None: none waits for that."""
 
 
 class KeptTiles(Generic[Found]):
-    """What one question found on each tile of one store; thread-safe.
+    """Results of one question on each tile of one store; thread-safe.
 
     ``look`` gives it, None for nothing. ``came`` is told of each that is kept, ``went`` of each that is dropped: for
     sums over all tiles.

@@ -147,7 +147,7 @@ class _AllCompared:
         self._opposed: dict[int, Sequence[Compared]] = {}
 
     def entries(self) -> list[Compared]:
-        """As many comparisons as say the same as all: one a vehicle with its cells, and those with contradictions."""
+        """The comparisons that represent all: one a vehicle with its cells, and those with contradictions."""
         none, no_claim = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)
         sums = [Compared(name, self._cells[name], none, none, no_claim) for name in self._tiles]
         return sums + [replace(entry, cells=0) for entries in self._opposed.values() for entry in entries]

@@ -52,7 +52,7 @@ class Bag:
         weakref.finalize(self, self.reader.close)
         self.path = path
         self.mended = files.mended
-        """What is wrong with its files, and is read nevertheless."""
+        """Faults of its files that do not stop the reading."""
 
     def decode(self, connection: Any, data: bytes) -> Any:
         """A serialised message; MapvoteError if it is damaged."""

@@ -64,9 +64,9 @@ class BagFiles:
     """Files given to a reader of bags, and their mends."""
 
     paths: list[Any]
-    """Of the reader's path protocol."""
+    """A member of the reader's path protocol."""
     mended: list[str]
-    """What is wrong with the files, in words, and what is read nevertheless."""
+    """Faults of the files, in words, and the part that is read nevertheless."""
 
 
 def bag_files(path: Path) -> BagFiles:
@@ -123,7 +123,7 @@ def _one_recording(folder: Path, files: list[Path]) -> None:
 
 
 def _wrong_in_metadata(about: Path) -> str:
-    """Why the reader cannot use a metadata.yaml, "" if it can. What compresses messages is written nowhere else, so
+    """Why the reader cannot use a metadata.yaml, "" if it can. The compression of messages is written nowhere else, so
     such a file is left to the reader."""
     try:
         table = read_yaml(about)["rosbag2_bagfile_information"]
@@ -171,7 +171,7 @@ class StorageFile:
     end: int = -1
     """Bytes of it that are used; -1: all."""
     tail: bytes = b""
-    """What follows them."""
+    """The bytes that follow them."""
 
     @property
     def suffix(self) -> str:

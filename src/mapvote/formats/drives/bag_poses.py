@@ -22,7 +22,7 @@ from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, ya
 
 POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _OWN_POSES = "/mapvote/pose"
-"""What a live drive publishes: no prior."""
+"""The topic on which a live drive publishes its own pose: no prior."""
 GNSS = ("sensor_msgs/msg/NavSatFix",)
 IMU = "sensor_msgs/msg/Imu"
 
@@ -31,7 +31,7 @@ class Poses(NamedTuple):
     """The topic of poses of a bag, as a live drive would choose it."""
 
     topic: str | None
-    """What ``--prior`` says, else the only one."""
+    """The topic that ``--prior`` names, else the only one."""
     T_base_lidar: F64 | None
     """(4, 4) the first LiDAR on what the topic tracks, by the frames in the bag."""
     in_map: bool

@@ -164,7 +164,7 @@ def sigmas_of(covariances: F64, rules: FixRules = FIX_RULES) -> F64:
 
 
 def prior_at(fixes: Fixes, stamp_ns: int, T_antenna_lidar: F64, rules: FixRules = FIX_RULES) -> PosePrior | None:
-    """What the fixes up to ``stamp_ns`` say of the LiDAR; None without a fix that is fresh.
+    """The prior of the LiDAR by the fixes up to ``stamp_ns``; None without a fresh fix.
 
     ``T_antenna_lidar`` (4, 4): the LiDAR from the antenna, in axes of the vehicle. A heading that nothing tells has the
     standard deviation :data:`UNKNOWN_RAD`; its prior bounds the place alone.

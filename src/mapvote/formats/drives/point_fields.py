@@ -265,7 +265,7 @@ def _sort_out(
 
 
 def _unit_of_near(points: F32) -> str:
-    """What points that are all too near may be."""
+    """Possible causes of points that are all too near."""
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(points.astype(np.float64), axis=1)
     distance = distance[np.isfinite(distance) & (distance > 0.0)]

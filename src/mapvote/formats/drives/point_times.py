@@ -98,7 +98,7 @@ JUDGEMENT = TimeJudgement()
 
 @dataclass(frozen=True, slots=True)
 class TimeRules:
-    """What the user says of the times of points: drive.toml, or the options of a verb."""
+    """The user's statements on the times of points: drive.toml, or the options of a verb."""
 
     motion_compensated: bool | None = None
     """True: points have no times. False: points without a field of times get them from their azimuth. None: points are
@@ -149,7 +149,7 @@ class FieldTimes:
     origin: str
     """From where they count."""
     clock_off_ns: int
-    """Of another clock: its time at the first point, less the stamp; else 0."""
+    """Offset of another clock: its time at the first point, less the stamp; else 0."""
     wraps_ns: int
     """After how long such a clock begins anew; 0: never."""
     spins: bool

@@ -46,7 +46,7 @@ class Column:
 
     index: int
     name: str
-    """As the header has it."""
+    """Name as in the header."""
     unit: str
     """"deg" of "yaw [deg]" or of "yaw_deg"; "" without one."""
 

@@ -29,9 +29,8 @@ _SWEEP = 0.55
 def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     """The drive of one PointCloud2 topic, or of several of one vehicle (--topic /front,/rear).
 
-    What several LiDARs took in one revolution is one scan, at the stamp of the first of them, its points in the frame
-    of the first topic's LiDAR, by /tf_static. MapvoteError lists the topics if there is none
-    or a choice to make.
+    The clouds of several LiDARs in one revolution make one scan, at the stamp of the first of them, its points in the
+    frame of the first topic's LiDAR, by /tf_static. MapvoteError lists the topics if there is none or a choice to make.
     """
     bag = Bag(path)
     for what in bag.mended:

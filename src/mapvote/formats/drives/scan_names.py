@@ -176,8 +176,8 @@ def _dates_ns(columns: Sequence[Sequence[_Number]]) -> I64 | None:
 
 
 def _tokens(file: Path) -> list[Token]:
-    """Text and numbers of a name without its suffix, in turn. Of three or more numbers with dots between them each
-    counts by itself, as in a date or a version."""
+    """Text and numbers of a name without its suffix, in turn. Three or more numbers with dots between them count one by
+    one, as in a date or a version."""
     tokens: list[Token] = []
     for match in _TOKEN.findall(file.stem.lower()):
         if not match[-1].isdigit():
@@ -215,8 +215,8 @@ def _columns(files: Sequence[Path]) -> list[list[_Number]]:
 def _counts_nanoseconds(names: Sequence[Sequence[Token]]) -> bool:
     """Whether the digits after a dot are nanoseconds without padding rather than decimals.
 
-    Of one length they mean the same order. A zero in front is written with padding, so it is a decimal. Else the
-    reading under which the scans come more evenly is the right one.
+    If all have one length, both readings give the same order. A leading zero is padding, so the digits are decimals.
+    Else the reading under which the scans come more evenly is right.
     """
     numbers = [[token for token in name if isinstance(token, _Number) and token.fraction] for name in names]
     first = [row[0] for row in numbers if row]

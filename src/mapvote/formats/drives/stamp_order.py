@@ -1,7 +1,8 @@
-"""Recorded messages in the order of their stamps: of headers without stamps, out of order, doubled, of two passes.
+"""Recorded messages in the order of their stamps, also where headers lack stamps, or stamps are out of order, doubled
+or of two passes.
 
 Receipt is not the order of measurement: drivers of several threads, a re-recording under ``use_sim_time`` or files
-joined in another order leave stamps that go back. What cannot be a time of this drive is left out and counted.
+joined in another order leave stamps that go back. A stamp that cannot be a time of this drive is left out and counted.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class StampOrder:
     stamps_ns: I64
     """(m,) strictly ascending."""
     told: list[str]
-    """What was mended or left out, in words, after "the topic"."""
+    """Mended and omitted stamps in words, after "the topic"."""
 
 
 def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STAMP_RULES) -> StampOrder:
@@ -73,7 +74,7 @@ def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STA
             f"recordings joined): the longest part is read, {len(chosen) - len(longest)} messages are left out"
         )
         chosen = chosen[longest]
-    # What remains is sorted; of equal stamps the first is kept.
+    # The rest is sorted; the first of equal stamps is kept.
     back = int((np.diff(stamps[chosen]) < 0).sum())
     if back:
         told.append(f"has stamps out of order in {back} places (use_sim_time, a driver of several threads): sorted")

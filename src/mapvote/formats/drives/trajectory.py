@@ -68,7 +68,7 @@ def read_numbers(file: Path, columns: int) -> F64:
 
 
 def _other_rows(numbers: int) -> str:
-    """What to do with a table whose first row has so many numbers."""
+    """The mend of a table whose first row has so many numbers."""
     if numbers == 13:
         return "is the first an index or a time? Leave it out, or write TUM (seconds x y z qx qy qz qw)"
     if numbers in (4, 3):
