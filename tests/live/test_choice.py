@@ -42,12 +42,6 @@ POINTS = np.random.default_rng(1).uniform((4, 4, 0), (30, 30, 5), (50, 3)).astyp
 START = 1_700_000_000 * 10**9
 
 
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "WAITS", IMPATIENT)
-    monkeypatch.setattr("mapvote.live.service.WAITS", IMPATIENT)
-
-
 class Said:
     """What the voice says, and when it ends: after so many sentences, or seconds."""
 
@@ -227,7 +221,7 @@ def test_frames_that_come_late_or_as_moving_ones_are_waited_for(domain: int) -> 
     mount = from_xyz_rpy(1.0, 0.0, 1.8, 0.0, 0.0, 0.1)
     sender.send("/tf", frames_message(START, {"lidar": mount}))
     sender.send("/points", cloud(10**8))
-    scans, poses = prepare(topics, PLAN, lambda: topics.T_base_lidar() is not None, Voice(print))
+    scans, poses = prepare(topics, PLAN, lambda: topics.T_base_lidar() is not None, Voice(print, IMPATIENT))
     found = topics.T_base_lidar()
     assert found is not None
     assert np.allclose(found, mount)

@@ -18,9 +18,8 @@ from live.test_outbox import said
 from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.live import drive as drive_module
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive, WaitingScan
-from mapvote.live.outbox import Outbox, ballot_of
+from mapvote.live.outbox import OUTBOX_SIZES, Outbox, OutboxSizes, ballot_of
 from mapvote.live.road_map import OneMap
 from mapvote.live.thinning import THINNING, Thinning
 from mapvote.vehicle import Cuts, Vehicle
@@ -39,11 +38,11 @@ def recorded() -> tuple[PointMap, Drive, list[Scan], F64]:
 class Live:
     """A live drive on the street, and the folder that its ballots go to."""
 
-    def __init__(self, tmp_path: Path, **more: Any) -> None:
+    def __init__(self, tmp_path: Path, sizes: OutboxSizes = OUTBOX_SIZES, **more: Any) -> None:
         self.point_map, drive, self.scans, self.poses = recorded()
         self.said: list[str] = []
         (tmp_path / "out").mkdir(exist_ok=True)
-        self.outbox = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=self.said.append)
+        self.outbox = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=self.said.append, sizes=sizes)
         self.live = LiveDrive(
             lambda point_map: Vehicle("car", drive.sensor, point_map),
             more.pop("maps", OneMap(self.point_map)),
@@ -175,10 +174,9 @@ def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_o
 
 
 def test_what_a_kill_leaves_in_the_journal_is_what_the_vehicle_had_said_of_each_tile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(drive_module, "_KEEP_S", 0.0)
-    live = Live(tmp_path)
+    live = Live(tmp_path, OutboxSizes(journal_s=0.0))
     for i in range(SCANS):
         live.give(i)
     live.drain()

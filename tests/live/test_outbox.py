@@ -20,7 +20,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file as really_whole_file
 from mapvote.live import outbox as outbox_module
-from mapvote.live.outbox import Journal, Outbox, ballot_of, records
+from mapvote.live.outbox import Journal, Outbox, OutboxSizes, ballot_of, records
 
 MAP = make_map({(0, 0): make_tile(wall([(1, 1)], [1.0])), (0, 1): make_tile(wall([(1, 1)], [1.0]), index=(0, 1))})
 
@@ -37,7 +37,9 @@ def said(folder: Path) -> dict[str, int]:
 
 
 def open_outbox(tmp_path: Path, **more: Any) -> Outbox:
-    return Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=lambda _: None, retry_s=0.05, **more)
+    return Outbox(
+        tmp_path / "state", "car", folder=tmp_path / "out", say=lambda _: None, sizes=OutboxSizes(retry_s=0.05), **more
+    )
 
 
 def leave(box: Outbox, n: int, *, last: bool = False) -> None:
@@ -182,7 +184,9 @@ def test_a_full_disk_is_said_once_and_nothing_is_lost_that_it_takes_later(
 
     monkeypatch.setattr(outbox_module, "whole_file", whole_file)
     (tmp_path / "out").mkdir()
-    box = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, retry_s=0.02)
+    box = Outbox(
+        tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, sizes=OutboxSizes(retry_s=0.02)
+    )
     box.begin("day")
     full[0] = True
     for n in range(1, 4):
@@ -201,7 +205,9 @@ def test_a_disk_that_takes_small_files_and_deletes_but_no_ballot_is_not_said_to_
     """A real refusal of the system: no file of this process may grow beyond 64 bytes."""
     said_of = list[str]()
     (tmp_path / "out").mkdir()
-    box = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, retry_s=0.02)
+    box = Outbox(
+        tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, sizes=OutboxSizes(retry_s=0.02)
+    )
     assert box.begin("day") == 1
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))
@@ -223,7 +229,7 @@ def test_a_disk_that_takes_small_files_and_deletes_but_no_ballot_is_not_said_to_
 
 def test_while_the_server_is_away_ballots_wait_in_the_spool_and_the_scan_loop_does_not(tmp_path: Path) -> None:
     away = MapClient("http://127.0.0.1:9", home=tmp_path / "home", attempts=1, timeout_s=0.2, sleep=lambda _: None)
-    box = Outbox(tmp_path / "home/live", "car", client=away, say=lambda _: None, retry_s=0.02)
+    box = Outbox(tmp_path / "home/live", "car", client=away, say=lambda _: None, sizes=OutboxSizes(retry_s=0.02))
     box.begin("day")
     for n in range(1, 21):
         leave(box, n)

@@ -51,7 +51,7 @@ class Voice:
 
     def __init__(self, say: Callable[[str], object], patience: Waits = WAITS) -> None:
         self._say = say
-        self._patience = patience
+        self.patience = patience
         self._since_s: float | None = None
         self._said_s = float("-inf")
         self._said = ""
@@ -65,8 +65,8 @@ class Voice:
         if self._since_s is None:
             self._since_s = now_s
         changed = text != self._said
-        early = now_s - self._since_s < self._patience.first_word_s
-        pause_s = self._patience.first_word_s if changed else self._patience.each_s
+        early = now_s - self._since_s < self.patience.first_word_s
+        pause_s = self.patience.first_word_s if changed else self.patience.each_s
         if not early and now_s - self._said_s >= pause_s:
             self._say(f"waiting: {text}")
             self._said = text
@@ -114,9 +114,9 @@ def choose_topics(
             seen_s = min(seen_s, now_s)
         text = lack_of_clouds(published, wish, network.domain)
         if not text and not poses:
-            text = lack_of_odometry(published, wish)
-        settled = now_s - seen_s >= (WAITS.settle_s if not wish.points else 0.0)
-        hopeless = wish.odometry is None and now_s - seen_s >= WAITS.odometry_s
+            text = lack_of_odometry(published, wish, voice.patience)
+        settled = now_s - seen_s >= (voice.patience.settle_s if not wish.points else 0.0)
+        hopeless = wish.odometry is None and now_s - seen_s >= voice.patience.odometry_s
         if len(clouds) >= max(len(wish.points), 1) and settled and (poses or hopeless):
             sources = poses or _fixes(published, wish) or _moving_frames(published, wish)
             return _with_imu(_only(clouds, sources, wish), published, wish)
@@ -202,18 +202,18 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
     return f"no {CLOUD} is sent: start the LiDAR's driver. Heard: {_listed(published)}"
 
 
-def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish) -> str:
+def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish, waits: Waits = WAITS) -> str:
     """The missing topic of poses, and the option to type."""
     if wish.odometry is not None:
         return _lack_of(wish.odometry, (*POSES, GNSS, TF), published, "--odometry")
     fixes = _fixes(published, wish)
     if fixes:
         return (
-            f"no {ODOMETRY} or other pose is sent. {WAITS.odometry_s:.0f} s after the first cloud the drive begins "
+            f"no {ODOMETRY} or other pose is sent. {waits.odometry_s:.0f} s after the first cloud the drive begins "
             f"with the fixes of {fixes[0].topic}; or type --odometry {fixes[0].topic}"
         )
     return (
-        f"no {ODOMETRY} or other pose is sent. The drive begins without it {WAITS.odometry_s:.0f} s after the first "
+        f"no {ODOMETRY} or other pose is sent. The drive begins without it {waits.odometry_s:.0f} s after the first "
         "cloud, and the whole map is searched; or start the odometry, or type --odometry TOPIC"
     )
 

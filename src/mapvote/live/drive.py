@@ -36,9 +36,6 @@ _FIXES = 400
 """Poses of scans that voted that are kept at most."""
 _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
-_KEEP_S = 8.0
-"""A tile that got votes is written to the journal after so long. With the scans that wait, and with tiles that are
-written one at a time, a crash costs less than 30 s of road."""
 _BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
 """A stamp so much before the last one, or after it: the clock has jumped."""
 _JUMPED = 3
@@ -282,7 +279,7 @@ class LiveDrive:
         a tile's votes have been unwritten for too long, a tile goes to the journal."""
         start = time.monotonic()
         ready = self._is_ready(ended)
-        overdue_s = start - min(self._touched.values(), default=np.inf) - _KEEP_S
+        overdue_s = start - min(self._touched.values(), default=np.inf) - self._outbox.sizes.journal_s
         if self.vehicle is not None and overdue_s > (2.0 if ready else 0.0):
             tile = min(self._touched, key=lambda index: self._touched[index])
             del self._touched[tile]

@@ -14,7 +14,7 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.frames import is_map_frame
-from mapvote.live.choice import WAITS, Voice
+from mapvote.live.choice import Voice
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
 from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
@@ -82,7 +82,7 @@ def prepare(
             break
         lack = _lack(topics, plan)
         known = bool(scans) and topics.measure(scans)
-        tracked = topics.chosen.odometry is None or topics.poses > 0 or now_s > first_s + WAITS.odometry_s
+        tracked = topics.chosen.odometry is None or topics.poses > 0 or now_s > first_s + voice.patience.odometry_s
         if known and tracked and not lack:
             break
         if lack and plan.idle_s and now_s > max(start_s, first_s) + plan.idle_s:
