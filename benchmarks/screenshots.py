@@ -26,7 +26,7 @@ from PIL import Image
 from chromium import Chromium
 from hand_made import make_map
 from live_server import serving
-from mapvote_server.questions.history import changes_between, page_between
+from mapvote_server.questions.changes import changes_between, page_between
 from mapvote_server.store import keys
 from mapvote_server.store.store import Store
 

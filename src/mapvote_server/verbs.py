@@ -234,7 +234,7 @@ def log(
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
     asked = f"from={old or 1}" + ("" if new is None else f"&to={new}")
     with api_at(store, key_file) as server, waiting("comparing versions"):
-        found = server.ask_json("GET", f"/v1/changes?{asked}&lonlat={str(not local).lower()}")
+        found = _all_changes(server, f"{asked}&lonlat={str(not local).lower()}")
         text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
     if page is not None:
         write_whole(page, text)
@@ -246,6 +246,17 @@ def log(
         print(json.dumps(found, indent=1))
     elif page is None:
         _print_changes(found)
+
+
+def _all_changes(server: Connection, asked: str) -> dict[str, Any]:
+    """The list of changes, part by part."""
+    whole = server.ask_json("GET", f"/v1/changes?{asked}&limit=10000")
+    part = whole
+    while part["features"] and len(whole["features"]) < whole["numberMatched"]:
+        versions = f"{asked}&to={whole['to_version']}"
+        part = server.ask_json("GET", f"/v1/changes?{versions}&limit=10000&offset={len(whole['features'])}")
+        whole["features"] += part["features"]
+    return {name: value for name, value in whole.items() if name not in ("numberMatched", "numberReturned")}
 
 
 def _print_versions(answer: Mapping[str, Any]) -> None:

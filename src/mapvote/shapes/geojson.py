@@ -29,14 +29,17 @@ def to_geojson(
     to_version: int | None = None,
     georeference: Mapping[str, str] | None = None,
     lonlat: bool = False,
+    among: Sequence[ChangeObject] | None = None,
 ) -> dict[str, Any]:
     """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``json.dumps``; its member "frame" says where
     coordinates lie.
 
     ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
+    ``among``: the list of which the objects are a part, for what is near them; None: they are all.
     """
     frame = frame_of(georeference or {})
-    features = [_feature(o, lattice, near) for o, near in zip(objects, _neighbours(objects), strict=True)]
+    near = _neighbours(objects, objects if among is None else among)
+    features = [_feature(change, lattice, beside) for change, beside in zip(objects, near, strict=True)]
     if lonlat and not frame.is_local:
         for feature in features:
             rings_to_lonlat(feature["geometry"], frame)
@@ -81,15 +84,15 @@ def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
-def _neighbours(objects: Sequence[ChangeObject]) -> list[list[str]]:
+def _neighbours(objects: Sequence[ChangeObject], among: Sequence[ChangeObject]) -> list[list[str]]:
     """For each object the ids of other large things whose box is within 15 m, nearest first."""
-    large = [other for other in objects if other.size == "large"]
+    large = [other for other in among if other.size == "large"]
     boxes, others = (shapely.box(*np.array([o.box for o in some]).reshape(-1, 4).T) for some in (objects, large))
     here, there = shapely.STRtree(others).query(boxes, predicate="dwithin", distance=NEIGHBOUR_RULE.near_m / CELL_SIZE)
     distance_m = CELL_SIZE * shapely.distance(boxes[here], others[there])
     near: list[list[tuple[float, str]]] = [[] for _ in objects]
     for i, k, metres in zip(here.tolist(), there.tolist(), distance_m.tolist(), strict=True):
-        if objects[i] is not large[k]:
+        if objects[i].id != large[k].id:
             near[i].append((metres, large[k].id))
     return [[name for _, name in sorted(one)][: NEIGHBOUR_RULE.listed] for one in near]
 

@@ -42,7 +42,7 @@ from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.simulation.processes import processes
-from mapvote_server.questions.history import changes_between, cutouts_between
+from mapvote_server.questions.changes import changes_between, cutouts_between
 from mapvote_server.store.store import Store, url_of
 
 CASE = "surfaces"

@@ -1,4 +1,4 @@
-"""Routes of operators: publish, roll back, see what changed and why; keys, retention, integrity, health."""
+"""Routes of operators: publish, roll back, see why; keys, retention, integrity, health."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import structlog
 from fastapi import APIRouter, Query, Request, Response
@@ -14,16 +14,14 @@ from prometheus_client import generate_latest
 
 from mapvote.codec.ballot import tile_key
 from mapvote.core.types import MapvoteError
-from mapvote.shapes.geojson import feature_rows, tile_squares
+from mapvote.shapes.geojson import tile_squares
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
     Cancelled,
-    Changes,
     Checked,
     Coverage,
     Digest,
-    From,
     Health,
     Info,
     IssueAsk,
@@ -32,8 +30,6 @@ from mapvote_server.api.schemas import (
     KeysRevoked,
     Log,
     Metres,
-    MinCells,
-    Newest,
     Passes,
     Places,
     PolicyAsk,
@@ -58,7 +54,7 @@ from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Servic
 from mapvote_server.errors import Held, Unavailable
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.explain import CellStory, explain_cell
-from mapvote_server.questions.history import changes_between, log_of, overview, page_between
+from mapvote_server.questions.history import log_of, overview
 from mapvote_server.questions.vehicles import (
     contradictions,
     standing_rows,
@@ -150,44 +146,6 @@ async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
     version = await parts.commands.run(rollback, parts.store, ask.to, by=by, reason=ask.reason)
     return as_json({"version": version.number})
-
-
-@router.get(
-    "/v1/changes",
-    response_model=Changes,
-    responses=problems(404) | AS_CSV,
-    summary="What changed, as GeoJSON in map metres or as CSV",
-)
-@on("questions")
-def changes(
-    parts: Parts,
-    known: Known,
-    old: From,
-    new: Newest = None,
-    min_cells: MinCells = 1,
-    lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map is georeferenced")] = False,
-    format: Literal["geojson", "csv"] = "geojson",
-) -> Response:
-    """Things built and demolished between two versions; ``to`` is the newest by default."""
-    newest = parts.store.current() if new is None else new
-    found = changes_between(parts.store, old, newest, min_cells, lonlat=lonlat, known=known)
-    return as_table(feature_rows(found)) if format == "csv" else as_json(found)
-
-
-@router.get(
-    "/v1/changes/page",
-    response_class=Response,
-    responses=problems(404) | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
-    summary="What changed, as a page that needs no server",
-)
-@on("questions")
-def changes_page(parts: Parts, known: Known, old: From, new: Newest = None, min_cells: MinCells = 1) -> Response:
-    """A file to keep or to mail: the clouds of the largest changes, before and after."""
-    store = parts.store
-    newest = store.current() if new is None else new
-    page = page_between(store, old, newest, changes_between(store, old, newest, min_cells, known=known))
-    kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
-    return Response(page, media_type="text/html", headers=kept)
 
 
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")

@@ -18,6 +18,7 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
 from mapvote.shapes.packed_cloud import N_LEVELS
 from mapvote_server.api.encodings import takes_zstd
+from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -144,7 +145,7 @@ async def asset(request: Request, name: str) -> Response:
     if found is None or found.kind == "text/html":
         raise NotFound(f"there is no page {name[:80]!r}")
     headers = {"Cache-Control": "no-cache", "ETag": found.tag, "Vary": "Accept-Encoding"}
-    if request.headers.get("if-none-match") == found.tag:
+    if has_already(request, found.tag):
         return Response(status_code=304, headers=headers)
     if takes_zstd(request):
         return Response(found.packed, media_type=found.kind, headers=headers | {"Content-Encoding": "zstd"})

@@ -70,9 +70,6 @@ TableOrMap = Literal["json", "geojson", "csv"]
 VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
 From = Annotated[int, Query(alias="from", ge=LEAST, le=MOST)]
 To = Annotated[int, Query(alias="to", ge=LEAST, le=MOST)]
-Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
-"""As :data:`To`, the newest version if it is left out."""
-MinCells = Annotated[int, Query(ge=1, le=100_000)]
 _ON_EARTH = {"exclusiveMinimum": -FARTHEST_M, "exclusiveMaximum": FARTHEST_M}
 Metres = Annotated[float, Query(description="in the map's frame", json_schema_extra=_ON_EARTH)]
 """A range that is declared only, as that of days: the store's own refusal says more than FastAPI's."""
@@ -305,6 +302,8 @@ class Changes(_Collection):
     """The differences between two versions."""
 
     features: list[ChangeFeature]
+    numberMatched: int = Field(description="of all that were asked for (OGC API Features)")
+    numberReturned: int = Field(description="of those here")
     damaged: list[str] | None = Field(default=None, description="tiles that cannot be read")
 
 
@@ -460,6 +459,7 @@ KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=l
 KeyIssued = _answer("KeyIssued", "The only time that the key is seen.", key=str)
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
+AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 
 

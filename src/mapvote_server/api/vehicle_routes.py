@@ -15,9 +15,11 @@ from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import TILE_PLANE_SIZES
 from mapvote.shapes.geojson import utc
 from mapvote_server.api.encodings import takes_zstd
+from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
+    AS_YOU_HAVE,
     Digest,
     ManifestAnswer,
     Name,
@@ -37,14 +39,13 @@ from mapvote_server.store.examination import Examination, Incoming
 from mapvote_server.store.policy import without_drive
 from mapvote_server.store.votes import withdraw
 
-_AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()
 
 
 @router.get(
     "/v1/map",
     response_model=ManifestAnswer,
-    responses=problems(404) | _AS_YOU_HAVE,
+    responses=problems(404) | AS_YOU_HAVE,
     summary="Manifest of the newest version",
 )
 async def newest(request: Request, since: VersionQuery | None = None) -> Response:
@@ -68,7 +69,7 @@ def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
 @router.get(
     "/v1/map/versions/{number}",
     response_model=ManifestAnswer,
-    responses=problems(404) | _AS_YOU_HAVE,
+    responses=problems(404) | AS_YOU_HAVE,
     summary="Manifest of one version",
 )
 async def one_version(request: Request, number: Number, since: VersionQuery | None = None) -> Response:
@@ -78,7 +79,7 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
 
 @router.get(
     "/v1/tiles/{digest}",
-    responses=problems(404) | _AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
+    responses=problems(404) | AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
     response_class=Response,
     summary="One plane of a tile",
 )
@@ -92,7 +93,7 @@ async def plane(request: Request, digest: Digest) -> Response:
     }
     parts = services(request)
     data = await parts.vehicle.run(parts.store.blob, digest)
-    if request.headers.get("if-none-match") == f'"{digest}"':
+    if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if takes_zstd(request):
         headers["Content-Encoding"] = "zstd"
@@ -124,7 +125,7 @@ async def _manifest(request: Request, number: int | None, since: int | None) -> 
     if made is None:
         made = await parts.vehicle.run(parts.manifests.make, number, since)
     headers = {"ETag": made.tag, "Cache-Control": "private, no-cache"}
-    if request.headers.get("if-none-match") == made.tag:
+    if has_already(request, made.tag):
         return Response(status_code=304, headers=headers)
     return Response(made.content, media_type="application/json", headers=headers)
 

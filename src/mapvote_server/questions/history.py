@@ -5,29 +5,18 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from threading import Lock
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
-from mapvote.core.grid import TileIndex
-from mapvote.core.tile import Tile
-from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.fusion.decision_record import Record, cells_in
-from mapvote.fusion.tile_vote import TileVote
-from mapvote.shapes.change_objects import Decided, change_objects, changed_cells
-from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
-from mapvote.shapes.geojson import to_geojson
+from mapvote.core.types import MapvoteError
 from mapvote_server.errors import Unavailable
-from mapvote_server.questions.explain import seen, sound_votes
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import set_aside
 from mapvote_server.store.keys import hash_of
@@ -35,18 +24,12 @@ from mapvote_server.store.queries import (
     Version,
     current_number,
     load_blob,
-    load_tile,
     newest_seq,
     oldest_kept,
-    records_of,
     tiles_of,
-    tiles_that_differ,
     version_of,
 )
 from mapvote_server.store.store import Store
-from mapvote_server.store.votes import (
-    StoredVote,
-)
 
 _LOOKED_AT = 3
 
@@ -102,93 +85,6 @@ def log_of(store: Store, last: int) -> dict[str, Any]:
     """The versions, oldest first, and the ``last`` so many events, newest first."""
     versions = [origin_of(version) | {"created_ns": version.created_ns} for version in store.versions()]
     return {"versions": versions, "events": last_events(store, last) if last else []}
-
-
-def changes_between(
-    store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False, known: bool = True
-) -> dict[str, Any]:
-    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
-    ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
-
-    NotFound if one of the versions does not exist.
-    """
-    with store.database.reading() as connection:
-        found, damaged = [], []
-        for index, *pair in tiles_that_differ(connection, old, new):
-            try:
-                before, after = (load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair)
-                found.append(changed_cells(before, after, _decided(connection, index, min(old, new), max(old, new))))
-            except Unavailable:
-                raise
-            except MapvoteError:
-                damaged.append(tile_key(index))
-    collection = to_geojson(
-        [
-            replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
-            for thing in change_objects(found, min_cells)
-        ],
-        store.lattice,
-        map_id=store.map_id,
-        from_version=old,
-        to_version=new,
-        georeference=store.georeference,
-        lonlat=lonlat,
-    )
-    return collection | ({"damaged": damaged} if damaged else {})
-
-
-def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
-    """The largest things of :func:`changes_between` with their surroundings, before and after."""
-    tiles = tiles_at(store, old), tiles_at(store, new)
-    large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
-    largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
-    return [of_feature(feature, tiles, store.lattice) for feature in largest]
-
-
-def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
-    """HTML of :func:`cutouts_between`, one file without any request."""
-    return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
-
-
-def tiles_at(store: Store, version: int) -> Tiles:
-    """Tiles of one version by their index, each loaded once. NotFound if there is no such version."""
-    with store.database.reading() as connection:
-        version_of(connection, version)
-        hashes = tiles_of(connection, version)
-
-    @cache
-    def load(index: TileIndex) -> Tile:
-        with store.database.reading() as connection:
-            return load_tile(connection, store.lattice.tile(index), hashes.get(index))
-
-    return load
-
-
-def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) -> list[Decided]:
-    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted;
-    MapvoteError if a record is damaged."""
-    records = records_of(connection, index, after=old, upto=new)
-    counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
-    sound = sound_votes(connection, index, counted)
-    return [(record, _drives(record, sound)) for record in records]
-
-
-def _drives(record: Record, sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
-    """(end_ns, states) of the ballots that counted, in the cells where they did. A cell that the version trimmed is
-    CHANGED_EMPTY where the ballot marks voxels of it as gone."""
-    found = []
-    for standing in record.standings:
-        _, vote = sound.get(standing.ballot, (None, None))
-        if not standing.why and vote is not None and vote.states is not None:
-            states = vote.states.copy()
-            if vote.gone is not None:
-                trimmed = np.intersect1d(vote.gone.cells, record.edit_votes.cells, assume_unique=True)
-                at = states.reshape(-1)[trimmed] == CellState.UNCHANGED_OCCUPIED
-                states.reshape(-1)[trimmed[at]] = CellState.CHANGED_EMPTY
-            for cells in (standing.spent, standing.reviewed):
-                states.reshape(-1)[cells_in(cells)] = NO_VOTE
-            found.append((vote.end_ns, states))
-    return found
 
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")

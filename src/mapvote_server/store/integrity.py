@@ -198,6 +198,12 @@ def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex
     return {(row, col) for query in queries for row, col in connection.execute(query)}
 
 
+def hurt_or_mended_since(connection: sa.Connection, since: int) -> bool:
+    """Whether anything was set aside since an event, or a plane mended."""
+    return any(question.ask(connection, since=since).first() is not None for question in (_ASIDE, _MENDED))
+
+
 _Q, _E, _SINCE = schema.quarantine.c, schema.events.c, sa.bindparam("since", type_=sa.BigInteger)
+_ASIDE = Question(sa.select(_Q.name).where(_Q.seq > _SINCE))
 _SET_ASIDE = Question(sa.select(_Q.name).where(_Q.kind == sa.literal("ballot"), _Q.seq > _SINCE))
 _MENDED = Question(sa.select(_E.detail).where(_E.kind == sa.literal(MENDED), _E.seq > _SINCE))

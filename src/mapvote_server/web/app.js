@@ -170,7 +170,7 @@ function askRange(deep = Boolean(view.cloud)) {
   const [from, to] = [$("from").value, $("to").value];
   const same = from === to;
   const clouds = deep && !same ? api.cloudsChanged(from, to) : Promise.resolve(new ArrayBuffer(0));
-  const list = same ? Promise.resolve([]) : api.changes(from, to).then((found) => found.features);
+  const list = same ? Promise.resolve({ features: [], numberMatched: 0 }) : api.changes(from, to);
   for (const answer of [list, clouds]) answer.catch(() => null);  // whoever shows it tells
   return (range = { from, to, list, clouds });
 }
@@ -179,16 +179,16 @@ async function showRange(mine = askRange()) {
   const { from, to } = mine;
   closeDetails();
   const shown = showClouds();
-  let features = [];
+  let found = { features: [], numberMatched: 0 };
   try {
-    features = await mine.list;
+    found = await mine.list;
   } catch (error) {
     refuse(error);
   }
   if (range !== mine) return;
   const usual = Number(to) === state.manifest.version && Number(from) === Math.max(state.versions[0].number, to - 1);
   address.write({ from: usual ? null : from, to: usual ? null : to });
-  showList(features, nothing(from, to), { from, to });
+  showList(found, nothing(from, to), { from, to });
   await shown;
 }
 

@@ -3,9 +3,10 @@
 import { drawable, nameOf, showChange, visit } from "./details.js";
 import { $, address, dot, element, state } from "./page.js";
 
+const MOST_IN_A_FILE = 10_000;  // as many as the server sends at once
 const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
 
-export function showList(features, nothing, range) {
+export function showList({ features, numberMatched }, nothing, range) {
   state.features = [...features].sort((a, b) => b.properties.area_m2 - a.properties.area_m2);
   state.view.setChanges(state.features.map(drawable));
   const large = state.features.filter((f) => !(f.properties.size in FOLDS));
@@ -14,6 +15,9 @@ export function showList(features, nothing, range) {
     ...(features.length
       ? [dot("built"), `${count("built")} built `, " \u2002 ", dot("demolished"), `${count("demolished")} demolished`]
       : [element("span", { className: "hint" }, [nothing])]),
+    ...(numberMatched > features.length
+      ? [element("span", { className: "hint" }, [` among the largest ${features.length} of ${numberMatched} changes`])]
+      : []),
   );
   $("changes").replaceChildren(...large.map(row));
   for (const [size, [id, told]] of Object.entries(FOLDS)) {
@@ -25,7 +29,7 @@ export function showList(features, nothing, range) {
     $(id).ontoggle = () => unfold(size, $(id).open);
   }
   for (const format of ["geojson", "csv"]) {
-    $(`as-${format}`).href = `v1/changes?${new URLSearchParams({ ...range, format })}`;
+    $(`as-${format}`).href = `v1/changes?${new URLSearchParams({ ...range, format, limit: MOST_IN_A_FILE })}`;
   }
 }
 

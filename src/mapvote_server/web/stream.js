@@ -6,6 +6,7 @@ import { MARK } from "./shaders.js";
 
 export const SPACING = [4.8, 2.4, 1.2, 0.6, 0.3, 0.15];  // metres between the points of each level
 const HEAD = 24, AT_ONCE = 6, ENOUGH_PIXELS = 1.1, MOST_LOADED = 14e6, FRAME_MS = [45, 75], LEAST = 30_000, MOST = 4e6;
+const MOST_TOLD = 256;  // tiles in view of which votes are shown: 256 kB each
 const FIRST = 40_000;  // points of the first picture, so that it comes at once even where the processor draws
 
 // {z0, zStep, packed} of one cloud of an answer, and where the next one begins.
@@ -95,9 +96,10 @@ export class Stream {
       box.min.set(x, y, z + tile.low);
       box.max.set(x + TILE, y + TILE, z + tile.high);
       tile.seen = frustum.intersectsBox(box);
+      tile.away = Infinity;
       for (const part of tile.levels) part.share = 0;
       if (!tile.seen || (tile.side === "old" && cloud.sides === "new") || (tile.side === "new" && cloud.sides === "old")) continue;
-      const distance = Math.max(box.distanceToPoint(corner.copy(eye)), 2);
+      const distance = (tile.away = Math.max(box.distanceToPoint(corner.copy(eye)), 2));
       for (const part of tile.levels) wanted.push({ px: (SPACING[part.level] * pixels) / distance, part, tile });
       if ((tile.next ?? 0) < SPACING.length) wanted.push({ px: (SPACING[tile.next ?? 0] * pixels) / distance, part: null, tile });
     }
@@ -117,6 +119,7 @@ export class Stream {
     this.shown = budget - Math.max(left, 0);
     if (this.tiles.map((tile) => this.show(tile)).some(Boolean)) cloud.draw();
     this.fetch();
+    if (this.asked) this.tell().then(() => this.forget(), this.onError);
   }
 
   // Draws of a tile what was planned; whether that is another picture than before.
@@ -239,13 +242,50 @@ export class Stream {
     }
   }
 
-  async evidence(colours, vehicle) {  // textures of what ballots say, for the tiles in view
-    await Promise.all(this.tiles.map(async (tile) => {
-      const bytes = colours ? await this.api.evidence(tile.name, vehicle) : null;
-      tile.evidence = bytes && this.cloud.texture(new Uint8Array(bytes));
-      for (const part of tile.levels) part.points.material.uniforms.evidence.value = tile.evidence ?? this.cloud.blank;
-    }));
+  // Whether points are coloured by what ballots say (of one vehicle, if it is named): asked for the nearest tiles in
+  // view, and for others as they come into view.
+  async evidence(colours, vehicle) {
+    this.asked = colours ? { vehicle } : null;
+    if (!colours) for (const tile of this.tiles) this.wear(tile, null);
+    await this.tell();
     this.cloud.draw();
+  }
+
+  async tell() {
+    while (this.untold()) await this.askAtOnce();
+  }
+
+  askAtOnce() {
+    return (this.telling ??= Promise.all(Array.from({ length: AT_ONCE }, () => this.askOn())).finally(() => (this.telling = null)));
+  }
+
+  async askOn() {
+    for (let tile; (tile = this.untold()); ) {
+      const { asked } = this;
+      tile.told = asked;
+      const bytes = await this.api.evidence(tile.name, asked.vehicle);
+      if (this.asked === asked) this.wear(tile, this.cloud.texture(new Uint8Array(bytes)));
+    }
+  }
+
+  // The next tile to ask for: of the nearest in view the first whose votes are not known.
+  untold() {
+    const { asked } = this, near = (a, b) => a.away - b.away;
+    return asked && this.tiles.filter((tile) => tile.seen).sort(near).slice(0, MOST_TOLD).find((tile) => tile.told !== asked);
+  }
+
+  wear(tile, evidence) {
+    tile.evidence?.dispose();
+    tile.evidence = evidence;
+    for (const part of tile.levels) part.points.material.uniforms.evidence.value = evidence ?? this.cloud.blank;
+    this.cloud.draw();
+  }
+
+  // Textures of tiles out of view go once there are too many.
+  forget() {
+    const worn = this.tiles.filter((tile) => tile.evidence);
+    if (worn.length <= 2 * MOST_TOLD) return;
+    for (const tile of worn) if (!tile.seen) Object.assign(tile, { told: null }), this.wear(tile, null);
   }
 
   // Points that came and went, as the server tells them, with shapes of their own.

@@ -19,7 +19,7 @@ from mapvote.codec.ballot import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.shapes.cutout import whole_page
-from mapvote_server.questions.history import changes_between, cutouts_between
+from mapvote_server.questions.changes import changes_between, cutouts_between
 from mapvote_server.store.publish import publish
 from mapvote_server.store.store import Store
 from stores import send

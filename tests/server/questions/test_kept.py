@@ -25,6 +25,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
+from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.vehicles import vehicle_standings
 from mapvote_server.store import schema
@@ -32,6 +33,7 @@ from mapvote_server.store.integrity import check, restore_plane
 from mapvote_server.store.keys import issue, revoke
 from mapvote_server.store.policy import KeepPolicy, Policy
 from mapvote_server.store.publish import publish
+from mapvote_server.store.queries import oldest_kept
 from mapvote_server.store.retention import clear
 from mapvote_server.store.reviews import decide, standing, undo
 from mapvote_server.store.rollback import replay, rollback
@@ -43,10 +45,18 @@ TILES: list[TileIndex] = [(0, 0), (0, 1), (0, 2)]
 WALL: list[Cell] = [(10, c) for c in range(10, 15)]
 LAWN: list[Cell] = [(30, c) for c in range(10, 15)]
 START_NS = 1_700_000_000 * 10**9
+
+
+def oldest_of(store: Store) -> int:
+    with store.database.reading() as connection:
+        return oldest_kept(connection)
+
+
 QUESTIONS: dict[str, Callable[[Store], object]] = {
     "vehicles": vehicle_standings,
     "waiting votes": waiting_votes,
     "wanted passes": wanted_passes,
+    "changes": lambda store: changes_between(store, oldest_of(store), store.current()),
 }
 """All that answer from what they kept."""
 SAYS = {
@@ -138,7 +148,7 @@ class Street:
         check(self.store, mend=True)
 
     def lose_plane(self, which: int) -> None:
-        """A plane that the map shows is lost, and another quorum makes the server read it."""
+        """A plane that the map shows is lost, a check says so, and another quorum makes the server read it."""
         b = schema.blobs
         with self.store.database.writing() as connection:
             shown = [hashes.points for hashes in self.store.tiles(self.store.current()).values()]
@@ -147,6 +157,7 @@ class Street:
             if digest not in self.lost:
                 self.lost[digest] = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "plane")
             connection.execute(b.update().where(b.c.hash == digest).values(data=b"spoilt"))
+        check(self.store, mend=True)
         self.store.change_policy({"fuse.min_votes": 1 + self.store.policy().fuse.min_votes % 3})
 
     def mend(self) -> None:
@@ -257,6 +268,7 @@ MATTER: dict[str, tuple[list[Step], Step]] = {
     "a hold": ([LACKS_ONE], ("review", "held", (0, 0))),
     "a hold taken back": ([LACKS_ONE, ("review", "held", (0, 0))], ("take_back",)),
     "a damaged ballot": ([LACKS_ONE], ("spoil_ballot", 0)),
+    "a damaged ballot that counted": (GONE, ("spoil_ballot", 0)),
     "a plane put back": ([LACKS_ONE, ("lose_plane", 0)], ("mend",)),
     "a ballot cleared away": (
         [("vote", "a", "d1", FIRST, "nothing", 1_000), ("vote", "b", "d1", FIRST, "wall gone"),

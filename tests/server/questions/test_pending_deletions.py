@@ -12,9 +12,9 @@ from mapvote.codec.ballot import MOST_STEPS, STEPS_PER_NAT
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.loss_budget import change_probability
+from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.desk import desk, review
 from mapvote_server.questions.explain import CellStory, explain_cell
-from mapvote_server.questions.history import changes_between
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import check
 from mapvote_server.store.policy import Policy

@@ -12,9 +12,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.decision_record import pack_edit_votes, unpack_edit_votes
 from mapvote.fusion.edit import EditVotes
+from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.desk import desk
 from mapvote_server.questions.explain import Edit, explain_cell
-from mapvote_server.questions.history import changes_between
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
 from mapvote_server.store.store import Store

@@ -12,9 +12,9 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import CellState
 from mapvote.fusion.fuse import update_map
+from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.desk import desk, review
 from mapvote_server.questions.explain import explain_cell
-from mapvote_server.questions.history import changes_between
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import preview, publish
 from mapvote_server.store.reviews import undo

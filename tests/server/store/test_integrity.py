@@ -16,9 +16,10 @@ from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
 from mapvote_server.errors import NotFound
+from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.clouds import Clouds
 from mapvote_server.questions.explain import evidence
-from mapvote_server.questions.history import changes_between, last_events
+from mapvote_server.questions.history import last_events
 from mapvote_server.questions.vehicles import vehicle_standings
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import ballot_name, check, restore_plane, set_aside

@@ -151,3 +151,39 @@ test("a plan draws no more points than its budget, the coarse ones first", () =>
   stream.plan(150);
   assert.deepEqual(stream.tiles[0].levels.map((p) => p.share), [100, 50, 0]);
 });
+
+test("votes are asked for of the tiles in view, a few at a time, and once for each choice", async () => {
+  const asked = [], cloud = { ...canvasless(), texture: () => ({ dispose() {} }) };
+  let open = 0, most = 0;
+  const evidence = async (name, vehicle) => {
+    asked.push(`${name} ${vehicle ?? "all"}`);
+    most = Math.max(most, ++open);
+    await new Promise((done) => setTimeout(done, 1));
+    open--;
+    return new ArrayBuffer(4);
+  };
+  const stream = new Stream(cloud, { evidence });
+  const all = Array.from({ length: 3000 }, (_, i) => [`0,${i}`, { points: `p${i}`, ground: "g" }]);
+  stream.fetch = () => {};
+  stream.setTiles({ x0: 0, y0: 0 }, Object.fromEntries(all), null);
+  const look = (from, to) => {
+    cloud.frustum = () => ({ intersectsBox: (box) => box.min.x >= 76.8 * from - 1e-3 && box.min.x < 76.8 * to - 1e-3 });
+    stream.plan();
+  };
+  look(10, 30);
+  await stream.evidence(true, undefined);
+  assert.deepEqual([asked.length, most], [20, 6]);
+  look(20, 40);
+  await stream.tell();
+  assert.equal(asked.length, 30, "those that came into view");
+  look(0, 3000);
+  await stream.tell();
+  assert.ok(asked.length <= 30 + 256, `${asked.length} asked with the whole city in view`);
+  look(10, 30);
+  const before = asked.length;
+  await stream.evidence(true, "a");
+  assert.deepEqual(asked.slice(before).sort()[0], "0,10 a");
+  assert.equal(asked.length, before + 20, "of one vehicle");
+  await stream.evidence(false);
+  assert.ok(stream.tiles.every((tile) => !tile.evidence));
+});

@@ -1,0 +1,97 @@
+"""Routes of what was built and demolished between two versions."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, Field
+
+from mapvote.shapes.geojson import feature_rows
+from mapvote_server.api.etags import has_already, tag_of
+from mapvote_server.api.lanes import on
+from mapvote_server.api.schemas import (
+    AS_CSV,
+    AS_YOU_HAVE,
+    LEAST,
+    MOST,
+    Changes,
+    as_json,
+    as_table,
+    problems,
+)
+from mapvote_server.api.services import Known, Parts
+from mapvote_server.questions.changes import Comparison, changes_between, compare_versions, page_between
+
+router = APIRouter()
+
+
+class Between(BaseModel):
+    """Two versions, and which of their differences."""
+
+    old: int = Field(alias="from", ge=LEAST, le=MOST)
+    new: int | None = Field(default=None, alias="to", ge=LEAST, le=MOST, description="the newest if left out")
+    min_cells: int = Field(default=1, ge=1, le=100_000)
+
+
+class ChangesAsked(Between):
+    """A part of the list of changes."""
+
+    lonlat: bool = Field(default=False, description="in longitude and latitude, if the map is georeferenced")
+    format: Literal["geojson", "csv"] = "geojson"
+    limit: int = Field(default=1_000, ge=1, le=10_000, description="so many at most, the largest first")
+    offset: int = Field(default=0, ge=0, le=MOST, description="after so many")
+
+
+@router.get(
+    "/v1/changes",
+    response_model=Changes,
+    responses=problems(404) | AS_CSV | AS_YOU_HAVE,
+    summary="What changed, as GeoJSON in map metres or as CSV",
+)
+@on("questions")
+def changes(request: Request, parts: Parts, known: Known, asked: Annotated[ChangesAsked, Query()]) -> Response:
+    """Things built and demolished between two versions, the largest first; ``to`` is the newest by default.
+
+    If there are more than ``limit``, the header Link names the next part.
+    """
+    newest = parts.store.current() if asked.new is None else asked.new
+    headers = _headers(compare_versions(parts.store, asked.old, newest), known, asked)
+    if has_already(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    shown: dict[str, Any] = {"limit": asked.limit, "offset": asked.offset}
+    found = changes_between(parts.store, asked.old, newest, asked.min_cells, lonlat=asked.lonlat, known=known, **shown)
+    answer = as_table(feature_rows(found)) if asked.format == "csv" else as_json(found)
+    after = asked.offset + found["numberReturned"]
+    if after < found["numberMatched"]:
+        following = dict(request.query_params) | {"to": str(newest), "offset": str(after)}
+        headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
+    answer.headers.update(headers)
+    return answer
+
+
+@router.get(
+    "/v1/changes/page",
+    response_class=Response,
+    responses=problems(404) | AS_YOU_HAVE | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
+    summary="What changed, as a page that needs no server",
+)
+@on("questions")
+def changes_page(request: Request, parts: Parts, known: Known, asked: Annotated[Between, Query()]) -> Response:
+    """A file to keep or to mail: the clouds of the largest changes, before and after."""
+    store = parts.store
+    newest = store.current() if asked.new is None else asked.new
+    headers = _headers(compare_versions(store, asked.old, newest), known, asked)
+    if has_already(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    page = page_between(
+        store, asked.old, newest, changes_between(store, asked.old, newest, asked.min_cells, known=known)
+    )
+    headers["Content-Disposition"] = 'attachment; filename="changes.html"'
+    return Response(page, media_type="text/html", headers=headers)
+
+
+def _headers(compared: Comparison, known: bool, asked: Between) -> dict[str, str]:
+    tag = tag_of(compared.digest, known, asked.model_dump(exclude={"new"}))
+    return {"ETag": tag, "Cache-Control": "private, no-cache"}
