@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -163,28 +164,63 @@ def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: st
     print(f"CPU of drive: {after.children_user - before.children_user:.1f} s user, start and kernels included")
 
 
-def noisy_fixes(poses: F64, stamps_ns: I64, every: int, sigma_m: float) -> Fixes:
-    """Satellite fixes of every ``every``-th of the poses (n, 4, 4), with independent errors; their heights count from
-    an ellipsoid 40 m below the map's."""
-    noise = np.random.default_rng(0).normal(0.0, sigma_m, (len(poses), 3))
-    frame = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
-    lonlat = frame.to_lonlat(poses[:, :3, 3] + noise + [0.0, 0.0, 40.0])
-    covariances = np.tile(np.diag([sigma_m**2] * 3).ravel(), (len(poses), 1))
-    return fixes_of(stamps_ns[::every], lonlat[::every], covariances[::every], frame)
+@dataclass(frozen=True)
+class Receiver:
+    """A satellite receiver at 1 Hz. Its heights count from an ellipsoid 40 m below the map's."""
+
+    sigma_m: float = 2.0
+    lasting_s: float = 0.0
+    """Time for which an error lasts; 0: errors are independent."""
+    outliers: float = 0.0
+    """Share of the fixes that are 20 m off beside."""
+    late_s: float = 0.0
+    """Time of the first fix."""
+    off_m: float = 0.0
+    """Error to the east that stays."""
+
+    def fixes(self, poses: F64, stamps_ns: I64) -> Fixes:
+        """Fixes of every tenth of the poses (n, 4, 4) at 10 Hz, which state ``sigma_m``."""
+        rng = np.random.default_rng(0)
+        noise = rng.normal(0.0, 1.0, (len(poses), 3))
+        if self.lasting_s:
+            weights = np.exp(-np.arange(0.0, 5.0 * self.lasting_s, 0.1) / self.lasting_s)
+            longer = np.concatenate([rng.normal(0.0, 1.0, (len(weights) - 1, 3)), noise])
+            noise = np.column_stack([np.convolve(axis, weights, "valid") for axis in longer.T])
+            noise /= np.sqrt((weights**2).sum())
+        noise *= self.sigma_m
+        wrong = rng.random(len(poses)) < self.outliers
+        noise[wrong] += rng.normal(0.0, 20.0, (int(wrong.sum()), 3))
+        chosen = np.arange(0, len(poses), 10)
+        chosen = chosen[stamps_ns[chosen] - stamps_ns[0] >= self.late_s * 1e9]
+        frame = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
+        lonlat = frame.to_lonlat(poses[:, :3, 3] + noise + [self.off_m, 0.0, 40.0])
+        covariances = np.tile(np.diag([self.sigma_m**2] * 3).ravel(), (len(poses), 1))
+        return fixes_of(stamps_ns[chosen], lonlat[chosen], covariances[chosen], frame)
+
+
+RECEIVERS = {
+    "GNSS, 2 m, 1 Hz": Receiver(),
+    "the same, first fix after 15 s": Receiver(late_s=15.0),
+    "the same, a fifth of them 20 m off": Receiver(outliers=0.2),
+    "GNSS, 3 m, errors that last 20 s": Receiver(sigma_m=3.0, lasting_s=20.0),
+    "GNSS, 10 m": Receiver(sigma_m=10.0),
+    "GNSS, 2 m stated, all of them 15 m off": Receiver(off_m=15.0),
+}
 
 
 def priors(drive_path: str, map_path: str) -> None:
-    """Scans that vote, and the largest error of those, by odometry in a frame of its own, without a prior and by fixes
-    of 2 m at 1 Hz."""
+    """Scans that vote, and the largest error of those, by odometry in a frame of its own, without a prior and by
+    satellite fixes."""
     drive = open_drive(Path(drive_path))
     point_map = read_map(Path(map_path))
     poses = read_poses(Path(drive_path).parent / "truth" / Path(drive_path).name / "poses.txt")
-    fixes = noisy_fixes(poses, drive.stamps_ns, 10, 2.0)
     kinds: dict[str, list[F64 | PosePrior | None]] = {
         "odometry turned and shifted, drifting by 2 %": list(odometry(poses, OWN_FRAME @ poses[0], drift=0.02)),
         "no prior": [None] * len(drive),
-        "GNSS, 2 m, 1 Hz": [prior_at(fixes, int(stamp_ns), np.eye(4)) for stamp_ns in drive.stamps_ns],
     }
+    for name, receiver in RECEIVERS.items():
+        fixes = receiver.fixes(poses, drive.stamps_ns)
+        kinds[name] = [prior_at(fixes, int(stamp_ns), np.eye(4)) for stamp_ns in drive.stamps_ns]
     for name, told in kinds.items():
         vehicle = Vehicle("car", drive.sensor, point_map)
         if name.startswith("odometry"):
