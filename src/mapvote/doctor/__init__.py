@@ -1,4 +1,4 @@
-"""What is wrong with a drive, a map, a ballot or a store, and how to mend it: measured where it can be, not guessed.
+"""Faults of a drive, a map, a ballot or a store, and their mends: measured where they can be, not guessed.
 
 :mod:`mapvote.doctor.diagnosis` lists the checks. docs/decisions/doctor.md gives the reasons.
 """

@@ -1,4 +1,4 @@
-"""What is wrong at a path, whatever lies there: a map, a ballot, a bag, a store, a drive, or a drive on a map.
+"""Faults at a path, whatever lies there: a map, a ballot, a bag, a store, a drive, or a drive on a map.
 
 A ballot: does it look as if the vehicle knew
 where it was? A store: is every byte what it was, can anybody use it, is its newest map sound?
@@ -39,7 +39,7 @@ _SIGMA_M = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the doctor found, errors first, and of a drive how it lies."""
+    """Findings of the doctor, errors first, and the poses of a drive."""
 
     findings: list[Finding]
     drive: Drive | None = None

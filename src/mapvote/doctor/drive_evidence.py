@@ -1,4 +1,4 @@
-"""What the scans of a drive show once they are compared: the road below, how ranges scatter, how the sensor moved.
+"""Evidence from comparing the scans of a drive: the road below, the scatter of ranges, the motion of the sensor.
 
 Nothing of the prior is used, not even as a guess: whatever is wrong with it can be measured against this. A run is some
 twenty metres of consecutive scans, each registered to those before it: long enough for a few centimetres of error to be
@@ -36,14 +36,14 @@ _ROAD_SCANS = 7
 _RAYS = 500
 _BESIDE = 8
 _QUARTER = 0.3186
-"""Of a normal distribution's absolute values a quarter is smaller than this many standard deviations."""
+"""A quarter of a normal distribution's absolute values is smaller than this many standard deviations."""
 _NEAREST_M, _FARTHEST_M = 3.0, 40.0
 _HALF_WINDOW_M = 60.0
-"""Of the NDT map of a run: its scans reach 50 m."""
+"""Half the side of the NDT map of a run, metres: its scans reach 50 m."""
 _RUNS, _SCANS, _ACROSS = 8, 11, 2
 """Runs spread over a drive, scans of each, and runs across the places where scans differ most."""
 _CHAIN_SCANS = 150
-"""Of a chain: some 300 m."""
+"""Scans of a chain: some 300 m."""
 _LOST_SCANS = 4
 """A chain of no more has lost itself at its first step."""
 _STEP_M, _MOST_STEP = 2.5, 5
@@ -56,7 +56,7 @@ _REFINED = 4
 _ROUGH_M, _SCATTER_M = 0.12, 0.25
 """Sound sensors show 0.02 to 0.04 m."""
 _HIGHEST_M = 4.5
-"""Of a sensor over the road."""
+"""Largest height of a sensor over the road, metres."""
 _LEAST_FIT = 0.55
 """Sound scans, a step apart, agree in .75 to .95 of their points; scans of different places in .2 to .5."""
 _BRAKES_MPS2 = 8.0
@@ -69,9 +69,9 @@ class Road:
     up: str
     """Which axis of the points points up: "+z" as it should."""
     depth_m: float
-    """Of the road below the sensor."""
+    """Normal of the road below the sensor."""
     share: float
-    """Of the points within 15 m that lie within 0.12 m of the plane; below 0.1 it may be no road."""
+    """Share of the points within 15 m that lie within 0.12 m of the plane; below 0.1 it may be no road."""
     normal: F64
     """(3,) of the road, upwards, in the frame of the points."""
     scatter_m: float
@@ -86,7 +86,7 @@ class Road:
 
     @property
     def tilt_deg(self) -> float:
-        """Of the sensor against the road."""
+        """Rotation of the sensor against the road."""
         return float(np.degrees(np.arccos(np.clip(self.normal @ _UPS[self.up], -1.0, 1.0))))
 
 
@@ -156,17 +156,17 @@ class DriveEvidence:
 
     @cached_property
     def road(self) -> Road:
-        """As the points are read."""
+        """Times as the points are read."""
         return find_road([scan.points for scan in self._scans])
 
     @cached_property
     def road_below(self) -> Road:
-        """Of points turned over where the sensor is upside down."""
+        """Points turned over where the sensor is upside down."""
         return find_road([scan.points @ _TURNED_OVER for scan in self._scans]) if self.road.up == "-z" else self.road
 
     @cached_property
     def scatter_m(self) -> float:
-        """Of ranges, of the first LiDAR: rays of another one begin elsewhere, and end on other things."""
+        """Scatter of the first LiDAR's ranges: rays of another one begin elsewhere, and end on other objects."""
         return float(np.median([_range_scatter_m(scan.by_lidar()[0][1].points) for scan in self._scans]))
 
     @property
@@ -223,7 +223,7 @@ class DriveEvidence:
 
     @cached_property
     def leaps(self) -> list[Finding]:
-        """What is wrong with the scans' own motion; while there is anything, a prior cannot be compared with it."""
+        """Faults of the scans' own motion; while there is any, a prior cannot be compared with it."""
         return list(_check_motion(self.every_run, self.drive)) if self.can_be_registered else []
 
     def _follow(self, start: int, scans: int = _SCANS) -> Run:
@@ -352,7 +352,8 @@ def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Ro
 
 
 def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]:
-    """As the last ones moved; at the start of a run, every way and speed that a vehicle may have."""
+    """Guesses by the motion of the last scans; at the start of a run, every direction and speed that a vehicle may
+    have."""
     last = poses[-1]
     if len(poses) > 1:
         a_scan = log(inverse(poses[-2]) @ last) / (indices[-1] - indices[-2])

@@ -22,12 +22,12 @@ from mapvote.perception.frontend import DriveReport
 
 @dataclass(frozen=True, slots=True)
 class LocalisedRules:
-    """What sound drives keep within."""
+    """Limits that sound drives keep."""
 
     least_scans: int = 8
     """Scans that show anything of a drive."""
     least_share: float = 0.5
-    """Of the scans over the map's ground: so many have a sure place."""
+    """Scans over the map's ground that must have a sure place."""
     leap_mps: float = 70.0
     """No vehicle is faster between two sure scans ..."""
     leap_m: float = 5.0
@@ -66,7 +66,7 @@ class LocalisedDrive:
 
     @classmethod
     def of(cls, drive: Drive, T_map_lidar: Sequence[F64] | F64, sure: Bool) -> LocalisedDrive:
-        """Of a recorded ``drive`` whose scans were found at poses (n, 4, 4), those that are ``sure`` (n,)."""
+        """Findings on a recorded ``drive`` whose scans were localised at poses (n, 4, 4), where ``sure`` (n,)."""
         prior, sigma_m, sigma_deg = drive.T_map_lidar_prior, drive.prior_sigma_m, drive.prior_sigma_deg
         if prior is not None and drive.prior_sigmas is not None:  # fixes, which know no attitude
             fixed = np.isfinite(drive.prior_sigmas[:, 0])
@@ -77,7 +77,7 @@ class LocalisedDrive:
 
     @classmethod
     def of_vote(cls, drive: Drive, report: DriveReport) -> LocalisedDrive:
-        """Of a recorded ``drive`` that has voted."""
+        """Findings on a recorded ``drive`` that has voted."""
         if not drive.prior_in_map:
             return cls.of_report(report, prior_in_map=False)
         sure = np.ones(len(drive), dtype=np.bool_)

@@ -60,11 +60,11 @@ _UNITS = (
     )),
     ("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
 )  # fmt: skip
-"""What the map's numbers may be instead of metres: (name, metres, how to mend it)."""
+"""Units that the map's numbers may have instead of metres: (name, metres, mend)."""
 _SENSOR_M = 2.0
 """Height of a sensor over the road, about."""
 _AROUND_M = 120.0
-"""Of the drive: what its scans can see, and then some."""
+"""Surroundings of the drive, metres: the range of its scans, and then some."""
 _FEWEST = 1000
 """Points of a map around a drive."""
 
@@ -76,7 +76,7 @@ class Place:
     index: int
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.matching.pose_check.Verdict` has it; 0 where the map has too few points."""
+    """Score of :class:`mapvote.matching.pose_check.Verdict`; 0 where the map has too few points."""
     known: float
     """Share of the scan's points near which the map has anything, at the guess."""
 
@@ -212,7 +212,7 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
 
 
 def in_another_unit(e: MapEvidence) -> Finding | None:
-    """What the map is in, if scans fit it once it is made metres about its origin, about its middle or about the road
+    """The unit of the map, if scans fit it once it is converted to metres about its origin, its middle or the road
     below the middle of the drive; None if none does.
 
     The map's points are made metres, not the scans feet: voxels have the size that suits points in metres.
@@ -363,7 +363,7 @@ def _where_not(places: Sequence[Place], good: Sequence[Place]) -> Iterator[Findi
 
 
 def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
-    """What the difference between prior and map amounts to, with its error."""
+    """The difference between prior and map, with its error."""
     off_m, sigma_m, sigma_deg = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m, drive.prior_sigma_deg
     yaw_deg = float(np.degrees(np.arctan2(d.rotation[1, 0], d.rotation[0, 0])))
     tilt_deg = float(np.degrees(np.arccos(np.clip(d.rotation[2, 2], -1.0, 1.0))))
@@ -394,7 +394,7 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
 
 
 def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:
-    """Of the sensor over the map's ground, once the difference is taken out."""
+    """Height of the sensor over the map's ground, once the difference is taken out."""
     height = check_heights(point_map, T[:, :3, 3])
     if not np.isfinite(height.median_m):
         return
@@ -409,8 +409,8 @@ def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:
 
 
 def check_cloud_on_map(point_map: PointMap, cloud: PointMap) -> list[Finding]:
-    """Of a map or a session's ``cloud`` against another map: where it lies there, and which part of it no rigid motion
-    lays there, as `mapvote diff` says it."""
+    """Findings on a map or a session's ``cloud`` against another map: its place there, and the part that no rigid
+    motion aligns, as `mapvote diff` reports them."""
     try:
         registered = register_maps(point_map, cloud)
     except MapvoteError as error:

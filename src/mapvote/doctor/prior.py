@@ -88,7 +88,7 @@ def _course(T: F64) -> F64:
 
 
 def median_angle_deg(angles: F64) -> float:
-    """Of angles (n,) in radians, by their sines and cosines."""
+    """Mean of angles (n,) in radians, by their sines and cosines."""
     return float(np.degrees(np.arctan2(np.median(np.sin(angles)), np.median(np.cos(angles)))))
 
 
@@ -116,7 +116,7 @@ def _from_degrees(first: int) -> Rule:
 
 
 def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
-    """What custom confuses, of the scans and of the prior: both move the same way."""
+    """Axes that are commonly confused, of the scans and of the prior: both move the same way."""
     rule = turned(from_xyz_rpy(0, 0, 0, yaw=np.radians(-yaw_deg)))
     scans = {
         90: "the scans are turned by 90 deg about z (x right, y forward)",
@@ -214,7 +214,7 @@ class Number:
 
     @property
     def least(self) -> float:
-        """What the drive can surely show."""
+        """Deviations that the drive can surely show."""
         return max(
             LEAST[self.kind], (PRIOR_CHECK.sure_of_time if self.kind == "time" else PRIOR_CHECK.sure) * self.off[1]
         )

@@ -40,12 +40,12 @@ from mapvote.survey.driven_road import wrong_attitude
 _POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
 """Errors of a prior's pose against a chain: they weigh positions against rotations."""
 _CHAIN_SCALE, _CHAIN_RAD = 0.003, np.radians(0.15)
-"""What the chain itself may err by."""
+"""Errors of the chain itself."""
 FEET_M = 0.3048
 _FIRSTS = 6
 """Readings that are tried as the first of two faults."""
 _HEIGHT_M = (0.8, 4.0)
-"""Of a LiDAR over the road."""
+"""Heights of a LiDAR over the road, metres."""
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 CANNOT_TELL = "without a turn this drive cannot decide whether"
 
@@ -73,7 +73,7 @@ class ChainFit:
     turn: Number
     pitch: Number
     length_m: float
-    """Of the chain, end to end."""
+    """Length of the chain, end to end."""
     rms_m: float
     """How far the prior strays from the chain once scale and turn are taken out."""
 
@@ -90,7 +90,7 @@ def agreement(e: DriveEvidence) -> tuple[list[Finding], F64 | None]:
 
 
 def check_attitude(e: DriveEvidence) -> Iterator[Finding]:
-    """What ``build`` would say too of a precise prior that agrees with the scans: it asks by the same function."""
+    """Findings on a precise prior that agrees with the scans; ``build`` uses the same function."""
     if e.T is not None and e.can_be_registered:
         wrong = wrong_attitude(e.drive, e.readable.tolist())
         if wrong is not None:
@@ -302,8 +302,8 @@ def _nothing_fits(as_it_is: _Fit, runs: Sequence[Run], length_m: float, prior_m:
 
 
 def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Finding]:
-    """Of poses T (n, 4, 4) that are right but for a little: scale, turn and pitch by the chain, the shift in time by
-    the runs as well. What is no larger than four standard errors cannot be decided: a note."""
+    """Findings on poses T (n, 4, 4) with small errors: scale, turn and pitch by the chain, the shift in time by the
+    runs as well. A deviation below four standard errors cannot be decided: a note."""
     chain, stamps_ns, sigma_m = e.chain.unbroken(), e.drive.stamps_ns, e.drive.prior_sigma_m
     if len(chain.indices) < len(e.chain.indices):  # though the runs fit by themselves
         before, scan = e.chain.indices[len(chain.indices) - 1 : len(chain.indices) + 1]
@@ -402,7 +402,7 @@ def _scatter(drive: Drive, as_it_is: _Fit, length_m: float) -> Iterator[Finding]
 
 
 def _cannot_tell(as_it_is: _Fit, fits: Sequence[_Fit], length_m: float, e: DriveEvidence) -> Iterator[Finding]:
-    """Readings that this drive would not betray. Of a mirror the way in which the points go round is a hint."""
+    """Readings that this drive would not betray. The direction in which the points go round is a hint of a mirror."""
     like = [h.reading for h in fits if h.special and not _worse(h, as_it_is, length_m)]
     if not like:
         return

@@ -69,16 +69,16 @@ _MOST_VOTES = 3
 """The fit used three vehicles: more of them count as three."""
 
 # By votes alone, of ballots that do not say how sure their vehicle is: of columns, and of older formats.
-_BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
-_DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
+_BUILT = (-0.78, 1.13, -0.01, 2.96)
+_DEMOLISHED = (-1.37, 1.15, -0.57, 3.18)
 """Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
 # By benchmarks/probability.py at 9f8814a, as are those below.
-_BUILT_SAID = np.array([0.752, 1.166])
-_DEMOLISHED_SAID = np.array([0.31, 1.012])
+_BUILT_SAID = (0.752, 1.166)
+_DEMOLISHED_SAID = (0.31, 1.012)
 """Log-odds of a cell of which they say that it is as likely as not; of each nat that they say."""
-_FALSE_DELETION = np.array([-9.03, 5.668])
+_FALSE_DELETION = (-9.03, 5.668)
 """Log-odds that something that stands goes with a cell beside which nothing stands; what a row of STANDING adds."""
-_FALSE_DELETION_SAID = np.array([-8.481, 5.043, -0.294])
+_FALSE_DELETION_SAID = (-8.481, 5.043, -0.294)
 """The same, and of a nat that they say."""
 STANDING = 3
 """Cells that stand beside one: so many are a row of a wall, before which noise put points; more add nothing."""

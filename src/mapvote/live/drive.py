@@ -131,7 +131,7 @@ class FirstSeconds:
         )
 
     def findings(self, vehicle: Vehicle, point_map: PointMap) -> list[Finding]:
-        """What shows in the scans themselves, and, if the vehicle finds no sure place, how they lie on the map."""
+        """Faults of the scans themselves and, if the vehicle finds no sure place, their fit to the map."""
         if self._looking is None:
             return []
         frame = vehicle.prior_frame
@@ -201,7 +201,7 @@ class LiveDrive:
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
         self.fixes: deque[Fixed] = deque(maxlen=_FIXES)
-        """Of the scans that voted last. Whoever publishes a fix removes it."""
+        """Fixes of the scans that voted last. The publisher of a fix removes it."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
@@ -217,7 +217,7 @@ class LiveDrive:
 
     @property
     def drive_id(self) -> str:
-        """Of the ballot that is open."""
+        """Identifier of the open ballot."""
         return stretch_name(self.name, self.number)
 
     @property

@@ -60,7 +60,7 @@ def prepare(
     """Take messages until sensor and mounts are known. Returns the scans and poses that arrived meanwhile: none if no
     cloud arrived for the idle time.
 
-    What is missing is said by ``voice``. MapvoteError if frames or odometry's mount are missing for the idle time.
+    ``voice`` reports missing topics. MapvoteError if frames or odometry's mount are missing for the idle time.
     """
     voice = voice or Voice(log.warning)
     scans: deque[list[Cloud]] = deque(maxlen=_KEPT_SCANS)
@@ -108,7 +108,7 @@ def _no_pose(topics: Subscriptions) -> str:
 
 
 def _lack(topics: Subscriptions, plan: Plan) -> str:
-    """What does not come of the clouds and frames that the drive needs, and what to type; "" if all is known."""
+    """The missing clouds and frames that the drive needs, and the option to type; "" if all is known."""
     silent = [one.topic for one, frame in zip(topics.chosen.points, topics.lidar_frames, strict=True) if not frame]
     if silent and topics.clouds == 0 and topics.last_unusable:
         return f"{silent[0]} sends nothing that can be used: {topics.last_unusable}"
@@ -215,7 +215,7 @@ def _upright(T_base_lidar: F64, topics: Subscriptions) -> F64:
 
 
 class Needs:
-    """What a drive on the road lacks."""
+    """Topics that a drive on the road lacks."""
 
     def __init__(self, plan: Plan, maps: Maps) -> None:
         self._plan = plan

@@ -50,8 +50,8 @@ _TOGETHER_NS = 500_000_000
 class Clocks:
     """Whether odometry and LiDAR share a clock: by the stamps of what they send, or of what arrives, at one time.
 
-    The smaller difference counts. What arrives together was not sent together if the process was busy. What was sent
-    at one time by two computers whose own clocks differ was not sent together either.
+    The smaller difference counts. Messages that arrive together were not sent together if the process was busy. Two
+    computers whose own clocks differ stamp messages of one moment differently.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Clocks:
         self.apart_ns = min(together, key=abs, default=self.apart_ns)
 
     def trouble(self) -> str:
-        """What is wrong if they are two clocks, else ""."""
+        """The fault if they are two clocks, else ""."""
         if abs(self.apart_ns) <= _OTHER_CLOCK_NS:
             return ""
         return (

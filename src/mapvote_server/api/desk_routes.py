@@ -55,7 +55,7 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
     the reasons to hold the version; the hashes of the tiles that a publish would make (null: without points), which
     `/v1/clouds` serves meanwhile.
 
-    As ``geojson`` or ``csv``: all of them in one list.
+    ``geojson`` and ``csv`` hold all of them in one list.
     """
     found = await _look(parts)
     left_out = [verdict_of(one) for one in found.reviewed]

@@ -1,7 +1,7 @@
-"""What votes say of cells: on one cell, each ballot and why it counted or not; on a tile, cell by cell.
+"""The votes on cells: on one cell, each ballot and why it counted or not; on a tile, cell by cell.
 
-What a version counted is read from its decision record (store/decisions.py). Only what the next version would count is
-decided here, of the one tile.
+The votes that a version counted are read from its decision record (store/decisions.py). Only the votes of the next
+version are decided here, for the one tile.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class _Now:
     asked: Electorate
     judged: Sequence[Judged]
     standings: Sequence[Standing]
-    """Of ``judged``, in the next version."""
+    """Reasons of ``judged``, in the next version."""
     said: Mapping[int, TileVote]
     """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
     decided: Decision

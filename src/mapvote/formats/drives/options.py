@@ -1,4 +1,4 @@
-"""What every drive format shares: drive.toml, ``--scans``, names, priors; and the making of a Drive from them."""
+"""Parts that every drive format shares: drive.toml, ``--scans``, names, priors; and the making of a Drive from them."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class SaidOfDrive(TypedDict, total=False):
 
 
 class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What the files of a drive cannot say themselves: drive.toml, in which every key is optional, and over it what the
-    caller says."""
+    """Facts that the files of a drive cannot state: drive.toml, in which every key is optional, and over it the
+    caller's arguments."""
 
     vehicle: str | None = None
     drive: str | None = None
@@ -93,7 +93,7 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def time_rules(self) -> TimeRules:
-        """What is said of the times of points."""
+        """The statements on the times of points."""
         rate = self.rate_hz is not None or (isinstance(self.sensor, dict) and "rate_hz" in self.sensor)
         return TimeRules(self.motion_compensated, self.time_field, self.time_unit, rate)
 
