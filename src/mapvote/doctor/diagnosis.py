@@ -16,6 +16,7 @@ import numpy as np
 from mapvote.codec.ballot import decode, is_ballot, unpack_states
 from mapvote.core.mount import mount_of_prior
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
 from mapvote.doctor import Finding, Progress, any_error, in_order
 from mapvote.doctor.bags import check_bag, check_lidars_of_bag
@@ -33,8 +34,20 @@ from mapvote.formats.registry import drive_format
 
 _CHANGED = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
 _DETERMINED = (CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY, *_CHANGED)
-_MOST_CHANGED = 0.2
-_SIGMA_M = 0.15
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class BallotCheck:
+    """Limits of a sound ballot."""
+
+    most_changed: float = 0.2
+    """Share of determined cells that are changed, at most."""
+    sigma_m: float = 0.15
+    """Median standard deviation of the poses, at most, metres."""
+
+
+BALLOT_CHECK = BallotCheck()
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +199,7 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     if not ballot.tiles:
         what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
         yield Finding("error", what, "see mapvote doctor DRIVE --map MAP")
-    elif determined and changed > _MOST_CHANGED * determined:
+    elif determined and changed > BALLOT_CHECK.most_changed * determined:
         what = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
         yield Finding("warning", what, "a lost vehicle, or the wrong map? Streets change by a few per cent")
     if ballot.end_ns <= ballot.start_ns:
@@ -194,7 +207,7 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     if ballot.scans_localised < 0.5 * ballot.scans:
         what = f"only {ballot.scans_localised} of {ballot.scans} scans were localised"
         yield Finding("warning", what, "is it the map of this street? mapvote doctor DRIVE --map MAP")
-    if ballot.median_sigma_m > _SIGMA_M:
+    if ballot.median_sigma_m > BALLOT_CHECK.sigma_m:
         what = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
         yield Finding("warning", what, "cells are 0.3 m: such votes blur")
     misfit_m, sigma_m = ballot.prior_misfit_m, ballot.prior_sigma_m

@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress
 from mapvote.doctor.scans import Looking, Looks
@@ -25,41 +26,97 @@ from mapvote.matching.prepare import thin_for_levels
 
 _UPS = {sign + axis: s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
-_NEAR_M = 15.0
-_ROAD_SHARE = 0.1
-"""A plane with fewer of a scan's near points than this is no road."""
-_UNSTEADY_M = 0.3
-_THICK_M = 0.12
-_DEPTH_M = (0.2, 12.0)
-_TRIES = 300
-_ROAD_SCANS = 7
-_RAYS = 500
-_BESIDE = 8
-_QUARTER = 0.3186
-"""A quarter of a normal distribution's absolute values is smaller than this many standard deviations."""
-_NEAREST_M, _FARTHEST_M = 3.0, 40.0
-_HALF_WINDOW_M = 60.0
-"""Half the side of the NDT map of a run, metres: its scans reach 50 m."""
-_RUNS, _SCANS, _ACROSS = 8, 11, 2
-"""Runs spread over a drive, scans of each, and runs across the places where scans differ most."""
-_CHAIN_SCANS = 150
-"""Scans of a chain: some 300 m."""
-_LOST_SCANS = 4
-"""A chain of no more has lost itself at its first step."""
-_STEP_M, _MOST_STEP = 2.5, 5
-"""Scans are left out of a run while consecutive ones stay this near."""
-_SPEEDS_M = (0.0, 0.8, 1.6, 2.6, 3.6, 4.6)
-_REACH_M = 50.0
-_GOOD_FIT = 0.7
-_STANDS_M = 0.4
-_REFINED = 4
-_ROUGH_M, _SCATTER_M = 0.12, 0.25
-"""Sound sensors show 0.02 to 0.04 m."""
-_HIGHEST_M = 4.5
-"""Largest height of a sensor over the road, metres."""
-_LEAST_FIT = 0.55
-"""Sound scans, a step apart, agree in .75 to .95 of their points; scans of different places in .2 to .5."""
-_BRAKES_MPS2 = 8.0
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class RoadSearch:
+    """Numbers of the search for the road in the points below the sensor."""
+
+    near_m: float = 15.0
+    """Distance from the sensor up to which points are used, metres."""
+    road_share: float = 0.1
+    """Share of the near points in a plane below which it is no road."""
+    unsteady_m: float = 0.3
+    """Scatter of the depth from scan to scan from which the plane is no road, metres."""
+    thick_m: float = 0.12
+    """Distance of a point from the plane up to which it lies in it, metres."""
+    depth_m: tuple[float, float] = (0.2, 12.0)
+    """Least and largest depth of a road below the sensor, metres."""
+    tries: int = 300
+    """Planes through three random points that are tried."""
+    scans: int = 7
+    """Scans in which the road is searched."""
+    highest_m: float = 4.5
+    """Largest height of a sensor over the road, metres."""
+
+
+ROAD_SEARCH = RoadSearch()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class RangeScatter:
+    """Numbers by which the scatter of ranges is measured."""
+
+    rays: int = 500
+    """Rays of a scan that are compared."""
+    beside: int = 8
+    """Neighbouring rays of each."""
+    quarter: float = 0.3186
+    """First quartile of a normal distribution's absolute values, standard deviations."""
+    nearest_m: float = 3.0
+    """Least range that is compared, metres."""
+    farthest_m: float = 40.0
+    """Largest range that is compared, metres."""
+    rough_m: float = 0.12
+    """Scatter of points about the road beyond which it is rough, metres."""
+    scatter_m: float = 0.25
+    """Largest scatter of a sound sensor's ranges, metres: they show 0.02 to 0.04 m."""
+
+
+RANGE_SCATTER = RangeScatter()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class RunRule:
+    """Numbers of the runs and chains of consecutive scans that are registered to each other."""
+
+    half_window_m: float = 60.0
+    """Half the side of the NDT map of a run, metres: its scans reach 50 m."""
+    runs: int = 8
+    """Runs that are spread over a drive."""
+    scans: int = 11
+    """Scans of each run."""
+    across: int = 2
+    """Runs across the places where scans differ most."""
+    chain_scans: int = 150
+    """Scans of a chain: some 300 m."""
+    lost_scans: int = 4
+    """Scans up to which a chain was lost at its first step."""
+    step_m: float = 2.5
+    """Motion between two scans of a run, metres: scans between them are left out."""
+    most_step: int = 5
+    """Scans to the next one of a run, at most."""
+    speeds_m: tuple[float, ...] = (0.0, 0.8, 1.6, 2.6, 3.6, 4.6)
+    """Motions from scan to scan that are tried at the start of a run, metres."""
+    reach_m: float = 50.0
+    """Range up to which points are used, metres."""
+    good_fit: float = 0.7
+    """Share of inliers from which the motion of the last scans is accepted as the guess."""
+    stands_m: float = 0.4
+    """Distance from the road beyond which a point stands on it, metres."""
+    refined: int = 4
+    """Guesses that are refined."""
+    least_fit: float = 0.55
+    """Share of inliers of a registered scan, at least. Sound scans, a step apart, agree in .75 to .95 of their points;
+    scans of different places in .2 to .5."""
+    brakes_mps2: float = 8.0
+    """Largest acceleration of a vehicle, metres per second squared."""
+
+
+RUN_RULE = RunRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +139,7 @@ class Road:
     @property
     def is_there(self) -> bool:
         """Whether it can be a road: some points lie in it, and as deep in every scan."""
-        return self.share >= _ROAD_SHARE and self.unsteady_m < _UNSTEADY_M
+        return self.share >= ROAD_SEARCH.road_share and self.unsteady_m < ROAD_SEARCH.unsteady_m
 
     @property
     def tilt_deg(self) -> float:
@@ -111,7 +168,7 @@ class Run:
 
     def unbroken(self) -> Run:
         """Up to the first scan that does not fit those before it."""
-        bad = np.flatnonzero(self.fit < _LEAST_FIT)
+        bad = np.flatnonzero(self.fit < RUN_RULE.least_fit)
         end = int(bad[0]) if len(bad) else len(self.fit)
         return Run(self.indices[:end], self.T_first_lidar[:end], self.fit[:end])
 
@@ -141,7 +198,7 @@ class DriveEvidence:
     @cached_property
     def some(self) -> I64:
         """A few of the readable scans, spread evenly."""
-        chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), _ROAD_SCANS)).astype(np.int64)
+        chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), ROAD_SEARCH.scans)).astype(np.int64)
         return self.readable[chosen]
 
     def _points(self, i: int) -> F32:
@@ -179,8 +236,8 @@ class DriveEvidence:
         """Runs spread over the drive, then those across the places where scans differ most, which show whether the
         scans are in order. Chosen for being odd, the latter are no measure of the prior."""
         n = len(self.readable)
-        across = np.argsort(self.looks.leaps, kind="stable")[-_ACROSS:] - _SCANS // 2
-        odd = np.unique(np.clip(across, 0, max(0, n - _SCANS)))
+        across = np.argsort(self.looks.leaps, kind="stable")[-RUN_RULE.across :] - RUN_RULE.scans // 2
+        odd = np.unique(np.clip(across, 0, max(0, n - RUN_RULE.scans)))
         starts = dict.fromkeys([*self._starts.tolist(), *odd.tolist()])
         found = []
         for k, start in enumerate(starts):
@@ -197,28 +254,28 @@ class DriveEvidence:
     @cached_property
     def _starts(self) -> I64:
         """First scans of runs spread evenly over the drive, half of them where the prior turns most."""
-        n, span = len(self.readable), _SCANS + 2 * _MOST_STEP
+        n, span = len(self.readable), RUN_RULE.scans + 2 * RUN_RULE.most_step
         if n <= span:
             return np.zeros(1, dtype=np.int64)
-        even = np.linspace(0, n - span, min(_RUNS, max(1, n // _SCANS))).astype(np.int64)
-        if self.T is None or len(even) < _RUNS:
+        even = np.linspace(0, n - span, min(RUN_RULE.runs, max(1, n // RUN_RULE.scans))).astype(np.int64)
+        if self.T is None or len(even) < RUN_RULE.runs:
             return np.unique(even)
         R = self.T[self.readable, :3, :3]
         candidates = np.arange(0, n - span, max(1, span // 2))
         turned = [-np.trace(R[i].T @ R[i + span]) for i in candidates]
-        most = candidates[np.argsort(np.array(turned), kind="stable")[::-1][: _RUNS // 2]]
+        most = candidates[np.argsort(np.array(turned), kind="stable")[::-1][: RUN_RULE.runs // 2]]
         return np.unique(np.concatenate([most, even[::2]]))
 
     @cached_property
     def chain(self) -> Run:
         """A long run, from the first scans that it can begin with: its first step tries every way and speed, and may
         find a wrong one; the next scan then does not fit, though nothing is wrong with the drive."""
-        run = self._follow(0, _CHAIN_SCANS)
-        for start in (_LOST_SCANS, 2 * _LOST_SCANS):
+        run = self._follow(0, RUN_RULE.chain_scans)
+        for start in (RUN_RULE.lost_scans, 2 * RUN_RULE.lost_scans):
             fitting = len(run.unbroken().indices)
-            if fitting > _LOST_SCANS or fitting == len(run.indices):
+            if fitting > RUN_RULE.lost_scans or fitting == len(run.indices):
                 break
-            run = self._follow(start, _CHAIN_SCANS)
+            run = self._follow(start, RUN_RULE.chain_scans)
         return run
 
     @cached_property
@@ -226,9 +283,9 @@ class DriveEvidence:
         """Faults of the scans' own motion; while there is any, a prior cannot be compared with it."""
         return list(_check_motion(self.every_run, self.drive)) if self.can_be_registered else []
 
-    def _follow(self, start: int, scans: int = _SCANS) -> Run:
+    def _follow(self, start: int, scans: int = RUN_RULE.scans) -> Run:
         """The run of at most ``scans`` scans that begins at readable scan ``start``."""
-        ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=_HALF_WINDOW_M))
+        ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=RUN_RULE.half_window_m))
         ndt_map.enter(_near(self._points(self.readable[start])))
         indices, poses, fits = [start], [np.eye(4)], [1.0]
         i, step = start, 1
@@ -244,7 +301,7 @@ class DriveEvidence:
                 ndt_map.recentre(position)
             ndt_map.enter(transform(found.T_map_lidar, clouds[-1].T))
             a_scan_m = float(np.linalg.norm((inverse(poses[-2]) @ poses[-1])[:3, 3])) / (indices[-1] - indices[-2])
-            step = 1 if len(indices) < 3 else int(np.clip(_STEP_M / max(a_scan_m, 0.01), 1, _MOST_STEP))
+            step = 1 if len(indices) < 3 else int(np.clip(RUN_RULE.step_m / max(a_scan_m, 0.01), 1, RUN_RULE.most_step))
         return Run(self.readable[indices], np.array(poses), np.array(fits))
 
 
@@ -253,12 +310,12 @@ def find_road(scans: Sequence[F32]) -> Road:
     near = []
     for scan in scans:
         away = np.linalg.norm(scan, axis=1)
-        points = scan[(away < _NEAR_M) & (away > 2.0)].astype(np.float64)
+        points = scan[(away < ROAD_SEARCH.near_m) & (away > 2.0)].astype(np.float64)
         near.append(points[:: max(1, len(points) // 3000)])
     planes = [_best_planes(points, np.random.default_rng(k)) for k, points in enumerate(near)]
     share = {name: float(np.mean([one[name][0] for one in planes])) for name in _UPS}
     best = max(share, key=lambda name: share[name])
-    if share[best] < max(1.5 * share["+z"], _ROAD_SHARE):
+    if share[best] < max(1.5 * share["+z"], ROAD_SEARCH.road_share):
         best = "+z"
     fitted = [_fitted(points, *one[best][1:]) for points, one in zip(near, planes, strict=True)]
     normal = np.median([normal for normal, _, _ in fitted], axis=0)
@@ -275,7 +332,7 @@ def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float
     out: dict[str, tuple[float, F64, float]] = {name: (0.0, up, 0.0) for name, up in _UPS.items()}
     if len(points) < 30:
         return out
-    a, b, c = (points[rng.integers(0, len(points), _TRIES)] for _ in range(3))
+    a, b, c = (points[rng.integers(0, len(points), ROAD_SEARCH.tries)] for _ in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 1e-3] / length[length > 1e-3, None]
@@ -283,9 +340,9 @@ def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float
     normals, depth = normals * np.sign(depth)[:, None], np.abs(depth)  # towards the sensor
     for normal, d in zip(normals, depth, strict=True):
         axis = int(np.argmax(np.abs(normal)))
-        if not _DEPTH_M[0] <= d <= _DEPTH_M[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
+        if not ROAD_SEARCH.depth_m[0] <= d <= ROAD_SEARCH.depth_m[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
             continue
-        share = float((np.abs(points @ normal + d) < _THICK_M).mean())
+        share = float((np.abs(points @ normal + d) < ROAD_SEARCH.thick_m).mean())
         name = ("+" if normal[axis] > 0 else "-") + "xyz"[axis]
         if share > out[name][0]:
             out[name] = (share, normal, float(d))
@@ -296,7 +353,7 @@ def _fitted(points: F64, normal: F64, depth_m: float) -> tuple[F64, float, float
     """(normal, depth, robust scatter) of the plane fitted to the points near a first guess of it, twice."""
     scatter = 0.0
     for _ in range(2):
-        p = points[np.abs(points @ normal + depth_m) < 3.0 * _THICK_M]
+        p = points[np.abs(points @ normal + depth_m) < 3.0 * ROAD_SEARCH.thick_m]
         if len(p) < 50:
             return normal, depth_m, 0.0
         centre = p.mean(axis=0)
@@ -314,23 +371,23 @@ def _range_scatter_m(points: F32) -> float:
     leaves scatter without being wrong, so the better quarter of the rays is taken for all.
     """
     length = np.linalg.norm(points, axis=1).astype(np.float64)
-    inside = (length > _NEAREST_M) & (length < _FARTHEST_M)
-    if inside.sum() < 20 * _BESIDE:
+    inside = (length > RANGE_SCATTER.nearest_m) & (length < RANGE_SCATTER.farthest_m)
+    if inside.sum() < 20 * RANGE_SCATTER.beside:
         return 0.0
     length, direction = length[inside], points[inside] / length[inside, None]
-    chosen = np.linspace(0, len(length) - 1, _RAYS).astype(np.int64)
-    beside = scipy.spatial.cKDTree(direction).query(direction[chosen], k=_BESIDE + 1)[1][:, 1:]
+    chosen = np.linspace(0, len(length) - 1, RANGE_SCATTER.rays).astype(np.int64)
+    beside = scipy.spatial.cKDTree(direction).query(direction[chosen], k=RANGE_SCATTER.beside + 1)[1][:, 1:]
     plane = np.linalg.pinv(direction[beside]) @ (1.0 / length[beside])[:, :, None]
     inverse_range = (direction[chosen][:, None, :] @ plane)[:, 0, 0]
     off = np.abs(1.0 / np.maximum(inverse_range, 1e-3) - length[chosen])
-    return float(np.quantile(off, 0.25)) / _QUARTER
+    return float(np.quantile(off, 0.25)) / RANGE_SCATTER.quarter
 
 
 def _near(points: F32) -> F32:
     squared = np.einsum("ij,ij->i", points, points)
-    middle = np.median(points, axis=0) if np.median(squared) > _REACH_M**2 else np.zeros(3, dtype=np.float32)
+    middle = np.median(points, axis=0) if np.median(squared) > RUN_RULE.reach_m**2 else np.zeros(3, dtype=np.float32)
     offset = points - middle
-    near: F32 = points[np.einsum("ij,ij->i", offset, offset) < _REACH_M**2]
+    near: F32 = points[np.einsum("ij,ij->i", offset, offset) < RUN_RULE.reach_m**2]
     return near
 
 
@@ -340,13 +397,13 @@ def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Ro
     Only objects on the road distinguish guesses: the sensor's rings on it fit best where nothing has moved.
     """
     found = ndt_map.refine(clouds, guesses[0])
-    if len(guesses) == 2 and found.inlier_share >= _GOOD_FIT:
+    if len(guesses) == 2 and found.inlier_share >= RUN_RULE.good_fit:
         return found
-    stands = [np.abs(road.normal @ cloud + road.depth_m) > _STANDS_M for cloud in clouds]
+    stands = [np.abs(road.normal @ cloud + road.depth_m) > RUN_RULE.stands_m for cloud in clouds]
     standing = [np.ascontiguousarray(cloud[:, high]) for cloud, high in zip(clouds, stands, strict=True)]
     tried = [
         found,
-        *(ndt_map.refine(clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, _REFINED, 800)),
+        *(ndt_map.refine(clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, RUN_RULE.refined, 800)),
     ]
     return max(tried, key=lambda one: likelihood_at(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
 
@@ -361,16 +418,16 @@ def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]
     across = np.linalg.svd(up[None, :])[2][1:]
     angles = np.arange(16) * (np.pi / 8.0)
     ways = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
-    return [from_xyz_rpy(*(speed * way)) for speed in _SPEEDS_M for way in ways]
+    return [from_xyz_rpy(*(speed * way)) for speed in RUN_RULE.speeds_m for way in ways]
 
 
 def check_ranges(e: DriveEvidence) -> Iterator[Finding]:
     """Do ranges scatter more than a sound sensor's?"""
-    if len(e.readable) > 2 and e.scatter_m > _SCATTER_M:
+    if len(e.readable) > 2 and e.scatter_m > RANGE_SCATTER.scatter_m:
         what = f"ranges scatter by {e.scatter_m:.2f} m against those of the rays beside them"
         what += " (sound sensors: 0.01 to 0.04 m)"
         mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
-        yield Finding("error" if e.scatter_m > 2.0 * _SCATTER_M else "warning", what, mend)
+        yield Finding("error" if e.scatter_m > 2.0 * RANGE_SCATTER.scatter_m else "warning", what, mend)
 
 
 def check_road(e: DriveEvidence) -> Iterator[Finding]:
@@ -388,7 +445,7 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
         mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
         yield Finding("error", what, mend)
         return
-    if not road.is_there or (road.scatter_m > _ROUGH_M and e.scatter_m <= _SCATTER_M):
+    if not road.is_there or (road.scatter_m > RANGE_SCATTER.rough_m and e.scatter_m <= RANGE_SCATTER.scatter_m):
         what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
         what += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
         yield Finding("warning", what, "are the lower beams missing, the points cut, or z measured from elsewhere?")
@@ -397,7 +454,7 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     if road.depth_m < 0.5:
         what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
         yield Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's")
-    if road.depth_m > _HIGHEST_M:
+    if road.depth_m > ROAD_SEARCH.highest_m:
         what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
         mend = (
             f"multiply their points by 0.3048 if they are feet (the road then lies {0.3048 * road.depth_m:.1f} m below)"
@@ -417,7 +474,7 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
 def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
     """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
     stamps_ns, times = drive.stamps_ns, source_of_times(drive.path)
-    broken = [run for run in runs if run.usual_fit < _LEAST_FIT]
+    broken = [run for run in runs if run.usual_fit < RUN_RULE.least_fit]
     leaps = np.concatenate([~_agree_with_time(run, stamps_ns) for run in runs])
     speed = [run.length_m / (1e-9 * float(np.diff(stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
     mend = f"are the scans in order of time ({times}), of one drive, and whole?"
@@ -443,5 +500,5 @@ def _agree_with_time(run: Run, stamps_ns: I64) -> Bool:
     seconds = np.diff(stamps_ns[run.indices]) * 1e-9
     velocity = np.diff(run.T_first_lidar[:, :3, 3], axis=0) / seconds[:, None]
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    out: Bool = change < 1.0 + _BRAKES_MPS2 * 0.5 * (seconds[1:] + seconds[:-1])
+    out: Bool = change < 1.0 + RUN_RULE.brakes_mps2 * 0.5 * (seconds[1:] + seconds[:-1])
     return out

@@ -18,6 +18,7 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, cut_tiles
+from mapvote.core.record import record
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
@@ -32,26 +33,54 @@ from mapvote.matching.pose_check import POSE_CHECK, Judge
 from mapvote.matching.prepare import deskew, motion_at, solid_sample, thin_for_levels
 
 Step = TypeVar("Step")
-_PLACES = 6
-_SEARCHED = 4
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class MapFitRule:
+    """Numbers of the comparison of a drive's prior with a map."""
+
+    places: int = 6
+    """Scans along the drive that are compared."""
+    searched: int = 4
+    """Scans that are searched for around the prior."""
+    turn_deg: float = 0.5
+    """Yaw between prior and map that is reported, degrees."""
+    tilt_deg: float = 1.5
+    """Tilt between prior and map that is reported, degrees."""
+    scale: float = 0.01
+    """Deviation of the scale that is reported."""
+    position_m: float = 0.03
+    """Position error of one registration, metres; it weighs positions against rotations."""
+    rotation_rad: float = np.radians(0.15)
+    """Rotation error of one registration, radians."""
+    points_scale: float = 0.002
+    """Error of the scale that points show."""
+    shift_sigmas: float = 3.0
+    """Standard deviations of the prior, as drive.toml states them, that explain a shift of three axes."""
+    turn_sigmas: float = 2.5
+    """Standard deviations of the prior that explain a turn."""
+    unknown_scale: float = 0.01
+    """Error of the scale where points do not show it, as on drives that are too short."""
+    ranked: int = 3
+    """Guesses that are refined."""
+    unit_scans: int = 3
+    """Scans registered in another scale or unit, to choose one."""
+    sensor_m: float = 2.0
+    """Usual height of a sensor over the road, metres."""
+    around_m: float = 120.0
+    """Surroundings of the drive that are used, metres: the range of its scans, and then some."""
+    fewest: int = 1000
+    """Points of a map around a drive, at least."""
+
+
+MAP_FIT_RULE = MapFitRule()
 _MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
-_TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
-_POSITION_M, _ROTATION_RAD = 0.03, np.radians(0.15)
-"""Errors of one registration; they weigh positions against rotations."""
-_POINTS_SCALE = 0.002
-"""Error of the scale that points show."""
-_SHIFT_SIGMAS, _TURN_SIGMAS = 3.0, 2.5
-"""Errors of the prior, as drive.toml states them: a shift (of three axes) or a turn of no more may be them."""
-_UNKNOWN_SCALE = 0.01
-"""Error of the scale where points do not show it, as on drives that are too short."""
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
 _YAWS = np.radians([0.0, -3.0, 3.0])
-_RANKED = 3
 _FINER = 0.01
 _SCALES = 1.0 + _FINER * np.arange(-9, 10)
 """A scan fits at no more than one step beside the right one."""
-_LOOKED_AT = 3
-"""Scans registered in another scale or unit, to choose one."""
 _FEET_M = 0.3048
 _BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
 _UNITS = (
@@ -61,12 +90,6 @@ _UNITS = (
     ("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
 )  # fmt: skip
 """Units that the map's numbers may have instead of metres: (name, metres, mend)."""
-_SENSOR_M = 2.0
-"""Height of a sensor over the road, about."""
-_AROUND_M = 120.0
-"""Surroundings of the drive, metres: the range of its scans, and then some."""
-_FEWEST = 1000
-"""Points of a map around a drive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +128,7 @@ class MapEvidence:
     def scans(self) -> dict[int, Scan]:
         """Along the drive, by their numbers; de-skewed by the prior's motion."""
         out = {}
-        for i in np.unique(np.linspace(0, len(self.drive) - 1, _PLACES).astype(np.int64)).tolist():
+        for i in np.unique(np.linspace(0, len(self.drive) - 1, MAP_FIT_RULE.places).astype(np.int64)).tolist():
             scan = self.drive.read_scan(i)
             points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
             out[i] = Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))
@@ -151,7 +174,7 @@ def check_on_map(
     for i in e.told("registering to the map", e.scans):
         places += e.places({i: _on_ground(T[i], point_map, depth_m)})
     scale, scale_sigma = _scale_by_points(e, places)
-    if abs(scale - 1.0) > 0.5 * _SCALE:
+    if abs(scale - 1.0) > 0.5 * MAP_FIT_RULE.scale:
         better = e.places({p.index: [p.T_map_lidar, e.scaled(p.index, scale)] for p in places}, scale=scale)
         if sum(p.fit for p in fitting(better)) > 1.2 * sum(p.fit for p in fitting(places)):
             places = better
@@ -176,9 +199,9 @@ def check_on_map(
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
         np.array([p.T_map_lidar for p in good]),
-        position_m=float(np.hypot(_POSITION_M, drive.prior_sigma_m)),
-        rotation_rad=float(np.hypot(_ROTATION_RAD, np.radians(drive.prior_sigma_deg))),
-        scale=(scale, scale_sigma) if np.isfinite(scale_sigma) else (1.0, _UNKNOWN_SCALE),
+        position_m=float(np.hypot(MAP_FIT_RULE.position_m, drive.prior_sigma_m)),
+        rotation_rad=float(np.hypot(MAP_FIT_RULE.rotation_rad, np.radians(drive.prior_sigma_deg))),
+        scale=(scale, scale_sigma) if np.isfinite(scale_sigma) else (1.0, MAP_FIT_RULE.unknown_scale),
     )
     mended = fit.applied(T)
     differs = _differs(fit, len(good), drive)
@@ -208,7 +231,7 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
     off = np.abs(np.array(peaks) - scale)
     if (off > 0.5 * _FINER).mean() > 0.5:
         return 1.0, float("inf")
-    return scale, max(_POINTS_SCALE, 1.4826 * float(np.median(off)) / np.sqrt(len(peaks)))
+    return scale, max(MAP_FIT_RULE.points_scale, 1.4826 * float(np.median(off)) / np.sqrt(len(peaks)))
 
 
 def in_another_unit(e: MapEvidence) -> Finding | None:
@@ -217,8 +240,8 @@ def in_another_unit(e: MapEvidence) -> Finding | None:
 
     The map's points are made metres, not the scans feet: voxels have the size that suits points in metres.
     """
-    some = list(e.scans)[:: max(1, len(e.scans) // _LOOKED_AT)][:_LOOKED_AT]
-    centres = np.zeros(3), _middle(e.point_map), e.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, _SENSOR_M]
+    some = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.unit_scans)][: MAP_FIT_RULE.unit_scans]
+    centres = np.zeros(3), _middle(e.point_map), e.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, MAP_FIT_RULE.sensor_m]
     for name, in_metres, mend in e.told("trying other units", _UNITS):
         for centre in centres:
             metres = _in_metres(e.point_map, in_metres, centre, e.T)
@@ -240,13 +263,13 @@ def _middle(point_map: PointMap) -> F64:
 
 def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointMap | None:
     """Its points around the drive, ``scale`` times as large about ``centre``; None if there are hardly any."""
-    low, high = T[:, :2, 3].min(axis=0) - _AROUND_M, T[:, :2, 3].max(axis=0) + _AROUND_M
+    low, high = T[:, :2, 3].min(axis=0) - MAP_FIT_RULE.around_m, T[:, :2, 3].max(axis=0) + MAP_FIT_RULE.around_m
     parts = []
     for tile in point_map.tiles.values():
         points = centre + scale * (tile.points_map - centre)
         parts.append(points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)])
     points = np.concatenate([np.empty((0, 3)), *parts])
-    if len(points) < _FEWEST:
+    if len(points) < MAP_FIT_RULE.fewest:
         return None
     lattice = Lattice()
     tiles = {}
@@ -259,7 +282,7 @@ def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointM
 def _searched(e: MapEvidence) -> tuple[list[Place], int]:
     """(the places under the difference that suits most of them, how many scans fit mirrored where none fits so)."""
     search = GlobalSearch(e.point_map, NdtSettings(), e.drive.sensor.range_sigma_m)
-    chosen = list(e.scans)[:: max(1, len(e.scans) // _SEARCHED)][:_SEARCHED]
+    chosen = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.searched)][: MAP_FIT_RULE.searched]
     best: list[Place] = []
     mirrored = 0
     for i in e.told("searching the map", chosen):
@@ -302,7 +325,7 @@ def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], ju
                 break
             beside = [from_xyz_rpy(x, y, 0.0) @ guess for x in _OFFSETS_M for y in _OFFSETS_M]
             grid = [T @ from_xyz_rpy(0, 0, 0, yaw=yaw) for T in beside for yaw in _YAWS]
-            starts = likeliest(ndt_map, clouds[0], grid, _RANKED, 500)
+            starts = likeliest(ndt_map, clouds[0], grid, MAP_FIT_RULE.ranked, 500)
     return best
 
 
@@ -374,10 +397,24 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     scale = f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})"
     # by how much; what is worth a word; its standard error; what the prior's stated errors explain; what is an error
     rows = [
-        (shift, off_m, 0.15, 0.75 * d.sigma_m, _SHIFT_SIGMAS * sigma_m, max(0.3, 4.0 * sigma_m)),
-        (yaw, abs(yaw_deg), _TURN_DEG, d.yaw_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
-        (tilt, tilt_deg, _TILT_DEG, d.tilt_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
-        (scale, abs(d.scale - 1.0), _SCALE, d.scale_sigma, 0.0, 0.0),
+        (shift, off_m, 0.15, 0.75 * d.sigma_m, MAP_FIT_RULE.shift_sigmas * sigma_m, max(0.3, 4.0 * sigma_m)),
+        (
+            yaw,
+            abs(yaw_deg),
+            MAP_FIT_RULE.turn_deg,
+            d.yaw_sigma_deg,
+            MAP_FIT_RULE.turn_sigmas * sigma_deg,
+            2.0 * MAP_FIT_RULE.turn_deg,
+        ),
+        (
+            tilt,
+            tilt_deg,
+            MAP_FIT_RULE.tilt_deg,
+            d.tilt_sigma_deg,
+            MAP_FIT_RULE.turn_sigmas * sigma_deg,
+            2.0 * MAP_FIT_RULE.tilt_deg,
+        ),
+        (scale, abs(d.scale - 1.0), MAP_FIT_RULE.scale, d.scale_sigma, 0.0, 0.0),
     ]
     surely = [(words, by, error) for words, by, least, s, within, error in rows if by > max(least, 4.0 * s, within)]
     if not surely:

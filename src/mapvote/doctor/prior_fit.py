@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from mapvote.core.geometry import poses_at
+from mapvote.core.record import record
 from mapvote.core.types import F64, Drive
 from mapvote.doctor import Finding, Reading, Severity
 from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
@@ -37,15 +38,28 @@ from mapvote.doctor.prior import (
 )
 from mapvote.survey.driven_road import wrong_attitude
 
-_POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
-"""Errors of a prior's pose against a chain: they weigh positions against rotations."""
-_CHAIN_SCALE, _CHAIN_RAD = 0.003, np.radians(0.15)
-"""Errors of the chain itself."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PriorFitRule:
+    """Errors and numbers of the comparison of a prior with chains and runs of scans."""
+
+    position_m: float = 0.15
+    """Position error of a prior's pose against a chain, metres; it weighs positions against rotations."""
+    rotation_rad: float = np.radians(0.25)
+    """Rotation error of a prior's pose against a chain, radians."""
+    chain_scale: float = 0.003
+    """Error of a chain's scale."""
+    chain_rad: float = np.radians(0.15)
+    """Error of a chain's heading, radians."""
+    firsts: int = 6
+    """Readings that are tried as the first of two faults."""
+    height_m: tuple[float, float] = (0.8, 4.0)
+    """Least and largest height of a LiDAR over the road, metres."""
+
+
+PRIOR_FIT_RULE = PriorFitRule()
 FEET_M = 0.3048
-_FIRSTS = 6
-"""Readings that are tried as the first of two faults."""
-_HEIGHT_M = (0.8, 4.0)
-"""Heights of a LiDAR over the road, metres."""
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 CANNOT_TELL = "without a turn this drive cannot decide whether"
 
@@ -147,7 +161,7 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
 def _two_at_once(T: F64, fits: Sequence[_Fit], runs: Sequence[Run], road: Road) -> tuple[_Fit, _Fit] | None:
     """The two readings, the second of a prior mended by the first, that leave least of the motion unexplained."""
     pairs = []
-    for one in sorted(fits, key=lambda h: h.median)[:_FIRSTS]:
+    for one in sorted(fits, key=lambda h: h.median)[: PRIOR_FIT_RULE.firsts]:
         mended = one.reading.poses(T)
         if one.reading.catch_all or np.linalg.det(mended[0, :3, :3]) < 0:
             continue
@@ -217,7 +231,7 @@ def _for_a_map(group: Sequence[_Fit], fits: Sequence[_Fit], as_it_is: _Fit, T: F
     for h in [*group, *others]:
         poses = h.reading.poses(T)
         alike = any(np.allclose(poses, one.poses(T), atol=1e-6) for one in out)
-        if not alike and len(out) < _FIRSTS + len(group):
+        if not alike and len(out) < PRIOR_FIT_RULE.firsts + len(group):
             out.append(h.reading)
     return tuple(out)
 
@@ -257,7 +271,7 @@ def _unit_near(m: Number) -> float:
 
 def _scale_words(m: Number, road: Road) -> tuple[str, str]:
     """Which side has the wrong scale shows by the sensor's height over the road."""
-    low, high = _HEIGHT_M
+    low, high = PRIOR_FIT_RULE.height_m
     size = f"{m.value:.3f} times (+-{m.sigma:.3f})" if 0.1 < m.value < 10 else f"{m.value:.3g} times"
     usual, other = low <= road.depth_m <= high, low <= road.depth_m * m.value <= high
     unit = _unit_near(m)
@@ -343,15 +357,23 @@ def fit_to_chain(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> ChainFit | N
     reach_m, extent_m = float(np.sqrt((away**2).sum(axis=1).mean())), float(np.linalg.norm(np.ptp(away, axis=0)))
     if reach_m < 1.0:
         return None
-    fit = fit_similarity(seen, T[chain.indices], position_m=_POSITION_M, rotation_rad=_ROTATION_RAD, own_turn=True)
+    fit = fit_similarity(
+        seen,
+        T[chain.indices],
+        position_m=PRIOR_FIT_RULE.position_m,
+        rotation_rad=PRIOR_FIT_RULE.rotation_rad,
+        own_turn=True,
+    )
     strays = float(np.linalg.norm(fit.off_m, axis=1).mean()) / reach_m
     share = float(np.hypot(strays, np.sqrt(2.0) * prior_sigma_m / extent_m))
     own = scipy.spatial.transform.Rotation.from_euler("zy", fit.own_deg, degrees=True)
     back = turned(poses_at([np.zeros(3)], own.inv().as_matrix())[0])
     yaw_deg, pitch_deg = fit.own_deg
-    sigma_deg = float(np.degrees(np.hypot(share, _CHAIN_RAD)))
+    sigma_deg = float(np.degrees(np.hypot(share, PRIOR_FIT_RULE.chain_rad)))
     return ChainFit(
-        Number("scale", fit.scale, fit.scale * float(np.hypot(share, _CHAIN_SCALE)), scaled(1.0 / fit.scale)),
+        Number(
+            "scale", fit.scale, fit.scale * float(np.hypot(share, PRIOR_FIT_RULE.chain_scale)), scaled(1.0 / fit.scale)
+        ),
         Number("turn", yaw_deg, sigma_deg, back),
         Number("pitch", -pitch_deg, sigma_deg, back),
         float(np.linalg.norm(seen[-1, :3, 3])),

@@ -28,6 +28,7 @@ from mapvote.codec.ballot import UNSAID, Odds, changed_cells_of, in_nats, pack_o
 from mapvote.codec.planes import unpack_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.record import record
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.fusion.tile_vote import TileVote
 
@@ -65,21 +66,33 @@ def unpack_agreed(data: bytes | None, states: U8) -> Odds:
     return Odds.none() if data is None else Odds(cells, unpack_plane(data, "<i1", (len(cells),), "decision: odds"))
 
 
-_MOST_VOTES = 3
-"""The fit used three vehicles: more of them count as three."""
+@record()
+@dataclass(frozen=True, slots=True)
+class HarmCurves:
+    """Coefficients of the logistic curves (docs/measurements/probability.md)."""
+
+    most_votes: int = 3
+    """Votes up to which more of them count: the fit used three vehicles."""
+    built: tuple[float, ...] = (-0.78, 1.13, -0.01, 2.96)
+    """Log-odds of a lone built cell with two votes for it and none against; of a third vote; of one against; of eight
+    such cells around."""
+    demolished: tuple[float, ...] = (-1.37, 1.15, -0.57, 3.18)
+    """The same of a demolished cell."""
+    built_stated: tuple[float, float] = (0.752, 1.166)
+    """Log-odds of a built cell with the stated probability 1/2; of each stated nat."""
+    demolished_stated: tuple[float, float] = (0.31, 1.012)
+    """The same of a demolished cell."""
+    false_deletion: tuple[float, float] = (-9.03, 5.668)
+    """Log-odds that a deleted point lies on a standing surface if no cell beside it stands; of a row of ``STANDING``
+    cells."""
+    false_deletion_stated: tuple[float, float, float] = (-8.481, 5.043, -0.294)
+    """The same, and of each stated nat."""
+
+
+HARM_CURVES = HarmCurves()
 
 # By votes alone, of ballots that do not say how sure their vehicle is: of columns, and of older formats.
-_BUILT = (-0.78, 1.13, -0.01, 2.96)
-_DEMOLISHED = (-1.37, 1.15, -0.57, 3.18)
-"""Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
 # By benchmarks/probability.py at 9f8814a, as are those below.
-_BUILT_SAID = (0.752, 1.166)
-_DEMOLISHED_SAID = (0.31, 1.012)
-"""Log-odds of a cell of which they say that it is as likely as not; of each nat that they say."""
-_FALSE_DELETION = (-9.03, 5.668)
-"""Log-odds that something that stands goes with a cell beside which nothing stands; what a row of STANDING adds."""
-_FALSE_DELETION_SAID = (-8.481, 5.043, -0.294)
-"""The same, and of a nat that they say."""
 STANDING = 3
 """Cells that stand beside one: so many are a row of a wall, before which noise put points; more add nothing."""
 
@@ -91,12 +104,12 @@ def change_probability(
     it, votes against it (not: undetermined), how many of the eight cells around changed likewise, and the confidence,
     UNSAID where none is stated; (n,) each."""
     built = (states == CellState.CHANGED_OCCUPIED)[:, None]
-    more = np.minimum(votes, _MOST_VOTES) - 2.0
+    more = np.minimum(votes, HARM_CURVES.most_votes) - 2.0
     told = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
-    alone = (np.where(built, _BUILT, _DEMOLISHED) * told).sum(axis=1)
+    alone = (np.where(built, HARM_CURVES.built, HARM_CURVES.demolished) * told).sum(axis=1)
     if odds is None:
         return _logistic(alone)
-    curve = np.where(built, _BUILT_SAID, _DEMOLISHED_SAID)
+    curve = np.where(built, HARM_CURVES.built_stated, HARM_CURVES.demolished_stated)
     return _logistic(np.where(odds == UNSAID, alone, curve[:, 0] + curve[:, 1] * in_nats(odds)))
 
 
@@ -104,8 +117,8 @@ def false_deletion_probability(standing: I32 | I64, odds: I8) -> F64:
     """(n,) probability that emptying cells decided changed-empty deletes something that still stands: by how many of
     the eight cells around are decided to stand, and the confidence, UNSAID where none is stated; (n,) each."""
     row = np.minimum(standing, STANDING) / STANDING
-    alone = _FALSE_DELETION[0] + _FALSE_DELETION[1] * row
-    curve = _FALSE_DELETION_SAID
+    alone = HARM_CURVES.false_deletion[0] + HARM_CURVES.false_deletion[1] * row
+    curve = HARM_CURVES.false_deletion_stated
     return _logistic(np.where(odds == UNSAID, alone, curve[0] + curve[1] * row + curve[2] * in_nats(odds)))
 
 

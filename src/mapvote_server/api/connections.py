@@ -3,7 +3,7 @@
 uvicorn limits only the pause between two requests. :class:`Connection` stands between the socket and uvicorn's
 protocol. It uses the interface of :class:`asyncio.Protocol`, and asks h11 what came after a request. :func:`tracked`
 calls it when a request begins and ends. h11 limits what uvicorn keeps of an unfinished event (heads, chunk lines,
-trailers) to :data:`HEAD_BYTES`, too.
+trailers) to ``HeadLimits.head_bytes``, too.
 
 Requests are parsed in one thread, so their order decides who waits. A request that came before the answer to the one
 before it (pipelining) is not read: its connection is closed after that answer, as RFC 9112, 9.3.2 lets a server do.
@@ -26,9 +26,19 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from mapvote.core.record import record
 from mapvote_server.errors import Unavailable
 
-HEAD_BYTES = 32_000
-"""A request's line and headers."""
-_LINGER_S = 1.0
+
+@record()
+@dataclass(frozen=True, slots=True)
+class HeadLimits:
+    """Limits of one connection."""
+
+    head_bytes: int = 32_000
+    """Bytes of a request's line and headers."""
+    linger_s: float = 1.0
+    """Time for which bytes after a refusal are discarded, seconds."""
+
+
+HEAD_LIMITS = HeadLimits()
 _END_OF_HEAD = re.compile(rb"\n\r?\n")
 _BARE_LINE_END = re.compile(rb"(?<!\r)\n")
 _LENGTHS = b"\r\ncontent-length:", b"\r\ntransfer-encoding:"
@@ -205,9 +215,9 @@ class Connection(asyncio.Protocol):
             return
         if self._head is not None:
             self._head += data
-            end = _END_OF_HEAD.search(self._head, 0, HEAD_BYTES)
+            end = _END_OF_HEAD.search(self._head, 0, HEAD_LIMITS.head_bytes)
             fault = _fault_of(bytes(self._head[: end.end()] if end else self._head))
-            if fault is None and end is None and len(self._head) > HEAD_BYTES:
+            if fault is None and end is None and len(self._head) > HEAD_LIMITS.head_bytes:
                 fault = _TOO_LARGE
             if fault is not None:
                 self._refuse(fault)
@@ -353,7 +363,7 @@ class Connection(asyncio.Protocol):
         if not self.transport.is_closing():
             self.transport.write(answer)
             self.transport.write_eof()
-            self._clock = self._loop.call_later(_LINGER_S, self.transport.abort)
+            self._clock = self._loop.call_later(HEAD_LIMITS.linger_s, self.transport.abort)
 
 
 _CONNECTION: ContextVar[Connection | None] = ContextVar("mapvote_connection", default=None)

@@ -23,7 +23,7 @@ from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote_server.api.app import create_app
-from mapvote_server.api.connections import HEAD_BYTES, Patience, tracked, watched
+from mapvote_server.api.connections import HEAD_LIMITS, Patience, tracked, watched
 from mapvote_server.api.security import HEADERS
 from mapvote_server.store import keys
 from mapvote_server.store.policy import Policy
@@ -118,7 +118,7 @@ def serve(
     config = uvicorn.Config(
         tracked(app),
         http=watched(H11Protocol, patience),
-        h11_max_incomplete_event_size=HEAD_BYTES,
+        h11_max_incomplete_event_size=HEAD_LIMITS.head_bytes,
         ws="none",
         access_log=False,
         proxy_headers=False,  # mapvote_server.api.proxies reads them

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key, unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, TileIndex
+from mapvote.core.record import record
 from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError
 from mapvote.fusion.next_pass import Stretch, Waiting, Witness, lacks_quorum_only, one_vote_short, stretches
 from mapvote.fusion.tile_vote import TileVote, by_voter, one_each
@@ -62,8 +63,20 @@ class _Kept:
 
 _kept: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
 _lock = Lock()
-PATH_REACH_M = 200.0
-"""A vehicle votes on no cell farther from its path."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class CoverageSizes:
+    """Numbers of the road on which one more pass would decide changes."""
+
+    reach_m: float = 200.0
+    """Distance from its path up to which a vehicle votes, metres."""
+    stretches: int = 1_000
+    """Stretches with most cells that are listed: more than a fleet drives in a day."""
+
+
+COVERAGE_SIZES = CoverageSizes()
 
 
 def _kept_of(store: Store) -> _Kept:
@@ -142,7 +155,7 @@ def _together(tiles: Iterable[_Tile], quorum: int) -> Waiting | None:
 
 def wanted_passes(store: Store) -> dict[str, Any]:
     """Stretches of road on which one more pass would decide cells, those with most cells first: GeoJSON lines in map
-    metres, each in the direction to drive, with what the pass would decide there; as many as ``MOST_STRETCHES``.
+    metres, each in the direction to drive, with its decisions there; at most ``CoverageSizes.stretches``.
 
     Besides, "cells" that one more vote would decide; "without_path", those of them that no drive with a path saw;
     "waits", text: what lacks only the quorum; "damaged" tiles, which are left out.
@@ -167,11 +180,7 @@ def wanted_passes(store: Store) -> dict[str, Any]:
         "damaged": sorted(tile.damaged for tile in found if tile.damaged),
     }
     every = _in_order([stretch for tile in found for stretch in tile.stretches])
-    return collection([_line(stretch) for stretch in every[:MOST_STRETCHES]]) | told
-
-
-MOST_STRETCHES = 1_000
-"""Those with most cells: more than a fleet drives in a day."""
+    return collection([_line(stretch) for stretch in every[: COVERAGE_SIZES.stretches]]) | told
 
 
 def _look(
@@ -209,8 +218,8 @@ def _paths_on(connection: sa.Connection, window: Grid, path_of: Callable[[int], 
         sa.select(b.seq, b.vehicle).join(schema.ballot_tiles, t.ballot == b.seq).join(schema.paths, p.ballot == b.seq)
     )
     here = here.where(t.row == row, t.col == col, b.gone_seq.is_(None)).order_by(b.seq)
-    low = np.array([window.x0, window.y0]) - PATH_REACH_M
-    high = low + 2 * PATH_REACH_M + TILE_CELLS * CELL_SIZE
+    low = np.array([window.x0, window.y0]) - COVERAGE_SIZES.reach_m
+    high = low + 2 * COVERAGE_SIZES.reach_m + TILE_CELLS * CELL_SIZE
     out = defaultdict[str, list[F64]](list)
     for ballot, vehicle in connection.execute(here).all():
         path = path_of(ballot)
