@@ -30,7 +30,7 @@ _TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
 
 @record()
 @dataclass(frozen=True, slots=True)
-class RoadSearch:
+class RoadPlane:
     """Numbers of the search for the road in the points below the sensor."""
 
     near_m: float = 15.0
@@ -51,7 +51,7 @@ class RoadSearch:
     """Largest height of a sensor over the road, metres."""
 
 
-ROAD_SEARCH = RoadSearch()
+ROAD_PLANE = RoadPlane()
 
 
 @record()
@@ -139,7 +139,7 @@ class Road:
     @property
     def is_there(self) -> bool:
         """Whether it can be a road: some points lie in it, and as deep in every scan."""
-        return self.share >= ROAD_SEARCH.road_share and self.unsteady_m < ROAD_SEARCH.unsteady_m
+        return self.share >= ROAD_PLANE.road_share and self.unsteady_m < ROAD_PLANE.unsteady_m
 
     @property
     def tilt_deg(self) -> float:
@@ -198,7 +198,7 @@ class DriveEvidence:
     @cached_property
     def some(self) -> I64:
         """A few of the readable scans, spread evenly."""
-        chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), ROAD_SEARCH.scans)).astype(np.int64)
+        chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), ROAD_PLANE.scans)).astype(np.int64)
         return self.readable[chosen]
 
     def _points(self, i: int) -> F32:
@@ -310,12 +310,12 @@ def find_road(scans: Sequence[F32]) -> Road:
     near = []
     for scan in scans:
         away = np.linalg.norm(scan, axis=1)
-        points = scan[(away < ROAD_SEARCH.near_m) & (away > 2.0)].astype(np.float64)
+        points = scan[(away < ROAD_PLANE.near_m) & (away > 2.0)].astype(np.float64)
         near.append(points[:: max(1, len(points) // 3000)])
     planes = [_best_planes(points, np.random.default_rng(k)) for k, points in enumerate(near)]
     share = {name: float(np.mean([one[name][0] for one in planes])) for name in _UPS}
     best = max(share, key=lambda name: share[name])
-    if share[best] < max(1.5 * share["+z"], ROAD_SEARCH.road_share):
+    if share[best] < max(1.5 * share["+z"], ROAD_PLANE.road_share):
         best = "+z"
     fitted = [_fitted(points, *one[best][1:]) for points, one in zip(near, planes, strict=True)]
     normal = np.median([normal for normal, _, _ in fitted], axis=0)
@@ -332,7 +332,7 @@ def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float
     out: dict[str, tuple[float, F64, float]] = {name: (0.0, up, 0.0) for name, up in _UPS.items()}
     if len(points) < 30:
         return out
-    a, b, c = (points[rng.integers(0, len(points), ROAD_SEARCH.tries)] for _ in range(3))
+    a, b, c = (points[rng.integers(0, len(points), ROAD_PLANE.tries)] for _ in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 1e-3] / length[length > 1e-3, None]
@@ -340,9 +340,9 @@ def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float
     normals, depth = normals * np.sign(depth)[:, None], np.abs(depth)  # towards the sensor
     for normal, d in zip(normals, depth, strict=True):
         axis = int(np.argmax(np.abs(normal)))
-        if not ROAD_SEARCH.depth_m[0] <= d <= ROAD_SEARCH.depth_m[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
+        if not ROAD_PLANE.depth_m[0] <= d <= ROAD_PLANE.depth_m[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
             continue
-        share = float((np.abs(points @ normal + d) < ROAD_SEARCH.thick_m).mean())
+        share = float((np.abs(points @ normal + d) < ROAD_PLANE.thick_m).mean())
         name = ("+" if normal[axis] > 0 else "-") + "xyz"[axis]
         if share > out[name][0]:
             out[name] = (share, normal, float(d))
@@ -353,7 +353,7 @@ def _fitted(points: F64, normal: F64, depth_m: float) -> tuple[F64, float, float
     """(normal, depth, robust scatter) of the plane fitted to the points near a first guess of it, twice."""
     scatter = 0.0
     for _ in range(2):
-        p = points[np.abs(points @ normal + depth_m) < 3.0 * ROAD_SEARCH.thick_m]
+        p = points[np.abs(points @ normal + depth_m) < 3.0 * ROAD_PLANE.thick_m]
         if len(p) < 50:
             return normal, depth_m, 0.0
         centre = p.mean(axis=0)
@@ -454,7 +454,7 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     if road.depth_m < 0.5:
         what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
         yield Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's")
-    if road.depth_m > ROAD_SEARCH.highest_m:
+    if road.depth_m > ROAD_PLANE.highest_m:
         what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
         mend = (
             f"multiply their points by 0.3048 if they are feet (the road then lies {0.3048 * road.depth_m:.1f} m below)"
