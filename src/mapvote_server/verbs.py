@@ -280,7 +280,7 @@ def _print_changes(found: Mapping[str, Any]) -> None:
     for feature in largest_first[:_MOST_CHANGES]:
         about = feature["properties"]
         (x0, y0), (x1, y1) = about["box"]
-        votes = f"{about['votes_min']}"
+        votes = f"{about['votes_min']}" if about["versions"] else "none: taken back"
         sizes = f"{about['area_m2']:.1f}", f"{about['height_m']:.1f}", str(about["points"])
         rows.append((about["kind"], f"{0.5 * (x0 + x1):.1f}", f"{0.5 * (y0 + y1):.1f}", *sizes, votes))
     versions = f"from version {found['from_version']} to {found['to_version']}"
@@ -291,6 +291,8 @@ def _print_changes(found: Mapping[str, Any]) -> None:
     if len(found["features"]) > _MOST_CHANGES:
         print(f"and {len(found['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
     print(f"{len(found['features'])} changes {versions}")
+    if not all(feature["properties"]["versions"] for feature in found["features"]):
+        print("taken back: no vehicle voted for it, a rollback or a replay took an earlier decision back")
 
 
 def _tell_damaged(found: Mapping[str, Any]) -> None:

@@ -82,10 +82,10 @@ def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: 
     """The cutout of a feature of :func:`mapvote.shapes.geojson.to_geojson`."""
     p = feature["properties"]
     kind = "Built" if p["kind"] == "built" else "Trimmed beside what stands" if _only_trimmed(p) else "Demolished"
-    facts = (
-        f"{p['area_m2']:.1f} m², {p['height_m']:.1f} m high, {p['points']} points; "
-        f"{p['votes_median']:g} votes for it, {p['against_median']:g} against"
-    )
+    votes = f"{p['votes_median']:g} votes for it, {p['against_median']:g} against"
+    if not p["versions"]:
+        votes = "no votes: a rollback or replay took a decision back"
+    facts = f"{p['area_m2']:.1f} m², {p['height_m']:.1f} m high, {p['points']} points; {votes}"
     (x0, y0), (x1, y1) = p["box"]
     name = f"{kind} at {0.5 * (x0 + x1):.0f}, {0.5 * (y0 + y1):.0f}"
     return cut_out(name, facts, (x0, y0, x1, y1), p["height_m"], tiles, lattice)
