@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import tomli_w
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, transform
@@ -178,6 +179,36 @@ def timed(name: str, of: Callable[[F64, float], Any], *, bent: bool = False, **t
             np.save(folder / "scans" / f"{file.stem}.npy", table)
         shutil.rmtree(folder / "velodyne")
         state(folder, motion_compensated=None, **toml)
+
+    return Files(edit)
+
+
+def pose_table(header: str, of: Callable[[F64, F64], F64]) -> Files:
+    """The prior as a table of times and ``of`` positions (n, 3) and quaternions (n, 4), x first, below a header."""
+
+    def edit(folder: Path) -> None:
+        T = np.loadtxt(folder / "prior.txt").reshape(-1, 3, 4)
+        turns = scipy.spatial.transform.Rotation.from_matrix(T[:, :, :3]).as_quat()
+        rows = np.column_stack([np.loadtxt(folder / "times.txt"), of(T[:, :, 3], turns)])
+        lines = [",".join(f"{value:.12g}" for value in row) for row in rows]
+        (folder / "prior.txt").write_text("\n".join([*filter(None, [header]), *lines]) + "\n")
+
+    return Files(edit)
+
+
+def w_first(p: F64, q: F64) -> F64:
+    return np.column_stack([p, np.roll(q, 1, axis=1)])
+
+
+def scan_names(name_of: Callable[[int, int], str]) -> Files:
+    """Scans by other names, of their number and how many there are."""
+
+    def edit(folder: Path) -> None:
+        files = sorted((folder / "velodyne").iterdir())
+        for i, file in enumerate(files):
+            file.rename(folder / "velodyne" / f"part-{i}")
+        for i in range(len(files)):
+            (folder / "velodyne" / f"part-{i}").rename(folder / "velodyne" / f"{name_of(i, len(files))}.bin")
 
     return Files(edit)
 
@@ -364,6 +395,23 @@ DRIVES: list[tuple[str, str, Break | Files]] = [
     ("one row not a number", "nan|number|finite", lines("prior.txt", lambda t: [*t[:4], "nan " * 12, *t[5:]])),
     ("rotations scaled", "orthonormal|rigid",
      lines("prior.txt", lambda t: [" ".join(str(2 * float(v)) for v in one.split()) for one in t])),
+    ("fixes that are all at latitude 0, longitude 0", "none of its .* fixes is one",
+     pose_table("time,longitude,latitude,altitude,yaw", lambda p, q: np.zeros((len(p), 4)))),
+    ("latitude and longitude of fixes swapped", "swapped|another place|lies at",
+     pose_table("time,latitude,longitude,altitude,yaw", lambda p, q: np.column_stack(
+         [np.add([139.0, 35.0], p[:, :2] / 1e5), p[:, 2], 0 * p[:, 0]]))),
+    ("fixes in radians", "radians",
+     pose_table("time,longitude,latitude,altitude,yaw", lambda p, q: np.column_stack(
+         [np.radians(degrees(p)[:, :2]), p[:, 2], 0 * p[:, 0]]))),
+    ("a header that names no position", "no known header|name a time, x, y, z",
+     pose_table("time,a,b,c,d,e,f,g", lambda p, q: np.column_stack([p, q]))),
+    ("quaternions that are none", "no unit quaternion",
+     pose_table("time,x,y,z,qx,qy,qz,qw", lambda p, q: np.column_stack([p, 3.0 * q]))),
+    ("quaternions in another order than the header says", "do not belong|rotations|" + TURN + "|" + UP,
+     pose_table("time,x,y,z,qx,qy,qz,qw", w_first)),
+    ("scans whose names count backwards", ORDER, scan_names(lambda i, n: f"{n - i:06d}")),
+    ("scans whose names are random", f"{ORDER}|" + VAGUE,
+     scan_names(lambda i, n: f"{int(rng(3).permutation(n)[i]):06d}")),
     ("times in milliseconds", "milliseconds", times(lambda t: 1e3 * t)),
     ("times in microseconds", "microseconds", times(lambda t: 1e6 * t)),
     ("times divided by 1000", "divided by 1000", times(lambda t: t / 1000)),
