@@ -8,7 +8,7 @@ from command_line import typed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote_server.questions.history import changes_between, page_between
+from mapvote_server.questions.changes import changes_between, page_between
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
 from mapvote_server.store.rollback import rollback
