@@ -3,6 +3,7 @@
     python benchmarks/live.py drive DRIVE MAP --rate 1   # share of scans that voted, latency from sending to vote
     python benchmarks/live.py kills DRIVE MAP --kills 50 # kill -9 at random moments, in half of them without a server
     python benchmarks/live.py priors DRIVE MAP           # scans that vote by each kind of prior, without DDS
+    python benchmarks/live.py packets DRIVE MAP          # the same on a bag of tenths of revolutions
 
 DRIVE is one that ``mapvote simulate`` wrote, MAP what ``mapvote build`` made of its surveys. For kills the drive goes
 round and round with stamps that go on; at the end of a lap the vehicle leaps back to the start, where some scans are
@@ -29,16 +30,19 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.types import F64, I64, PosePrior
+from mapvote.core.types import F64, I64, PosePrior, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at
+from mapvote.formats.drives.frames import BASE_FRAME
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.dds import Network
-from mapvote.live.play import opened
-from mapvote.vehicle import Vehicle
+from mapvote.live.messages import CLOUD, ODOMETRY
+from mapvote.live.play import cloud_message, odometry_message, opened
+from mapvote.vehicle import Vehicle, vote_drive
 
 sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder, whose live.py would hide tests/live
+from bag_recorder import Recorder  # noqa: E402
 from live.loopback_dds import LOOPBACK, own_domain  # noqa: E402
 from live_server import mapvote  # noqa: E402
 from odometry_errors import odometry  # noqa: E402
@@ -241,9 +245,35 @@ def priors(drive_path: str, map_path: str) -> None:
         )
 
 
+def packets(drive_path: str, map_path: str) -> None:
+    """Scans that vote on a bag in which each revolution is ten clouds, as some drivers publish them."""
+    drive = open_drive(Path(drive_path))
+    assert drive.T_map_lidar_prior is not None
+    with tempfile.TemporaryDirectory() as home:
+        bag = Recorder(Path(home) / "bag")
+        for i, scan in enumerate(drive):
+            assert scan.time_s is not None
+            bag.write_raw("/odom", ODOMETRY, scan.stamp_ns, odometry_message(scan.stamp_ns, drive.T_map_lidar_prior[i]))
+            first_s = float(scan.time_s.min())
+            tenth = np.clip(((scan.time_s - first_s) * 100.0).astype(np.int64), 0, 9)
+            for k in np.unique(tenth).tolist():
+                part = tenth == k
+                begin_s = first_s + 0.01 * k
+                ns = scan.stamp_ns + round(begin_s * 1e9)
+                fields = {name: values[part] for name, values in scan.fields.items()}
+                ring = None if scan.ring is None else scan.ring[part]
+                packet = Scan(ns, scan.points[part], scan.time_s[part] - np.float32(begin_s), fields, ring)
+                bag.write_raw("/points", CLOUD, ns, cloud_message(packet, BASE_FRAME))
+        bag.bag.close()
+        recorded = open_drive(Path(home) / "bag", as_live=True)
+        _, report = vote_drive(recorded, read_map(Path(map_path)))
+    voted = report.scans - len(report.lost)
+    print(f"packets of a tenth in a bag: {voted} of {report.scans} revolutions voted ({len(drive)} were recorded)")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["drive", "kills", "laps", "priors"])
+    parser.add_argument("what", choices=["drive", "kills", "laps", "priors", "packets"])
     parser.add_argument("paths", nargs="*")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--rate", type=float, default=1.0)
@@ -256,6 +286,7 @@ def main() -> None:
         "drive": lambda: play_and_drive(*o.paths, o.rate, o.sensor, o.core),
         "kills": lambda: kills(*o.paths, o.kills, o.longest),
         "priors": lambda: priors(*o.paths),
+        "packets": lambda: packets(*o.paths),
         "laps": lambda: laps(o.domain, o.paths[0], Path(o.paths[1])),
     }
     runs[o.what]()

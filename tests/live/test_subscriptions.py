@@ -16,6 +16,8 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.frames import matrix_of
+from mapvote.formats.drives.packets import direction_of
+from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
@@ -25,7 +27,7 @@ from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odom
 from mapvote.live.road_map import OneMap
 from mapvote.live.service import Plan, run
 from mapvote.live.subscriptions import Clocks, Subscriptions
-from mapvote.live.sweeps import Cloud, Packets, Sweeps, direction_of
+from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 from streets import drive_along, path, street
 
 pytest.importorskip("cyclonedds")
@@ -58,19 +60,19 @@ def sector(start_deg: float, width_deg: float, ns: int, seed: int = 0) -> Cloud:
 
 @pytest.mark.parametrize(("start_deg", "step_deg"), [(0.0, 36.0), (170.0, -36.0), (-90.0, 72.0), (11.0, 20.0)])
 def test_packets_of_a_part_of_a_revolution_are_joined_to_whole_ones(start_deg: float, step_deg: float) -> None:
-    packets, per_turn = Packets(), round(360.0 / abs(step_deg))
+    packets, per_turn = Revolutions(), round(360.0 / abs(step_deg))
     out = []
     for k in range(5 * per_turn):
         width = abs(step_deg)
         begin = start_deg + k * step_deg - (width if step_deg < 0 else 0.0)
         out += packets.add(sector(begin, width, k * 10**7))
-    assert packets.is_packets
+    assert packets._packets.is_packets
     assert [len(scan.packets) for scan in out] == [per_turn] * 4
     assert [scan.stamp_ns for scan in out] == [n * per_turn * 10**7 for n in range(4)]
 
 
 def test_clouds_that_wait_for_the_decision_are_released_after_a_pause() -> None:
-    packets = Packets()
+    packets = Revolutions()
     first = sector(0.0, 90.0, 0)
     assert packets.add(first, 5.0) == []
     assert packets.after_pause(5.2) == []
@@ -79,18 +81,18 @@ def test_clouds_that_wait_for_the_decision_are_released_after_a_pause() -> None:
 
 
 def test_lost_packets_cost_their_points_and_no_revolution() -> None:
-    packets = Packets()
+    packets = Revolutions()
     out = [s for k in range(60) if k not in (23, 24, 41) for s in packets.add(sector(36.0 * k, 36.0, k * 10**7))]
     assert [len(scan.packets) for scan in out] == [10, 10, 8, 10, 9]
 
 
 @pytest.mark.parametrize(("start_deg", "width_deg"), [(0.0, 360.0), (-60.0, 120.0), (-35.0, 70.0)])
 def test_whole_revolutions_and_lidars_that_look_ahead_are_no_packets(start_deg: float, width_deg: float) -> None:
-    packets = Packets()
+    packets = Revolutions()
     clouds = [sector(start_deg, width_deg, k * 10**8, k) for k in range(12)]
     out = [one for cloud in clouds for one in packets.add(cloud)]
-    assert (packets.is_packets, out) == (False, clouds)
-    middle, coverage = direction_of(clouds[0].message)
+    assert (packets._packets.is_packets, out) == (False, clouds)
+    middle, coverage = direction_of(point_cloud_table("a cloud", clouds[0].message))
     assert coverage == pytest.approx(width_deg / 360.0, abs=0.06)
     assert width_deg == 360.0 or abs(middle) < 0.05
 

@@ -17,6 +17,7 @@ from mapvote.core.mount import Mount, mount_of_base
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of
+from mapvote.formats.drives.packets import scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.formats.drives.sensor_estimate import (
@@ -34,7 +35,7 @@ from mapvote.live.fix_topics import FixTopics
 from mapvote.live.log_lines import Repeated
 from mapvote.live.messages import CLOCK, CLOUD, GNSS, IMU, MAP_FRAME, POSES, TF, from_cdr, stamp_ns, time_ns
 from mapvote.live.names import RosNames
-from mapvote.live.sweeps import Cloud, Packets, Sweeps
+from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 
 log = logging.getLogger("mapvote.live")
 _DEPTH = 200
@@ -130,7 +131,7 @@ class Subscriptions:
         self._repeated = Repeated(log.warning)
         self._readers = [PointReader(one.topic, rules) for one in chosen.points]
         self._sweeps = Sweeps(len(chosen.points))
-        self._packets = [Packets() for _ in chosen.points]
+        self._revolutions = [Revolutions() for _ in chosen.points]
         self._points, self._odometry = (
             [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
             for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
@@ -248,9 +249,9 @@ class Subscriptions:
         whole: list[Cloud] = []
         for cloud in sorted(clouds, key=lambda cloud: cloud.stamp_ns):
             with self._some_unusable(CLOUD):
-                whole += self._packets[cloud.lidar].add(cloud, now_s)
-        for packets in self._packets:
-            whole += packets.after_pause(now_s)
+                whole += self._revolutions[cloud.lidar].add(cloud, now_s)
+        for revolutions in self._revolutions:
+            whole += revolutions.after_pause(now_s)
         return self._sweeps.add(whole)
 
     def _add_frames(self, data: memoryview, *, fixed: bool) -> None:
@@ -336,12 +337,7 @@ class Subscriptions:
             reader.step_s = self._sweeps.step_s
             return scan_from_point_cloud2(cloud.message, sensor, reader)
         stamps_ns = [packet.stamp_ns for packet in cloud.packets]
-        reader.step_s = float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else None
-        scans: list[Scan] = []
-        for number, packet in enumerate(cloud.packets):
-            try:
-                scans.append(scan_from_point_cloud2(packet.message, sensor, reader))
-            except MapvoteError:
-                if number + 1 == len(cloud.packets) and not scans:
-                    raise
-        return replace(Scan.sweep(cloud.stamp_ns, scans), others=())
+        messages = [packet.message for packet in cloud.packets]
+        return scan_of_packets(
+            cloud.stamp_ns, stamps_ns, reader, lambda i: scan_from_point_cloud2(messages[i], sensor, reader)
+        )

@@ -15,11 +15,13 @@ from scipy.spatial import cKDTree
 
 from bag_recorder import CLOUD, START, Recorder
 from mapvote.core import geometry
-from mapvote.core.types import F32, MapvoteError, PosePrior
+from mapvote.core.types import F32, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive
+from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.messages import GNSS, IMU, ODOMETRY, TF, blank_message, header_of, to_cdr
-from mapvote.live.play import odometry_message
+from mapvote.live.messages import GNSS, IMU, ODOMETRY, TF, blank_message, from_cdr, header_of, to_cdr
+from mapvote.live.play import cloud_message, odometry_message
+from mapvote.live.sweeps import Cloud, Revolutions
 from receiver_messages import fix_message, imu_message, moving_frame
 
 N = 5
@@ -326,3 +328,31 @@ def test_fixes_of_a_drive_that_votes_state_their_own_sigmas_and_know_no_later_fi
     assert prior.is_planar
     unplaced = open_drive(tmp_path / "bag", sensor="hdl32e", as_live=True)
     assert unplaced.T_map_lidar_prior is None, "nobody knows where the map lies on Earth"
+
+
+def test_packets_of_a_part_of_a_revolution_are_joined_to_the_scans_that_a_live_drive_makes_of_them(
+    tmp_path: Path,
+) -> None:
+    """Ten packets a revolution, clockwise, each point with its time in the packet; one packet is lost."""
+    rng = np.random.default_rng(3)
+    bag = Recorder(tmp_path / "bag")
+    live = Revolutions()
+    joined = []
+    for k in range(62):
+        azimuth = -2.0 * np.pi * (k + np.linspace(0.0, 1.0, 300, endpoint=False)) / 10.0
+        points = np.column_stack([9.0 * np.cos(azimuth), 9.0 * np.sin(azimuth), rng.uniform(-1, 3, 300)])
+        time_s = np.linspace(0.0, 0.01, 300, endpoint=False).astype(np.float32)
+        ns = START + k * 10**7
+        data = cloud_message(Scan(ns, points.astype(np.float32), time_s))
+        if k != 23:
+            bag.write_raw("/points", CLOUD, ns, data)
+            joined += live.add(Cloud(0, ns, ns, from_cdr(CLOUD, data)))
+    bag.bag.close()
+    drive = open_drive(tmp_path / "bag", sensor="hdl32e")
+    assert [len(drive.read_scan(i).points) for i in range(len(drive))] == [3000, 3000, 2700, 3000, 3000, 3000]
+    assert drive.stamps_ns.tolist() == [cloud.stamp_ns for cloud in joined]
+    scan = drive.read_scan(0)
+    assert scan.time_s is not None
+    assert np.allclose(scan.time_s, np.arange(3000) / 3000 * 0.1, atol=1e-6)
+    packets = [scan_from_point_cloud2(packet.message, drive.sensor) for packet in joined[1].packets]
+    assert np.array_equal(drive.read_scan(1).points, np.concatenate([packet.points for packet in packets]))

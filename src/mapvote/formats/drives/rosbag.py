@@ -6,10 +6,12 @@ Priors are topics of odometry or GNSS fixes; the mounts of a vehicle's LiDARs co
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
@@ -19,6 +21,7 @@ from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.frames import T_from
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
+from mapvote.formats.drives.packets import PACKET_RULE, Packets, direction_of, scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.stamp_order import in_order_of_stamps
 
@@ -44,15 +47,23 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     prior = prior_of_bag(bag, options, stamps_ns, poses)
     readers = [PointReader(f"{path} {topic}", options.time_rules, step_of(stamps_ns)) for topic in topics]
 
+    def read_cloud(i: int, message: _Message, sensor: Sensor) -> Scan:
+        where = f"{path} {topics[message.topic]}, scan {i}"
+        table = _points_of(bag, topics[message.topic], message, where)
+        return readers[message.topic].scan(where, i, message.stamp_ns, table, sensor)
+
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
-        start, topic = message.received_ns, topics[message.topic]
-        where = f"{path} {topic}, scan {i}"
-        for connection, _, data in bag.raw(topic, start=start, stop=start + 1):
-            if bag.stamp_ns(data) == message.header_ns:
-                table = bag.points(where, connection, data)
-                scan = readers[message.topic].scan(where, i, message.stamp_ns, table, sensor)
-                return scan if message.topic == 0 else scan.seen_from(mounts[message.topic])
-        raise MapvoteError(f"{where}: gone; the bag changed while it was read")
+        if message.packets:
+            stamps = [packet.stamp_ns for packet in message.packets]
+            scan = scan_of_packets(
+                message.stamp_ns,
+                stamps,
+                readers[message.topic],
+                lambda number: read_cloud(i, message.packets[number], sensor),
+            )
+        else:
+            scan = read_cloud(i, message, sensor)
+        return scan if message.topic == 0 else scan.seen_from(mounts[message.topic])
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
         scans = [read_message(i, message, sensor) for message in sweeps[i]]
@@ -105,11 +116,15 @@ class _Message:
     received_ns: int
     header_ns: int
     """The stamp in its header, 0 where nobody stamped it."""
+    packets: tuple[_Message, ...] = ()
+    """The packets of a revolution, of which this is the first; () if it came whole."""
 
 
 def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution."""
-    found = [message for k, topic in enumerate(topics) for message in _messages_of(bag, topic, k)]
+    found = [
+        message for k, topic in enumerate(topics) for message in _revolutions(bag, topic, _messages_of(bag, topic, k))
+    ]
     if not found:
         raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; {mend_of(bag.path)}")
     if len(topics) == 1:
@@ -124,6 +139,40 @@ def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
         else:
             sweeps.append([message])
     return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
+
+
+def _points_of(bag: Bag, topic: str, message: _Message, where: str) -> NDArray[np.void]:
+    """The points (n,) of one cloud of a topic. MapvoteError if it is not there any more, or damaged."""
+    start_ns = message.received_ns
+    for connection, _, data in bag.raw(topic, start=start_ns, stop=start_ns + 1):
+        if bag.stamp_ns(data) == message.header_ns:
+            return bag.points(where, connection, data)
+    raise MapvoteError(f"{where}: gone; the bag changed while it was read")
+
+
+def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Message]:
+    """The clouds of a topic, or, if each is a part of a revolution, the first of each revolution with its packets. The
+    last revolution, whose end nothing shows, is left out, as on the road."""
+    packets: Packets[_Message] = Packets()
+    for message in messages[: PACKET_RULE.looked_at]:
+        with suppress(MapvoteError):  # a damaged cloud is reported when it is read as a scan
+            direction = direction_of(_points_of(bag, topic, message, f"{bag.path} {topic}"))
+            packets.add(message, message.stamp_ns, lambda looked=direction: looked)  # type: ignore[misc]
+    if not packets.is_packets:
+        return messages
+    # One pass over the topic gives the direction of each.
+    directions = {
+        (received_ns, bag.stamp_ns(data)): direction_of(bag.points(f"{bag.path} {topic}", connection, data))
+        for connection, received_ns, data in bag.raw(topic)
+    }
+    packets = Packets()
+    out = []
+    for message in messages:
+        looked = directions[message.received_ns, message.header_ns]
+        for group in packets.add(message, message.stamp_ns, lambda looked=looked: looked):  # type: ignore[misc]
+            out.append(replace(group[0], packets=tuple(group)))
+    log.info("%s: %s: %d packets are joined to %d revolutions", bag.path, topic, len(messages), len(out))
+    return out
 
 
 def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
