@@ -228,7 +228,7 @@ def export(
     source: Annotated[str, typer.Argument(metavar="MAP|STORE|URL", help="a map, a store, or a server's newest map")],
     out: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help=".pcd, .las, .laz, .ply, or a folder to fill with Autoware tiles"),
+        typer.Argument(metavar="FILE", help=".pcd, .las, .laz, .copc.laz, .ply, or a folder for Autoware tiles"),
     ],
     offset: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="metres to subtract from every point, for float32 formats")

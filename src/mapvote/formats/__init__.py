@@ -182,11 +182,10 @@ def export_map(
     Returns the format's name and the frame of what was written.
     """
     path = Path(path)
-    if path.name.lower().endswith((".copc.laz", ".copc.las")):
-        raise MapvoteError(
-            f"{path}: COPC is not written; name it .laz, and make COPC of that: pdal translate A.laz {path}"
-        )
-    writer = WRITERS.get(path.suffix.lower())
+    if path.name.lower().endswith(".copc.las"):
+        raise MapvoteError(f"{path}: COPC is compressed; name it {path.stem}.laz")
+    ending = next((e for e in WRITERS if e.count(".") > 1 and path.name.lower().endswith(e)), path.suffix.lower())
+    writer = WRITERS.get(ending)
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
         raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")

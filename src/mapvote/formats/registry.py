@@ -9,7 +9,7 @@ from pathlib import Path
 from mapvote.core.types import Drive
 from mapvote.formats.drives import bag_files, datasets, rosbag, scan_folder
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.maps import autoware, e57, las, pcd, ply
+from mapvote.formats.maps import autoware, copc, e57, las, pcd, ply
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
 
 
@@ -88,6 +88,7 @@ WRITERS: dict[str, MapWriter] = {
     ".pcd": MapWriter("PCD file", pcd.write_pcd, single=True),
     ".las": MapWriter("LAS file", las.write_las, classes=True),
     ".laz": MapWriter("LAZ file", las.write_las, classes=True),
+    ".copc.laz": MapWriter("COPC", copc.write_copc, classes=True),
     ".ply": MapWriter("PLY file", ply.write_ply),
     "": MapWriter("Autoware tile folder", autoware.write_autoware, single=True),
 }

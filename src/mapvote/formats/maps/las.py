@@ -330,14 +330,12 @@ def _wkt(crs: Any) -> str:
         return str(crs.to_2d().to_wkt("WKT1_GDAL"))
 
 
-def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
-    """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
+def las_header(laspy: Any, path: Path, clouds: CloudPieces) -> tuple[Any, F64]:
+    """(laspy's header of LAS 1.4 for a cloud, (3,) metres to add to its points): coordinate system, steps and fields.
 
-    x is east or longitude, y north or latitude, whatever order the coordinate system names. Every point is return 1 of
-    1 where nothing else is known. Whole or not at all.
+    x is east or longitude, y north or latitude, whatever order the coordinate system names. What LAS cannot hold of
+    intensities and colours is a warning.
     """
-    laspy = require("laspy", "las", str(path))
-    clouds = CloudPieces.of(cloud)
     shift = np.zeros(3)
     geographic = False
     header = laspy.LasHeader(point_format=7 if "red" in clouds.kinds else 6, version="1.4")
@@ -355,6 +353,17 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
     if own:
         header.add_extra_dims(own)
     _tell_of_brightness(path, clouds)
+    return header, shift
+
+
+def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
+    """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
+
+    Every point is return 1 of 1 where nothing else is known. Whole or not at all.
+    """
+    laspy = require("laspy", "las", str(path))
+    clouds = CloudPieces.of(cloud)
+    header, shift = las_header(laspy, path, clouds)
     compressed = path.suffix.lower() == ".laz"
     with (
         whole_file(path) as partial,
@@ -362,10 +371,10 @@ def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
         laspy.open(stream, mode="w", header=header, do_compress=compressed, closefd=False) as out,
     ):
         for piece in clouds:
-            out.write_points(_record(laspy, header, piece, clouds.brightness, shift))
+            out.write_points(las_record(laspy, header, piece, clouds.brightness, shift))
 
 
-def _record(laspy: Any, header: Any, piece: Cloud, brightness: Mapping[str, Brightness], shift: F64) -> Any:
+def las_record(laspy: Any, header: Any, piece: Cloud, brightness: Mapping[str, Brightness], shift: F64) -> Any:
     """One piece as laspy's points."""
     record = laspy.ScaleAwarePointRecord.zeros(len(piece.points), header=header)
     record.x, record.y, record.z = (piece.points.astype(np.float64, copy=False) + shift).T
