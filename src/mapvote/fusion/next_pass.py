@@ -11,18 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
 
 SECTORS = 8
 """Directions of road, 45 deg each."""
-_DETERMINED = (
-    CellState.UNCHANGED_OCCUPIED,
-    CellState.UNCHANGED_EMPTY,
-    CellState.CHANGED_OCCUPIED,
-    CellState.CHANGED_EMPTY,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +74,10 @@ class Waiting:
 def lacks_quorum_only(states: Sequence[U8], quorum: int) -> U8:
     """(rows, cols) the change that ``quorum`` - 1 of the vehicles and more than half of those that determined the cell
     vote for; NO_VOTE in all other cells. ``states``: (rows, cols) of each vehicle."""
-    said = np.stack(states)
-    determined = np.isin(said, _DETERMINED).sum(axis=0)
-    out = np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    determined = _count([said < CellState.UNDETERMINED for said in states])
+    out = np.full(determined.shape, NO_VOTE, dtype=np.uint8)
     for change in (CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED) if quorum > 1 else ():
-        votes = (said == change).sum(axis=0)
+        votes = _count([said == change for said in states])
         out[(votes == quorum - 1) & (2 * votes > determined)] = change
     return out
 
@@ -94,15 +88,22 @@ def one_vote_short(states: Sequence[U8], quorum: int) -> U8:
     ``states``: (rows, cols) of each vehicle. The rule is that of ``fuse.count``: a change needs ``quorum`` votes and a
     majority of the vehicles that determined the cell. A change without any vote is not listed.
     """
-    said = np.stack(states)
-    determined = np.isin(said, _DETERMINED).sum(axis=0)
-    out = np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    determined = _count([said < CellState.UNDETERMINED for said in states])
+    out = np.full(determined.shape, NO_VOTE, dtype=np.uint8)
     for change in (CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED):
-        votes = (said == change).sum(axis=0)
+        votes = _count([said == change for said in states])
         decided = (votes >= quorum) & (2 * votes > determined)
         would = (votes + 1 >= quorum) & (2 * (votes + 1) > determined + 1)
         out[(votes > 0) & would & ~decided] = change
     return out
+
+
+def _count(claims: Sequence[Bool]) -> NDArray[np.int16]:
+    """(rows, cols) how many of the claims hold."""
+    count = np.zeros(claims[0].shape, dtype=np.int16)
+    for claim in claims:
+        count += claim
+    return count
 
 
 def stretches(window: Grid, witnesses: Sequence[Witness], quorum: int) -> list[Stretch]:

@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,9 +31,9 @@ class OverviewSizes:
 
     points: int = 150_000
     """Points of an overview: 1.2 MB, one to two seconds of a slow connection."""
-    spare: int = 4
-    """Points that a tile keeps while an overview is made, as a multiple of its even share: a map of any size fits in
-    memory."""
+    spare: int = 2
+    """Points that a tile keeps for later overviews, as a multiple of its even share, rounded up to a power of two: a
+    map of any size fits in memory."""
     threads: int = 2
     """Threads for an overview: reading and sorting release the interpreter."""
     kept_bytes: int = 256_000_000
@@ -44,6 +45,21 @@ _ANYWHERE = Lattice().tile((0, 0))
 """Coordinates of levels begin at the tile's corner, so the window does not matter."""
 _HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
 _OVERVIEW_MAGIC = 0x3143564F
+
+
+class _Drawn(NamedTuple):
+    """What the coarse picture of a tile follows from."""
+
+    points: str
+    ground: str
+    fields: str | None
+    share: int
+    """Points that it keeps at most."""
+
+    @classmethod
+    def of(cls, hashes: TileHashes, share: int) -> _Drawn:
+        """Of a tile with these planes."""
+        return cls(hashes.points, hashes.ground, hashes.fields, share)
 
 
 class Clouds:
@@ -58,6 +74,8 @@ class Clouds:
         self._lock, self._making = threading.Lock(), threading.Lock()
         self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
         self._overview: tuple[int, bytes] = 0, b""
+        self._coarse: dict[_Drawn, Levels] = {}
+        """The tiles of the overview."""
         self._proposed: Mapping[TileHashes, Tile] = {}
 
     def propose(self, tiles: Iterable[tuple[TileHashes, Tile]]) -> None:
@@ -93,25 +111,34 @@ class Clouds:
         """
         with self._making:  # of concurrent requests, one makes it
             if self._overview[0] != version:
-                made = self._coarse(version, stop)
+                made = self._made_coarse(version, stop)
                 if made is None:
                     return b""
                 self._overview = version, _overview_bytes(made)
             return self._overview[1]
 
-    def _coarse(self, version: int, stop: Callable[[], bool]) -> list[tuple[TileIndex, Levels]] | None:
+    def _made_coarse(self, version: int, stop: Callable[[], bool]) -> list[tuple[TileIndex, Levels]] | None:
+        """Tiles that the last overview has too are not made again."""
         with self._store.database.reading() as connection:
             version_of(connection, version)
             tiles = tiles_of(connection, version)
+        share = _share(len(tiles))
 
-        def made(index: TileIndex) -> list[tuple[TileIndex, Levels]]:
-            sound = [] if stop() else self._sound(tiles[index])
-            most = OVERVIEW_SIZES.spare * OVERVIEW_SIZES.points // len(tiles)
-            return [(index, make_levels(t.points, t.ground_z, most, self._bright(tiles[index], t))) for t in sound]
+        def made(hashes: TileHashes) -> Levels | None:
+            known = self._coarse.get(_Drawn.of(hashes, share))
+            if known is not None or stop():
+                return known
+            for tile in self._sound(hashes):
+                return make_levels(tile.points, tile.ground_z, share, self._bright(hashes, tile))
+            return None
 
         with ThreadPoolExecutor(OVERVIEW_SIZES.threads, "coarse") as pool:
-            parts = list(pool.map(made, tiles))
-        return None if stop() else [part for of_tile in parts for part in of_tile]
+            found = dict(zip(tiles, pool.map(made, tiles.values()), strict=True))
+        if stop():
+            return None
+        sound = {index: levels for index, levels in found.items() if levels is not None}
+        self._coarse = {_Drawn.of(tiles[index], share): levels for index, levels in sound.items()}
+        return list(sound.items())
 
     def _bright(self, hashes: TileHashes, tile: Tile) -> U8 | None:
         """(n,) the intensity of a tile's points, 255 for 1.0; None if it has none, or that is damaged."""
@@ -153,6 +180,11 @@ class Clouds:
         pairs = [self._sound(*states) for _, *states in differ]
         placed = [(index, pair) for (index, *_), pair in zip(differ, pairs, strict=True) if pair]
         return b"".join(came_and_went(before, after, index) for index, (before, after) in placed)
+
+
+def _share(tiles: int) -> int:
+    """Points that a tile of so many keeps at most: a power of two, so that it seldom changes while a map grows."""
+    return 1 << (OVERVIEW_SIZES.spare * OVERVIEW_SIZES.points // max(tiles, 1)).bit_length()
 
 
 def _drawn(hashes: TileHashes) -> TileHashes:

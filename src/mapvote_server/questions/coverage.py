@@ -92,11 +92,12 @@ def waiting_votes(store: Store) -> Waiting | None:
             now_ns = store.clock()
             asked = electorate_now(connection, now_ns)
             quorum = asked.settings.min_votes
+            newest = version_of(connection).number
 
             def look(index: TileIndex) -> _Tile | None:
                 if _vehicles_on(connection, index) >= quorum:
                     return None
-                drives = _counting(connection, store, asked, index)
+                drives = _counting(connection, newest, asked, store.lattice.tile(index))
                 waits = None if drives is None else _waits(drives, _states(drives, store, index, asked), quorum)
                 return None if waits is None else _Tile(waits)
 
@@ -112,11 +113,11 @@ def _vehicles_on(connection: sa.Connection, index: TileIndex) -> int:
     return int(connection.execute(here).scalar_one())
 
 
-def _counting(connection: sa.Connection, store: Store, asked: Electorate, index: TileIndex) -> list[TileVote] | None:
-    """The votes on a tile of the drives that count, in the cells where they do; None if the tile cannot be read."""
-    newest = version_of(connection).number
+def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> list[TileVote] | None:
+    """The votes on a tile of the newest version of the drives that count, in the cells where they do; None if the tile
+    cannot be read."""
     try:
-        tile = tile_as_of(connection, store.lattice.tile(index), newest)
+        tile = tile_as_of(connection, window, newest)
     except Unavailable:
         raise
     except MapvoteError:
@@ -165,12 +166,16 @@ def wanted_passes(store: Store) -> dict[str, Any]:
         with store.database.reading() as connection:
             now_ns = store.clock()
             asked = electorate_now(connection, now_ns)
+            newest = version_of(connection).number
 
             @lru_cache(maxsize=100)
             def path_of(ballot: int) -> F64:
                 return _driven(connection, store, ballot)
 
-            tiles.refresh(connection, asked, now_ns, lambda index: _look(connection, store, asked, index, path_of))
+            def look(index: TileIndex) -> _Tile | None:
+                return _look(connection, newest, asked, store.lattice.tile(index), path_of)
+
+            tiles.refresh(connection, asked, now_ns, look)
         found = list(tiles.found.values())
     waits = _together(found, asked.settings.min_votes)
     told = {
@@ -184,13 +189,13 @@ def wanted_passes(store: Store) -> dict[str, Any]:
 
 
 def _look(
-    connection: sa.Connection, store: Store, asked: Electorate, index: TileIndex, path_of: Callable[[int], F64]
+    connection: sa.Connection, newest: int, asked: Electorate, window: Grid, path_of: Callable[[int], F64]
 ) -> _Tile | None:
-    """Changes that one more pass would decide on a tile; None without any."""
-    window, quorum = store.lattice.tile(index), asked.settings.min_votes
-    drives = _counting(connection, store, asked, index)
+    """Changes that one more pass would decide on a tile of the newest version; None without any."""
+    quorum = asked.settings.min_votes
+    drives = _counting(connection, newest, asked, window)
     if drives is None:
-        return _Tile(None, damaged=tile_key(index))
+        return _Tile(None, damaged=tile_key(window.tile_index))
     if not drives:
         return None
     named = by_voter(drives, asked.settings)

@@ -36,8 +36,11 @@ from mapvote_server.store.votes import FOREVER, Electorate
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
 Claim = Literal["occupied", "empty"]
-_SAYS_OCCUPIED = (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED)
-_SAYS_EMPTY = (CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY)
+_SILENT, _OCCUPIED, _EMPTY = range(3)
+_CLAIMS = np.full(256, _SILENT, dtype=np.uint8)
+"""By state: what it says of the cell now."""
+_CLAIMS[[CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED]] = _OCCUPIED
+_CLAIMS[[CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY]] = _EMPTY
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,19 +97,20 @@ def compare(index: TileIndex, votes: Iterable[TileVote]) -> list[Compared]:
     ordered = sorted(votes, key=lambda vote: (vote.end_ns, vote.vehicle))
     if not ordered:
         return []
-    states = np.stack([said_by(vote).reshape(-1) for vote in ordered])
-    occupied, empty = np.isin(states, _SAYS_OCCUPIED), np.isin(states, _SAYS_EMPTY)
-    until_occupied, until_empty = (np.cumsum(claim, axis=0, dtype=np.int32) for claim in (occupied, empty))
-    all_occupied, all_empty = until_occupied[-1], until_empty[-1]
+    claims = np.stack([_CLAIMS[said_by(vote).reshape(-1)] for vote in ordered])
+    occupied, empty = claims == _OCCUPIED, claims == _EMPTY
+    all_occupied, all_empty = (claim.sum(axis=0, dtype=np.int16) for claim in (occupied, empty))
+    before_occupied, before_empty = np.zeros_like(all_occupied), np.zeros_like(all_empty)
     out = []
     for i, vote in enumerate(ordered):
-        before_occupied, before_empty = until_occupied[i] - occupied[i], until_empty[i] - empty[i]
-        after_occupied, after_empty = all_occupied - until_occupied[i], all_empty - until_empty[i]
-        more = np.sign((before_occupied + after_occupied) - (before_empty + after_empty))
-        agree_occupied = (more > 0) & (before_occupied > 0) & (after_occupied > 0)
-        agree_empty = (more < 0) & (before_empty > 0) & (after_empty > 0)
+        others_occupied, others_empty = all_occupied - occupied[i], all_empty - empty[i]
+        # A side that has the majority, and a vote both before this one and after it.
+        agree_occupied = (others_occupied > others_empty) & (before_occupied > 0) & (others_occupied > before_occupied)
+        agree_empty = (others_empty > others_occupied) & (before_empty > 0) & (others_empty > before_empty)
+        before_occupied += occupied[i]
+        before_empty += empty[i]
         opposed = np.flatnonzero((agree_occupied & empty[i]) | (agree_empty & occupied[i]))
-        compared = int(((agree_occupied | agree_empty) & (occupied[i] | empty[i])).sum())
+        compared = int(((agree_occupied | agree_empty) & (claims[i] != _SILENT)).sum())
         out.append(
             Compared(
                 vehicle=vote.vehicle,
@@ -134,7 +138,9 @@ def vehicle_standings(store: Store) -> list[VehicleStanding]:
                 return compare(index, votes_on(connection, store.lattice, index, asked.policy)) or None
 
             kept.tiles.refresh(connection, asked, store.clock(), look)
-        return standings_of(kept.entries(), store.lattice)
+        if kept.standings is None:
+            kept.standings = standings_of(kept.entries(), store.lattice)
+        return kept.standings
 
 
 class _AllCompared:
@@ -145,6 +151,8 @@ class _AllCompared:
         self._cells: Counter[str] = Counter()
         self._tiles: Counter[str] = Counter()
         self._opposed: dict[int, Sequence[Compared]] = {}
+        self.standings: list[VehicleStanding] | None = None
+        """What follows from all tiles; None: not asked since one came or went."""
 
     def entries(self) -> list[Compared]:
         """The comparisons that represent all: one a vehicle with its cells, and those with contradictions."""
@@ -153,6 +161,7 @@ class _AllCompared:
         return sums + [replace(entry, cells=0) for entries in self._opposed.values() for entry in entries]
 
     def _come(self, compared: Sequence[Compared]) -> None:
+        self.standings = None
         for entry in compared:
             self._cells[entry.vehicle] += entry.cells
             self._tiles[entry.vehicle] += 1
@@ -161,6 +170,7 @@ class _AllCompared:
             self._opposed[id(compared)] = opposed
 
     def _go(self, compared: Sequence[Compared]) -> None:
+        self.standings = None
         for entry in compared:
             self._cells[entry.vehicle] -= entry.cells
             self._tiles[entry.vehicle] -= 1

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hand_made import make_map, make_tile, two_walls, wall
+from mapvote.config import FuseSettings
 from mapvote.core.types import F32
 from mapvote.shapes.packed_cloud import N_LEVELS, SIDE_M, SPACINGS_M, Levels, make_levels
+from mapvote_server.questions import clouds
+from mapvote_server.store.policy import Policy
+from mapvote_server.store.publish import publish
+from mapvote_server.store.rollback import rollback
+from stores import NewStore, vote_gone
 
 GROUND = np.full((256, 256), 1.0, dtype=np.float32)
 
@@ -67,3 +76,21 @@ def test_the_coarse_part_alone_is_made_of_the_same_points_as_the_coarse_part_of_
     finest = int(np.searchsorted(whole.ends, len(coarse.packed), side="right")) - 1
     both = [part.packed[: whole.ends[finest], :2].tolist() for part in (whole, coarse)]
     assert sorted(both[0]) == sorted(both[1])
+
+
+def test_the_overview_of_a_version_makes_only_the_tiles_that_the_last_one_did_not_have(new_store: NewStore) -> None:
+    wide = wall([(10, col) for col in range(10, 20)], [0.05, 0.45, 0.75, 1.05])
+    street = make_map({(0, 0): two_walls().tiles[0, 0], (0, 1): make_tile(wide, index=(0, 1))})
+    store = new_store(street, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    kept = clouds.Clouds(store)
+    with mock.patch.object(clouds, "make_levels", wraps=make_levels) as made:
+        first = kept.overview(1)
+        alike = made.call_count
+        vote_gone(store)
+        assert publish(store).published
+        second = kept.overview(2)
+        assert (alike, made.call_count) == (2, 3)
+        rollback(store, 1)
+        assert kept.overview(3) == first
+        assert made.call_count == 4
+    assert [clouds.Clouds(store).overview(number) for number in (1, 2, 3)] == [first, second, first]
