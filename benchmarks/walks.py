@@ -4,7 +4,8 @@
 
 A walk is what runs of mapvote's own functions, in all threads; kernels count as their caller. *Files*: those in which
 anything runs, and how many of them do more than serve (core, config, codec). *Stays*: handovers, each pair of a calling
-and a called file once, to files that do. *Returns*: handovers to a file that waits further up in the same stack.
+and a called file once, to files that do. *Returns*: calls into a file that waits further up in the same stack, every
+call counted; *places*: pairs of a calling and a called function between which they happen.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -45,8 +47,8 @@ from mapvote_server.store.policy import Policy
 from mapvote_server.store.store import Store
 from streets import drive_along, path, street
 
-SRC = str(Path(mapvote.__file__).parent) + "/"
-SERVING = "core", "config", "codec", "__init__.py"
+SRC = str(Path(mapvote.__file__).parents[1]) + "/"
+SERVING = "mapvote/core", "mapvote/config", "mapvote/codec", "mapvote/__init__.py"
 POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)
 
 
@@ -57,7 +59,8 @@ class Walk:
         self.on = False
         self.files: set[str] = set()
         self.stays: set[tuple[str, str]] = set()
-        self.returns: set[tuple[str, str]] = set()
+        self.returns: Counter[tuple[str, str]] = Counter()
+        """Calls back into a waiting file, by the calling and the called function, each as "file:function"."""
 
     def watch(self, frame: FrameType, event: str, arg: object) -> None:
         """For :func:`sys.setprofile`."""
@@ -67,20 +70,26 @@ class Walk:
         self.files.add(here)
         above: list[str] = []
         waiting = frame.f_back
+        caller: FrameType | None = None
         while waiting is not None:
             there = file_of(waiting.f_code.co_filename)
-            above += [] if there is None else [there]
+            if there is not None:
+                caller = caller or waiting
+                above.append(there)
             waiting = waiting.f_back
         if above and above[0] != here and not here.startswith(SERVING):
             self.stays.add((above[0], here))
             if here in above:
-                self.returns.add((above[0], here))
+                assert caller is not None
+                calling = f"{above[0]}:{caller.f_code.co_name}"
+                self.returns[calling, f"{here}:{frame.f_code.co_name}"] += 1
 
 
 @cache
 def file_of(source: str) -> str | None:
-    """A file of mapvote's, from its root; None for any other."""
-    return source.removeprefix(SRC) if source.startswith(SRC) else None
+    """A file of mapvote's packages, from ``src``; None for any other."""
+    inside = source.removeprefix(SRC) if source.startswith(SRC) else ""
+    return inside if inside.startswith("mapvote") else None
 
 
 @contextmanager
@@ -181,12 +190,15 @@ def main() -> None:
             threading.setprofile(None)
             doing = [file for file in walk.files if not file.startswith(SERVING)]
             print(
-                f"| {act.__name__} | {len(walk.files)} | {len(doing)} | {len(walk.stays)} | {len(walk.returns)} |",
+                f"| {act.__name__} | {len(walk.files)} | {len(doing)} | {len(walk.stays)} | "
+                f"{walk.returns.total()} | {len(walk.returns)} |",
                 flush=True,
             )
             if options.show:
                 for pair in sorted(walk.stays):
-                    print(*pair, "(returns)" if pair in walk.returns else "", sep="  ")
+                    print(*pair, sep="  ")
+                for (calling, called), times in sorted(walk.returns.items()):
+                    print("returns", calling, called, times, sep="  ")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def test_links_and_files_that_a_page_names_are_there_and_its_prose_wraps_at_120(
     ]
     assert [link for link in links if not (page.parent / link).exists()] == []
     files = set(re.findall(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|toml|js))`", text))
-    rooms = (ROOT, ROOT / "src/mapvote", ROOT / "src/mapvote_lab", ROOT / "docs")
+    rooms = (ROOT, *(ROOT / "src" / room for room in ("", "mapvote", "mapvote_server", "mapvote_lab")), ROOT / "docs")
     assert sorted(name for name in files if not any((room / name).exists() for room in rooms)) == []
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL).splitlines()
     assert [line for line in prose if len(line) > 120 and not line.startswith(("|", "!["))] == []

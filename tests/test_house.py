@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -27,6 +28,16 @@ MOST_FUNCTION_LINES = 60
 MOST_ARGUMENTS = 8
 MOST_NAMED_TWICE = 10
 """Public functions and classes with two meanings."""
+MOST_MODULE_NAMES = 990
+"""Names bound at the top level of modules, without functions and classes."""
+MOST_LOOSE_NUMBERS = 185
+"""Numbers among them: those that kernels read, sizes of formats, bits and codes."""
+MOST_NAMES_WITH_SEVERAL_VALUES = 5
+MOST_PACKED_SHARE = 0.085
+"""Share of assignments that pack several statements into one line."""
+MOST_ODD_SENTENCES = 8
+"""Sentences of docstrings that begin with Of, What or As: their subject is missing or a clause."""
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 
 @cache
@@ -205,3 +216,109 @@ def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:
         and any(keyword.arg == "type" for keyword in call.keywords)
     ]
     assert late == [], "make a Decoder of the type at the module's top level"
+
+
+def module_constants(source: Path) -> Iterator[tuple[str, ast.expr]]:
+    """Names that a module binds at its top level, with their values; a packed assignment gives several."""
+    for node in parsed(source).body:
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                yield from unpacked(target, node.value)
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            yield from unpacked(node.target, node.value)
+
+
+def unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[str, ast.expr]]:
+    if isinstance(target, ast.Name):
+        yield target.id, value
+    elif isinstance(target, ast.Tuple):
+        values = value.elts if isinstance(value, ast.Tuple) else [value] * len(target.elts)
+        for name, one in zip(target.elts, values, strict=True):
+            yield from unpacked(name, one)
+
+
+def is_number(value: ast.expr) -> bool:
+    if isinstance(value, ast.BinOp):
+        return is_number(value.left) and is_number(value.right)
+    if isinstance(value, ast.UnaryOp):
+        return is_number(value.operand)
+    return isinstance(value, ast.Constant) and type(value.value) in (int, float)
+
+
+def docstrings(source: Path) -> Iterator[str]:
+    for node in ast.walk(parsed(source)):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef | ast.Module):
+            yield " ".join((ast.get_docstring(node) or "").split())
+
+
+def odd_sentences(text: str) -> list[str]:
+    sentences = re.split(r"(?<=[.;:])\s+", text)
+    return [s for s in sentences if len(s.split()) > 2 and s.startswith(("Of ", "What ", "As "))]
+
+
+def packs(node: ast.Assign) -> bool:
+    return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
+
+
+def patches_a_constant(call: ast.Call) -> bool:
+    return ast.unparse(call.func).endswith("monkeypatch.setattr") and any(
+        isinstance(argument, ast.Constant) and re.fullmatch(r"(.*\.)?_?[A-Z][A-Z0-9_]+", str(argument.value))
+        for argument in call.args
+    )
+
+
+def test_numbers_lie_in_records() -> None:
+    constants = [constant for source in SOURCES for constant in module_constants(source)]
+    assert len(constants) <= MOST_MODULE_NAMES
+    assert sum(is_number(value) for _, value in constants) <= MOST_LOOSE_NUMBERS
+
+
+def test_few_names_have_several_values() -> None:
+    values: dict[str, set[str]] = defaultdict(set)
+    for source in SOURCES:
+        for name, value in module_constants(source):
+            if isinstance(value, ast.Constant):
+                values[name].add(repr(value.value))
+    several = {name for name, given in values.items() if len(given) > 1}
+    assert len(several) <= MOST_NAMES_WITH_SEVERAL_VALUES, several
+
+
+def test_tests_hand_numbers_in_and_patch_no_constant() -> None:
+    patched = [
+        f"{test.relative_to(ROOT)}:{call.lineno}"
+        for test in TESTS
+        for call in ast.walk(parsed(test))
+        if isinstance(call, ast.Call) and patches_a_constant(call)
+    ]
+    assert patched == []
+
+
+def test_a_line_holds_one_assignment() -> None:
+    assigned = [n for s in SOURCES for n in ast.walk(parsed(s)) if isinstance(n, ast.Assign)]
+    assert sum(map(packs, assigned)) <= MOST_PACKED_SHARE * len(assigned)
+
+
+def test_sentences_begin_with_their_subject() -> None:
+    odd = [sentence for source in SOURCES for text in docstrings(source) for sentence in odd_sentences(text)]
+    assert len(odd) <= MOST_ODD_SENTENCES, odd
+
+
+def test_odd_sentences_and_patched_constants_are_recognised() -> None:
+    """The checks above can fail."""
+    assert odd_sentences("One ballot. Of two the newest counts: what is old goes. As before it stays.") == [
+        "Of two the newest counts:",
+        "As before it stays.",
+    ]
+    assert packs(ast.parse("a, b = 1, 2").body[0])  # type: ignore[arg-type]
+    for text, is_patch in (
+        ("setattr(m, '_LIMIT', 1)", True),
+        ("setattr('a.b.LIMIT', 1)", True),
+        ("setattr(m, 'f', 1)", False),
+    ):
+        (statement,) = ast.parse(f"monkeypatch.{text}").body
+        assert isinstance(statement, ast.Expr)
+        assert isinstance(statement.value, ast.Call)
+        assert patches_a_constant(statement.value) == is_patch
+    (constant,) = ast.parse("a, b = 2 * 3, 'text'").body
+    assert isinstance(constant, ast.Assign)
+    assert [is_number(value) for _, value in unpacked(constant.targets[0], constant.value)] == [True, False]

@@ -48,7 +48,7 @@ class ClosedStretch(NamedTuple):
     written: Callable[[], Ballot]
     """Writes the ballot: it may be called later and in another thread, and raises MapvoteError if no scan has voted."""
     report: DriveReport
-    """Of its scans."""
+    """Report on its scans."""
     point_map: PointMap
     """The map that it was driven on."""
     prior_in_map: bool

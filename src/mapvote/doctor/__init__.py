@@ -23,7 +23,7 @@ Rule = Callable[[F64], F64]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What may be wrong, and how to mend it."""
+    """A possible fault, and its mend."""
 
     name: str
     mend: str
@@ -48,7 +48,7 @@ class Finding:
     map_tells: bool = False
     """Whether a map can decide what the drive cannot: on one that it lies well on, nothing of this is left."""
     readings: tuple[Reading, ...] = ()
-    """Of a prior and its scans, among which the drive cannot decide; its map may."""
+    """Readings of a prior and its scans among which the drive cannot decide; its map may."""
 
 
 def any_error(found: Iterable[Finding]) -> bool:

@@ -86,8 +86,8 @@ class LocalisedDrive:
 
     @classmethod
     def of_report(cls, report: DriveReport, *, prior_in_map: bool = True) -> LocalisedDrive:
-        """Of the scans of ``report`` that are decided. Priors that are not in the map's frame say nothing of a scan
-        that has no sure place: where their frame lies is learnt from those that have one."""
+        """Findings on the decided scans of ``report``. Priors outside the map's frame say nothing of a scan without a
+        sure place: their frame is learnt from the scans that have one."""
         n = len(report.T_map_lidar)
         sure = np.ones(n, dtype=np.bool_)
         sure[[i for i in report.lost if i < n]] = False
@@ -130,8 +130,8 @@ def check_localised(
 def written_if_localised(
     written: Callable[[], Ballot], localised: LocalisedDrive, point_map: PointMap
 ) -> Callable[[], Ballot]:
-    """What writes the ballot of a closed stretch of road: it raises MapvoteError, too, if the vehicle did not know
-    where it was."""
+    """A function that writes the ballot of a closed stretch of road. It raises MapvoteError, too, if the vehicle did
+    not know where it was."""
 
     def checked() -> Ballot:
         for finding in check_localised(localised, point_map):

@@ -225,7 +225,7 @@ def _like_the_best(best: _Fit, fits: Sequence[_Fit], length_m: float, runs: Sequ
 
 def _for_a_map(group: Sequence[_Fit], fits: Sequence[_Fit], as_it_is: _Fit, T: F64) -> tuple[Reading, ...]:
     """The readings that a map may decide among: those that are named, then others that leave much less than the prior
-    as it is. Of those that lay the scans alike the first."""
+    as it is. The first of the readings that align the scans alike is returned."""
     others = [h for h in sorted(fits, key=lambda h: h.median) if h.special and h.median < 0.5 * as_it_is.median]
     out: list[Reading] = []
     for h in [*group, *others]:

@@ -1,9 +1,9 @@
 """Which vehicles do not count on a tile because they oppose the others (docs/decisions/voting.md).
 
-A vehicle does not count if it contradicts, nearly everywhere, what k + 1 others agree on, or nearly every
-change that k + 1 vehicles back there (it replays the old street, or saw it last). Of k + 1 vehicles at least one is
-honest, so k liars cannot exclude an honest vehicle. An honest vehicle differs from another in some per cent of the
-cells; a demolished block is some per cent of a tile. An excluded vehicle was one of the k, so k falls by one.
+A vehicle does not count if it contradicts, nearly everywhere, what k + 1 others agree on, or nearly every change that k
++ 1 vehicles back there (it replays the old street, or saw it last). At least one of k + 1 vehicles is honest, so k
+liars cannot exclude an honest vehicle. An honest vehicle differs from another in some per cent of the cells; a
+demolished block is some per cent of a tile. An excluded vehicle was one of the k, so k falls by one.
 """
 
 from __future__ import annotations

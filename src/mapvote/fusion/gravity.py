@@ -140,7 +140,7 @@ class Falling:
     reviewed: Bool | None = None
     """(256, 256) cells of changes that a reviewer holds or rejected, from which nothing falls."""
     fallen: Fallen | None = None
-    """What falls besides, as the tiles around decide."""
+    """Further voxels that fall, by the decisions of the tiles around."""
     gravity: Gravity = GRAVITY
 
 

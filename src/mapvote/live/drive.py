@@ -428,7 +428,7 @@ class LiveDrive:
             self._repeated("frame", f"odometry is in a frame of its own. Its origin in the map: {frame.told()}")
 
     def _written(self, stretch: ClosedStretch) -> Callable[[], Ballot]:
-        """What writes the ballot of a stretch that is closed."""
+        """A function that writes the ballot of a closed stretch."""
         if not self._checked:
             return stretch.written
         localised = LocalisedDrive.of_report(stretch.report, prior_in_map=stretch.prior_in_map)

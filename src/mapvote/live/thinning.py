@@ -52,7 +52,7 @@ class Thinning:
         self._crowded = False
 
     def cost(self, seconds: float) -> None:
-        """What a scan took."""
+        """Time that a scan took."""
         self._cost_s += self._rule.memory * (seconds - self._cost_s)
         self._costs_s.append(seconds)
 

@@ -1,7 +1,7 @@
 """False and missing points of a real LiDAR: mirrors, mixed pixels, surfaces that send nothing back, rain, exhaust.
 
-* A smooth surface (a puddle, a pane, a car's paint) sends the beam on. What comes back over it is reported where the
-  beam would have been without the mirror: below the road, behind the glass, inside the car.
+* A smooth surface (a puddle, a pane, a car's paint) sends the beam on. A return over it is reported where the beam
+  would have been without the mirror: below the road, behind the glass, inside the car.
 * A beam is a cone. At an edge it meets two surfaces less than a pulse's length apart, and reports a range between them.
 * Wet asphalt under a flat angle, glass and dark paint return too little to be seen.
 * Drops near the sensor return the beam before it arrives; so does the exhaust behind a car in the cold.

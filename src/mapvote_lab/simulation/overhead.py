@@ -1,4 +1,4 @@
-"""What hangs over a street: wires, foot-bridges, boards, viaducts and crowns, of which no drive sees the support."""
+"""Objects over a street: wires, foot-bridges, boards, viaducts and crowns, of which no drive sees the support."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Flaws(_Table):
 
 
 class Overhead(_Table):
-    """What hangs over the street (simulation/overhead.py), metres along it; none of it by default."""
+    """Objects over the street (simulation/overhead.py), metres along it; none by default."""
 
     wire_m: tuple[float, ...] = Field(default=(), description="three wires across, from facade to facade")
     bridge_m: tuple[float, ...] = Field(default=(), description="a foot-bridge across, its piers out of sight")

@@ -305,7 +305,7 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
 
 
 def _overhead(scenario: Scenario, bodies: list[Body], terrain: Terrain, rng: np.random.Generator) -> list[Body]:
-    """What hangs over the street, and over those of its ``bodies`` that go."""
+    """Objects over the street, and over those of its ``bodies`` that are removed."""
     found = []
     for kind, triangles, s, side in overhead.across(scenario.overhead):
         found.append(Body(kind, Side(0.0, terrain.axis_y, 0.0, side, ()).put(triangles, s, 0.0, terrain)))

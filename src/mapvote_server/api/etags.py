@@ -1,4 +1,4 @@
-"""What the client has already: If-None-Match (RFC 9110, 13.1.2)."""
+"""Tags of content that the client has already: If-None-Match (RFC 9110, 13.1.2)."""
 
 from __future__ import annotations
 

@@ -151,7 +151,8 @@ async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
 @on("questions")
 def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
-    """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
+    """Each ballot's statement on the cell at (x, y), map metres, whether it counts, and the decision of each
+    version."""
     return as_json(explain_cell(parts.store, x, y, known=known))
 
 

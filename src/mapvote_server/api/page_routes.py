@@ -90,7 +90,7 @@ def level_of(
 def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
     """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
 
-    Of one ``vehicle`` only for reviewers and operators.
+    The votes of one ``vehicle`` are open to reviewers and operators only.
     """
     if vehicle is not None:
         name_of(request, "reviewer", "operator")

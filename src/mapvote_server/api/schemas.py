@@ -1,5 +1,5 @@
-"""What clients of the API send and are answered, as OpenAPI declares it to programs in other languages; and the one
-table from errors to status codes.
+"""Requests and answers of the API, as OpenAPI declares them to programs in other languages; and the one table from
+errors to status codes.
 
 Routes encode their answers themselves (:func:`as_json`). A test holds every answer to its model: it has the model's
 members and no others.

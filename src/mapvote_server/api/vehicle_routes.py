@@ -73,7 +73,7 @@ def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
     summary="Manifest of one version",
 )
 async def one_version(request: Request, number: Number, since: VersionQuery | None = None) -> Response:
-    """As ``/v1/map``, of any version; one that does not exist is 404."""
+    """The answer of ``/v1/map`` for any version; one that does not exist is 404."""
     return await _manifest(request, number, since)
 
 

@@ -1,4 +1,4 @@
-"""What was built and demolished between two versions: compared once, kept by the two."""
+"""Built and demolished objects between two versions: compared once, kept by the two versions."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Comparison:
 
 @dataclass(slots=True)
 class _Pair:
-    """What was found of two versions so far: a comparison that ran out of time goes on from there."""
+    """Results for two versions so far: a comparison that ran out of time goes on from there."""
 
     comparing: Lock = field(default_factory=Lock)
     tiles: dict[TileIndex, ChangedCells | None] = field(default_factory=dict)
@@ -84,8 +84,8 @@ class _Kept:
         """The last event that the pairs know of."""
 
     def pair(self, connection: sa.Connection, old: int, new: int) -> _Pair:
-        """Of two versions. All are forgotten once a plane or a ballot is not what it was: what was cleared away, set
-        aside or mended may have been a part of any."""
+        """Comparisons by their two versions. All are forgotten once a plane or a ballot is cleared away, set aside or
+        mended: it may have been a part of any."""
         with self._lock:
             mark = self._mark
             if mark is not None and (cleared_since(connection, mark) or hurt_or_mended_since(connection, mark)):
@@ -212,8 +212,8 @@ def tiles_at(store: Store, version: int) -> Tiles:
 
 
 def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) -> list[Decided]:
-    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted;
-    MapvoteError if a record is damaged."""
+    """The decisions of the versions after ``old`` up to ``new`` on a tile, and the ballots that counted; MapvoteError
+    if a record is damaged."""
     records = records_of(connection, index, after=old, upto=new)
     counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
     sound = sound_votes(connection, index, counted)

@@ -154,7 +154,7 @@ def last_events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
 class Feed:
     """The latest events of one store, kept for all listeners; thread-safe.
 
-    Of the listeners that call :meth:`after` within ``poll_s`` seconds, the first polls the database.
+    The first listener that calls :meth:`after` within ``poll_s`` seconds polls the database.
     """
 
     def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:

@@ -142,7 +142,7 @@ class Open:
 
     @property
     def index(self) -> TileIndex:
-        """Of its tile."""
+        """Index of its tile."""
         return self.tile.index
 
     @property

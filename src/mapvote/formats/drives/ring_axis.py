@@ -23,7 +23,7 @@ class RingAxisRules:
     lean_deg: float = 16.0
     """Farthest from z."""
     points: int = 3000
-    """Of a scan that are looked at."""
+    """Points of a scan that are examined."""
     far_m: float = 8.0
     """Nearer points are left out: the beams of large sensors do not start in one point."""
     bin_deg: tuple[float, ...] = (0.4, 0.2, 0.1)
