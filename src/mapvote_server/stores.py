@@ -129,10 +129,10 @@ def check_store(store: Store) -> list[Finding]:
         if count > _LISTED:
             found.append(Finding("error", f"damaged: {count - _LISTED} more of the kind {kind}", _MEND))
     glance = overview(store)
-    sizes = ", ".join(f"{glance[key]:,} {key.replace('_', ' ')}" for key in _SIZES)
-    found.append(Finding("note", f"version {glance['version']}: {sizes}"))
-    if glance["quarantined"]:
-        what = f"{glance['quarantined']} damaged things were set aside: their votes and tiles do not count"
+    sizes = ", ".join(f"{getattr(glance, key):,} {key.replace('_', ' ')}" for key in _SIZES)
+    found.append(Finding("note", f"version {glance.version}: {sizes}"))
+    if glance.quarantined:
+        what = f"{glance.quarantined} damaged things were set aside: their votes and tiles do not count"
         found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
     valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
     if valid["operator"]:

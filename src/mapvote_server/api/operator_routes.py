@@ -23,12 +23,10 @@ from mapvote_server.api.schemas import (
     Coverage,
     Digest,
     Health,
-    Info,
     IssueAsk,
     KeyIssued,
     KeysAnswer,
     KeysRevoked,
-    Log,
     Metres,
     Passes,
     Places,
@@ -54,7 +52,7 @@ from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Servic
 from mapvote_server.errors import Held, Unavailable
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.explain import CellStory, explain_cell
-from mapvote_server.questions.history import log_of, overview
+from mapvote_server.questions.history import Info, Log, log_of, overview
 from mapvote_server.questions.vehicles import (
     contradictions,
     standing_rows,
@@ -165,10 +163,11 @@ def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
 @on("questions")
 def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
-    answer = tiles_seen(parts.store, known)
-    if format == "csv":
-        return as_table(answer)
-    return as_json(tile_squares(answer, parts.store.lattice) if format == "geojson" else {"tiles": answer})
+    tiles = tiles_seen(parts.store, known)
+    if format == "json":
+        return as_json({"tiles": tiles})
+    rows = [asdict(tile) for tile in tiles]
+    return as_table(rows) if format == "csv" else as_json(tile_squares(rows, parts.store.lattice))
 
 
 @router.get("/v1/coverage/passes", response_model=Passes, responses=problems(403), summary="Where to drive next")
@@ -284,10 +283,7 @@ async def clear_now(by: Operator, parts: Parts) -> Response:
 @on("questions")
 def listed_keys(by: Operator, parts: Parts) -> Response:
     """All keys ever issued, revoked and expired ones too."""
-    standing, now = keys.ballots_standing(parts.store), parts.store.clock()
-    listed = keys.listed(parts.store)
-    told = [asdict(key) | {"valid": key.valid_at(now), "ballots": standing.get(key.name, 0)} for key in listed]
-    return as_json({"keys": told})
+    return as_json({"keys": keys.entries(parts.store)})
 
 
 @router.post("/v1/keys", response_model=KeyIssued, responses=problems(403, 409), summary="Issue a key")

@@ -34,7 +34,8 @@ from mapvote_server.errors import (
     Unavailable,
 )
 from mapvote_server.questions.explain import FARTHEST_M
-from mapvote_server.questions.vehicles import VehicleStanding
+from mapvote_server.questions.history import DatedVersion
+from mapvote_server.questions.vehicles import CoveredTile, VehicleStanding
 from mapvote_server.store import keys
 from mapvote_server.store.integrity import Damage
 from mapvote_server.store.policy import Policy, names_in
@@ -175,24 +176,6 @@ def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **in
 
 Planes = _answer_of(TileHashes, leave_out=["memory"])
 ManifestAnswer = _answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[valid-type]
-
-
-class VersionEntry(Answer):
-    """The origin of a version."""
-
-    number: int
-    parent: int | None
-    kind: Literal["import", "publish", "rollback", "replay"]
-    target: int | None = Field(description="of a rollback or replay: the version it goes back to")
-    published_by: str
-    reason: str
-
-
-class DatedVersion(VersionEntry):
-    """A version with the policy that it was made by."""
-
-    created: str
-    policy: dict[str, Any]
 
 
 class Withdrawn(Answer):
@@ -358,71 +341,10 @@ class Passes(Places):
     damaged: list[str] = Field(description="tiles that cannot be read, and are left out")
 
 
-class CoveredTile(Answer):
-    """Row and column of a tile, how many vehicles saw it, and when the last did."""
-
-    row: int
-    col: int
-    vehicles: int
-    last_seen: str | None
-
-
-class Info(Answer):
-    """The content of the store."""
-
-    map_id: str
-    version: int
-    published_ns: int
-    oldest_version: int
-    tiles: int
-    fields: str
-    ballots: int
-    vehicles: int
-    votes_on_tiles: int
-    planes: int
-    plane_bytes: int
-    quarantined: int
-
-
-class LoggedVersion(VersionEntry):
-    """A version in the log."""
-
-    created_ns: int
-
-
-class LoggedEvent(Answer):
-    """One line of the log."""
-
-    seq: int
-    at_ns: int
-    kind: str
-    actor: str
-    detail: str
-
-
-class Log(Answer):
-    """Versions oldest first, events newest first."""
-
-    versions: list[LoggedVersion]
-    events: list[LoggedEvent]
-
-
 class Restored(Answer):
     """A plane is as it was written; ``restored``: by this request."""
 
     restored: bool
-
-
-class KeyEntry(Answer):
-    """A key that was issued; never the key itself."""
-
-    name: str
-    role: str
-    created_ns: int
-    revoked_ns: int | None
-    expires_ns: int | None
-    valid: bool
-    ballots: int = Field(description="standing ballots of this name")
 
 
 class KeysRevoked(Answer):
@@ -455,7 +377,7 @@ RolledBack = _answer("RolledBack", "The new version.", version=int)
 Coverage = _answer("Coverage", "Extent of all tiles of the map and of standing ballots.", tiles=list[CoveredTile])
 Vehicles = _answer("Vehicles", "By name.", vehicles=list[VehicleStanding])
 Checked = _answer("Checked", "The damaged items.", damage=list[Damage])
-KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=list[KeyEntry])
+KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=list[keys.KeyEntry])
 KeyIssued = _answer("KeyIssued", "The only time that the key is seen.", key=str)
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}

@@ -5,6 +5,7 @@ OpenAPI is the contract for vehicles in other languages: every answer is declare
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
+from dataclasses import asdict
 from typing import Any
 
 import msgspec
@@ -13,7 +14,6 @@ from fastapi.routing import APIRoute
 
 from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import TILE_PLANE_SIZES
-from mapvote.shapes.geojson import utc
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
@@ -33,10 +33,9 @@ from mapvote_server.api.schemas import (
     problems,
 )
 from mapvote_server.api.services import Known, Parts, own, services
-from mapvote_server.questions.history import origin_of
+from mapvote_server.questions.history import dated_versions
 from mapvote_server.store.admission import Intake, Receipt
 from mapvote_server.store.examination import Examination, Incoming
-from mapvote_server.store.policy import without_drive
 from mapvote_server.store.votes import withdraw
 
 router = APIRouter()
@@ -58,12 +57,10 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
 def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by. Only reviewers and operators see the name of the
     policy's gate drive."""
-    found = parts.store.versions()
-    listed = [origin_of(v) | {"created": utc(v.created_ns)} for v in found]
+    listed = dated_versions(parts.store, known)
     if format == "csv":
-        return as_table(listed)
-    policies = [v.policy if known else without_drive(v.policy) for v in found]
-    return as_json({"versions": [one | {"policy": said} for one, said in zip(listed, policies, strict=True)]})
+        return as_table([{name: value for name, value in asdict(one).items() if name != "policy"} for one in listed])
+    return as_json({"versions": listed})
 
 
 @router.get(

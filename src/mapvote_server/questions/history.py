@@ -6,20 +6,24 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from threading import Lock
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
+from pydantic import Field
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
 from mapvote.core.types import MapvoteError
+from mapvote.shapes.geojson import utc
+from mapvote_server.answers import answer
 from mapvote_server.errors import Unavailable
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import set_aside
 from mapvote_server.store.keys import hash_of
+from mapvote_server.store.policy import without_drive
 from mapvote_server.store.queries import (
     Version,
     current_number,
@@ -34,7 +38,85 @@ from mapvote_server.store.store import Store
 _LOOKED_AT = 3
 
 
-def overview(store: Store) -> dict[str, Any]:
+@answer
+@dataclass(frozen=True, slots=True)
+class Info:
+    """The content of the store."""
+
+    map_id: str
+    version: int
+    published_ns: int
+    oldest_version: int
+    tiles: int
+    fields: str
+    ballots: int
+    vehicles: int
+    votes_on_tiles: int
+    planes: int
+    plane_bytes: int
+    quarantined: int
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class VersionEntry:
+    """The origin of a version."""
+
+    number: int
+    parent: int | None
+    kind: Literal["import", "publish", "rollback", "replay"]
+    target: Annotated[int | None, Field(description="of a rollback or replay: the version it goes back to")]
+    published_by: str
+    reason: str
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class DatedVersion(VersionEntry):
+    """A version with the policy that it was made by."""
+
+    created: str
+    policy: dict[str, Any]
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class LoggedVersion(VersionEntry):
+    """A version in the log."""
+
+    created_ns: int
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class LoggedEvent:
+    """One line of the log."""
+
+    seq: int
+    at_ns: int
+    kind: str
+    actor: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event(LoggedEvent):
+    """One line of the log, as listeners get it."""
+
+    version: int
+    """The newest version when the event was read."""
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Log:
+    """Versions oldest first, events newest first."""
+
+    versions: list[LoggedVersion]
+    events: list[LoggedEvent]
+
+
+def overview(store: Store) -> Info:
     """The figures of `mapvote info`."""
     b, t = schema.ballots, schema.ballot_tiles
     standing = sa.select(sa.func.count(), sa.func.count(sa.distinct(b.c.vehicle))).where(b.c.gone_seq.is_(None))
@@ -46,20 +128,20 @@ def overview(store: Store) -> dict[str, Any]:
         ).one()
         votes = connection.execute(sa.select(sa.func.count()).select_from(t)).scalar_one()
         tiles = tiles_of(connection, newest.number)
-        return {
-            "map_id": store.map_id,
-            "version": newest.number,
-            "published_ns": newest.created_ns,
-            "oldest_version": oldest_kept(connection),
-            "tiles": len(tiles),
-            "fields": _fields(connection, tiles.values()),
-            "ballots": ballots,
-            "vehicles": vehicles,
-            "votes_on_tiles": votes,
-            "planes": planes,
-            "plane_bytes": int(size),
-            "quarantined": len(set_aside(connection)),
-        }
+        return Info(
+            map_id=store.map_id,
+            version=newest.number,
+            published_ns=newest.created_ns,
+            oldest_version=oldest_kept(connection),
+            tiles=len(tiles),
+            fields=_fields(connection, tiles.values()),
+            ballots=ballots,
+            vehicles=vehicles,
+            votes_on_tiles=votes,
+            planes=planes,
+            plane_bytes=int(size),
+            quarantined=len(set_aside(connection)),
+        )
 
 
 def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
@@ -75,16 +157,27 @@ def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
     return ", ".join(names) or "none"
 
 
-def origin_of(version: Version) -> dict[str, Any]:
-    """Where a version comes from."""
-    columns = ("number", "parent", "kind", "target", "published_by", "reason")
-    return {name: getattr(version, name) for name in columns}
+def _origin_of(version: Version) -> dict[str, Any]:
+    """The members of a :class:`VersionEntry`."""
+    return {member.name: getattr(version, member.name) for member in fields(VersionEntry)}
 
 
-def log_of(store: Store, last: int) -> dict[str, Any]:
+def dated_versions(store: Store, known: bool) -> list[DatedVersion]:
+    """The versions, oldest first. The name of the policy's gate drive is left out unless the asker is ``known``."""
+    return [
+        DatedVersion(
+            **_origin_of(version),
+            created=str(utc(version.created_ns)),
+            policy=dict(version.policy if known else without_drive(version.policy)),
+        )
+        for version in store.versions()
+    ]
+
+
+def log_of(store: Store, last: int) -> Log:
     """The versions, oldest first, and the ``last`` so many events, newest first."""
-    versions = [origin_of(version) | {"created_ns": version.created_ns} for version in store.versions()]
-    return {"versions": versions, "events": last_events(store, last) if last else []}
+    versions = [LoggedVersion(**_origin_of(version), created_ns=version.created_ns) for version in store.versions()]
+    return Log(versions, last_events(store, last) if last else [])
 
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
@@ -94,19 +187,6 @@ OF_VEHICLES = ("ballot", "withdraw", "two places")
 _MOST = 500
 POLL_S = 0.9
 """Least time between two polls of the database."""
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One line of the log."""
-
-    seq: int
-    at_ns: int
-    kind: str
-    actor: str
-    detail: str
-    version: int
-    """The newest version when the event was read."""
 
 
 def newest_event(store: Store) -> int:
@@ -143,12 +223,12 @@ def events_after(store: Store, seq: int) -> list[Event]:
     return [Event(*row, version) for row in rows]
 
 
-def last_events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
+def last_events(store: Store, limit: int = 100) -> list[LoggedEvent]:
     """The last events, newest first."""
     e = schema.events.c
     query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
     with store.database.reading() as connection:
-        return [dict(row._mapping) for row in connection.execute(query)]
+        return [LoggedEvent(*row) for row in connection.execute(query)]
 
 
 class Feed:

@@ -26,6 +26,7 @@ from mapvote.core.types import F32, I64, U8, CellState
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.shapes.geojson import collection, utc
 from mapvote.shapes.outlines import pieces
+from mapvote_server.answers import answer
 from mapvote_server.questions.explain import said_by, seen, votes_on
 from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
@@ -272,7 +273,18 @@ def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
     return [{f.name: getattr(s, f.name) for f in fields(s) if f.name != "evidence"} for s in standings]
 
 
-def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:
+@answer
+@dataclass(frozen=True, slots=True)
+class CoveredTile:
+    """Row and column of a tile, how many vehicles saw it, and when the last did."""
+
+    row: int
+    col: int
+    vehicles: int
+    last_seen: str | None
+
+
+def tiles_seen(store: Store, known: bool) -> list[CoveredTile]:
     """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
     ``known``, see :func:`mapvote_server.questions.explain.seen`."""
     b, t = schema.ballots, schema.ballot_tiles
@@ -284,7 +296,7 @@ def tiles_seen(store: Store, known: bool) -> list[dict[str, Any]]:
         )
         tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
     return [
-        {"row": index[0], "col": index[1], "vehicles": vehicles, "last_seen": utc(seen(last_ns, known))}
+        CoveredTile(row=index[0], col=index[1], vehicles=vehicles, last_seen=utc(seen(last_ns, known)))
         for index, (last_ns, vehicles) in sorted(tiles.items())
     ]
 

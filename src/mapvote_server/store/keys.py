@@ -7,13 +7,14 @@ import hmac
 import re
 import secrets
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 import sqlalchemy as sa
 
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
+from mapvote_server.answers import answer
 from mapvote_server.errors import Conflict, NotFound, Unauthorised
 from mapvote_server.store import schema
 from mapvote_server.store.queries import end_votes, log_event
@@ -110,6 +111,26 @@ def ballots_standing(store: Store) -> dict[str, int]:
     query = sa.select(b.vehicle, sa.func.count()).where(b.gone_seq.is_(None)).group_by(b.vehicle)
     with store.database.reading() as connection:
         return {vehicle: int(count) for vehicle, count in connection.execute(query)}
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class KeyEntry(Key):
+    """A key that was issued; never the key itself."""
+
+    expires_ns: int | None
+    valid: bool
+    ballots: int
+    """standing ballots of this name"""
+
+
+def entries(store: Store) -> list[KeyEntry]:
+    """All keys ever issued, oldest first."""
+    standing = ballots_standing(store)
+    now_ns = store.clock()
+    return [
+        KeyEntry(**asdict(key), valid=key.valid_at(now_ns), ballots=standing.get(key.name, 0)) for key in listed(store)
+    ]
 
 
 def listed(store: Store) -> list[Key]:

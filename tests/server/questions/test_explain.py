@@ -150,9 +150,9 @@ def test_of_copies_the_story_says_that_one_counts_and_the_log_whose_they_are_onc
     assert {vote.vehicle: vote.left_out_of for vote in story(store).votes} == {
         "a": (LeftOut(2, REASONS["copy"]),), "b": (), "liar": ()
     }  # fmt: skip
-    (told,) = [event for event in last_events(store) if event["kind"] == "copy"]
-    assert told["detail"].startswith("a's ballot ")
-    assert "is a copy of liar's " in told["detail"]
+    (told,) = [event for event in last_events(store) if event.kind == "copy"]
+    assert told.detail.startswith("a's ballot ")
+    assert "is a copy of liar's " in told.detail
 
 
 def test_the_story_of_a_cell_of_many_versions_decides_its_tile_once(

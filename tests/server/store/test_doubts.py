@@ -63,8 +63,8 @@ def test_a_change_against_what_as_many_vehicles_said_is_told_and_can_be_held(
     assert desk(store).held == [told]
     done = publish(store, override=True)
     assert done.deleted == 9
-    events = [event for event in last_events(store) if event["kind"] == "doubt"]
-    assert [event["detail"] for event in events] == [f"v{done.version}: {told}"]
+    events = [event for event in last_events(store) if event.kind == "doubt"]
+    assert [event.detail for event in events] == [f"v{done.version}: {told}"]
     assert not publish(store).published
     assert list(preview(store).doubts) == []
 

@@ -140,7 +140,7 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
         connection.execute(b.update().where(b.c.hash == digest).values(data=broken))
     assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", digest)]
     assert not publish(store).published, "its points would lose them"
-    assert overview(store)["fields"] == ", ".join(KINDS), "the other tile's"
+    assert overview(store).fields == ", ".join(KINDS), "the other tile's"
     with store.database.reading() as connection:
         assert list(set_aside(connection)) == [("plane", digest)]
     assert digest is not None

@@ -172,6 +172,6 @@ def test_a_plane_is_put_back_from_another_store_and_nothing_else_is_taken(
     assert len(check(store)) == 1
     assert restore_plane(store, points, sound, by="boss")
     (event,) = last_events(store, 1)
-    assert (event["kind"], event["actor"], event["detail"]) == ("mended", "boss", f"plane {points}")
+    assert (event.kind, event.actor, event.detail) == ("mended", "boss", f"plane {points}")
     assert check(store) == []
     assert publish(store).published
