@@ -36,6 +36,8 @@ class HeadLimits:
     """Bytes of a request's line and headers."""
     linger_s: float = 1.0
     """Time for which bytes after a refusal are discarded, seconds."""
+    surplus_bytes: int = 1_000_000
+    """Bytes that nobody reads and that are discarded; after more of them the connection is not read any more."""
 
 
 HEAD_LIMITS = HeadLimits()
@@ -188,6 +190,8 @@ class Connection(asyncio.Protocol):
         """Bytes of the head so far; None from its end to the end of its request's body."""
         self._held = b""
         """The end of a head that waits in line."""
+        self._surplus = 0
+        """Bytes that were discarded."""
         self._asked = self._answering = False
         self._body_left = self._refused = self._pipelined = False
         self._in_line = self._waits = False
@@ -206,17 +210,19 @@ class Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Whatever comes between two requests, even a single byte, starts the clock of the next one's head."""
         if self._refused:
+            self._discard(data)
             return
         if self._waits:
             self._held += data
             return
         if self._answering and not self._body_left:
-            self._pipelined = True  # thrown away: the connection ends after this answer
+            self._pipelined = True  # the connection ends after this answer
+            self._discard(data)
             return
         if self._head is not None:
             self._head += data
             end = _END_OF_HEAD.search(self._head, 0, HEAD_LIMITS.head_bytes)
-            fault = _fault_of(bytes(self._head[: end.end()] if end else self._head))
+            fault = _fault_of(bytes(self._head[: end.end() if end else HEAD_LIMITS.head_bytes]))
             if fault is None and end is None and len(self._head) > HEAD_LIMITS.head_bytes:
                 fault = _TOO_LARGE
             if fault is not None:
@@ -275,6 +281,15 @@ class Connection(asyncio.Protocol):
             self.transport.resume_reading()
             self._pass_on(data)
 
+    def _discard(self, data: bytes) -> None:
+        """Discard bytes that nobody reads: to take them as fast as they come would cost the other clients their turns."""
+        self._surplus += len(data)
+        if self._surplus > HEAD_LIMITS.surplus_bytes:
+            self.transport.pause_reading()
+            if self._refused:
+                self._stop()
+                self._clock = self._loop.call_later(HEAD_LIMITS.linger_s, self.transport.abort)
+
     def _pass_on(self, data: bytes) -> None:
         _CONNECTION.set(self)
         self._inner.data_received(data)
@@ -323,17 +338,23 @@ class Connection(asyncio.Protocol):
         return self._pipelined or (conn.their_state is h11.DONE and bool(conn.trailing_data[0]))
 
     def end_request(self) -> None:
-        """Its answer is sent. The rest of an unread body stays under its clock; h11 discards it."""
+        """Its answer is sent. A connection with an unread body ends: its rest is discarded under the body's clock."""
         if not self._answering:
             return
         self._answering = False
         self._key_known_before, self._key_known = self._key_known, False
-        self._head = None if self._body_left else bytearray()
         self.step_aside()
         self._crowd.silent(self)
         if self._pipelined:
             self._refused = True
             self.transport.close()
+        elif self._body_left and cast("Any", self._inner).conn.their_state is h11.SEND_BODY:
+            self._refused = True
+            if not self.transport.is_closing():
+                self.transport.write_eof()
+        else:
+            self.end_body()
+            self._head = bytearray()
 
     def _start(self, seconds: float) -> None:
         self._clock = self._loop.call_later(seconds, self._too_slow)

@@ -34,20 +34,22 @@ from mapvote_server.store import keys
 
 @record()
 @dataclass(frozen=True, slots=True)
-class KeyGuess:
-    """Numbers of the defence against guessed keys."""
+class Floods:
+    """Numbers of the defence against guessed keys and floods of requests."""
 
     remembered: int = 10_000
     """Keys that are remembered as right."""
     pause_s: float = 1.0
-    """Pause before the answer to a wrong key of an address that sent too many, seconds."""
+    """Pause before the refusal of who sends too many requests or wrong keys, seconds."""
     per_minute: float = 60.0
     """Wrong keys of one address per minute that are answered without a pause."""
     at_once: int = 120
     """Wrong keys of one address at once that are answered without a pause."""
+    request_s: float = 0.001
+    """CPU time in the event loop that a request is charged to the budget of its key, beside its work, seconds."""
 
 
-KEY_GUESS = KeyGuess()
+FLOODS = Floods()
 
 
 class Guard:
@@ -67,7 +69,7 @@ class Guard:
         self._opened = opened
         self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
         self._known: dict[str, keys.Key] = {}
-        self._wrong = RateLimit(KEY_GUESS.per_minute, KEY_GUESS.at_once, "wrong keys")
+        self._wrong = RateLimit(FLOODS.per_minute, FLOODS.at_once, "wrong keys")
 
     async def who(
         self, authorization: str | None, peer: str, *, ballot: bool = False
@@ -76,7 +78,7 @@ class Guard:
 
         Unauthorised if the key is missing, unknown or revoked; of a ``ballot`` a known key passes, and the store
         decides. TooMany in its place if ``peer`` has sent many wrong keys. A right key never waits for wrong ones:
-        every key is looked up, and only the answer to a wrong one is delayed.
+        every key is looked up, and only the refusal is delayed (:class:`Watch`).
         """
         if self._owner is not None:
             return self._owner, None
@@ -91,7 +93,7 @@ class Guard:
         key = self._known.get(digest) if ballot else None
         if key is None:
             key = await self._look_up(digest, peer)
-            if len(self._known) > KEY_GUESS.remembered:
+            if len(self._known) > FLOODS.remembered:
                 self._known.clear()
             self._known[digest] = key
         return key, digest
@@ -101,12 +103,7 @@ class Guard:
             return await self._parts.known_keys.put(digest)
         except Unauthorised:
             self._known.pop(digest, None)
-            try:
-                self._wrong.take(peer)
-            except TooMany:
-                step_aside()
-                await asyncio.sleep(KEY_GUESS.pause_s)  # a flood waits for its answers instead of sending more
-                raise
+            self._wrong.take(peer)
             raise
 
 
@@ -211,6 +208,7 @@ class Watch:
         self._proxies = proxies
         self._metrics = parts.metrics
         self._ready = parts.check_ready
+        self._budget = parts.budget
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -237,11 +235,16 @@ class Watch:
             whose = await self._guard.who(authorization, peer, ballot=ballot)
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
+            privileged = key is None or key.role in ("reviewer", "operator")
+            identify(key.name if key else "", privileged=privileged)
             if key_hash is not None and key is not None:
                 asker.set(key.name)
-            identify(key.name if key else "", privileged=key is None or key.role in ("reviewer", "operator"))
+                self._charge(key.name, privileged=privileged)
             await self._app(scope, receive, watched)
         except MapvoteError as error:
+            if isinstance(error, TooMany):  # a flood waits for its refusals instead of sending more
+                step_aside()
+                await asyncio.sleep(FLOODS.pause_s)
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
             probed = asks and scope["path"] in PROBES
             if isinstance(error, Unauthorised) and asks and scope["path"] == key_form.STYLE:
@@ -261,6 +264,13 @@ class Watch:
             tell = log.warning if status >= 500 else log.info
             name = key.name if key else "-"
             tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))
+
+    def _charge(self, name: str, *, privileged: bool) -> None:
+        """Charge a request to its key; TooMany if the key of a vehicle or reader has used up its budget. Reviewers and
+        operators can still send commands then."""
+        if not privileged:
+            self._budget.check(name)
+        self._budget.spend(name, FLOODS.request_s, 0)
 
     async def _let_in(self, scope: Scope, receive: Receive, peer: str) -> Response:
         """The answer to the form that asks for a key."""

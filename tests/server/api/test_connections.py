@@ -132,10 +132,15 @@ def test_requests_before_the_answer_to_the_first_end_the_connection(line: socket
 def test_one_after_another_on_one_connection_all_are_answered(line: socket.socket) -> None:
     for _ in range(50):
         line.sendall(ONE)
-        said = line.recv(1 << 16)
-        while not said.endswith(b"}"):
-            said += line.recv(1 << 16)
-        assert said.startswith(b"HTTP/1.1 200 ")
+        assert answered(line) == 200
+
+
+def answered(line: socket.socket) -> int:
+    """Status of a whole answer in JSON."""
+    said = line.recv(1 << 16)
+    while not said.endswith(b"}"):
+        said += line.recv(1 << 16)
+    return int(said.split()[1])
 
 
 @pytest.mark.parametrize(
@@ -172,10 +177,52 @@ def test_a_head_of_more_than_32_kb_is_431_and_the_end_of_the_connection(line: so
     assert not before or line.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
     line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
     start = time.monotonic()
-    with suppress(ConnectionError):
-        line.sendall(b"a" * 40_000_000)  # thrown away as it comes, or cut
+    assert flooded(line) < 20_000_000
     assert b"HTTP/1.1 431 " in until_cut(line)
     assert time.monotonic() - start < PATIENT_S
+
+
+def flooded(connection: socket.socket, most: int = 40_000_000) -> int:
+    """Bytes that the other side takes until it hangs up; buffers of both systems hold some megabytes of them."""
+    sent = 0
+    with suppress(ConnectionError, TimeoutError):
+        while sent < most:
+            sent += connection.send(bytes(100_000))
+    return sent
+
+
+def unread(body: bytes, declared: int) -> bytes:
+    """A request that is refused by its head."""
+    head = f"PUT /v1/ballots/a/d1 HTTP/1.1\r\nHost: evil.example\r\nContent-Length: {declared}\r\n\r\n"
+    return head.encode() + body
+
+
+def test_a_body_that_nobody_reads_is_read_no_longer_and_ends_its_connection(line: socket.socket) -> None:
+    line.sendall(unread(b"", 1 << 30))
+    assert answered(line) == 403
+    assert flooded(line) < 20_000_000
+
+
+def test_after_a_body_that_nobody_reads_no_other_request_is_taken(line: socket.socket) -> None:
+    line.sendall(unread(b"ju", 4))
+    assert answered(line) == 403
+    line.sendall(b"nk" + ONE)
+    assert until_cut(line) == b""
+
+
+def test_after_a_whole_body_that_nobody_reads_the_next_head_is_looked_at(line: socket.socket) -> None:
+    for _ in range(2):
+        line.sendall(unread(b"junk", 4))
+        assert answered(line) == 403
+    line.sendall(ONE)
+    assert answered(line) == 200
+    line.sendall(ONE.replace(b"\r\n", b"\n"))
+    assert line.recv(1 << 16).startswith(b"HTTP/1.1 400 ")
+
+
+def test_bytes_that_follow_a_request_are_read_no_longer(line: socket.socket) -> None:
+    line.sendall(ONE)
+    assert flooded(line) < 20_000_000
 
 
 def test_a_head_just_below_32_kb_is_read(url: str) -> None:

@@ -11,11 +11,16 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from fastapi.testclient import TestClient
 
 from hand_made import two_walls
+from mapvote.config import ServerSettings, Settings
+from mapvote_server.api.app import create_app
 from mapvote_server.api.lanes import QUEUES, Budget, Lane, asker
+from mapvote_server.api.security import FLOODS
 from mapvote_server.errors import TooMany, TooSlow
 from mapvote_server.store.database import Database
+from mapvote_server.store.keys import issue
 from mapvote_server.store.store import Store
 from mapvote_server.work import Work, check_time, count_rows, current
 
@@ -227,4 +232,26 @@ def test_a_probe_neither_waits_for_a_writer_nor_looks_twice_at_once(tmp_path: Pa
         probe.close()
 
     asyncio.run(story())
+    store.close()
+
+
+def test_a_key_without_budget_waits_for_its_refusal_and_operators_still_command(tmp_path: Path) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    vehicle, operator = issue(store, "v1", "vehicle"), issue(store, "boss", "operator")
+    settings = Settings(server=ServerSettings(work_s_per_minute=0.01))
+    with TestClient(create_app(store, settings), base_url="http://localhost") as client:
+
+        def ask(method: str, path: str, key: str, body: object = None) -> int:
+            return client.request(method, path, headers={"Authorization": f"Bearer {key}"}, json=body).status_code
+
+        assert ask("GET", "/v1/map", vehicle) == 200
+        while ask("GET", "/healthz", vehicle) == 200:
+            pass
+        begun_s = time.monotonic()
+        refused = client.get("/v1/map", headers={"Authorization": f"Bearer {vehicle}"})
+        assert (refused.status_code, int(refused.headers["retry-after"]) >= 1) == (429, True)
+        assert time.monotonic() - begun_s >= FLOODS.pause_s
+        while ask("GET", "/v1/info", operator) == 200:
+            pass
+        assert ask("POST", "/v1/keys/revoke", operator, {"name": "v1"}) == 200
     store.close()
