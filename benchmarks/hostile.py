@@ -120,6 +120,11 @@ async def pipelined(at: Target, turn: int) -> None:
         writer.transport.abort()
 
 
+async def manifest(at: Target, turn: int) -> None:
+    """A cheap answer, again and again."""
+    await ask(at.address, "GET", "/v1/map", at.keys["bad7"])
+
+
 async def stream(at: Target, turn: int) -> None:
     await hold(at.address, head("GET /v1/events", at.keys["bad1"]))
 
@@ -177,6 +182,7 @@ async def large_head(at: Target, turn: int) -> None:
 ATTACKS: dict[str, tuple[int, Callable[[Target, int], Awaitable[None]]]] = {
     "reads": (40, greedy_read),
     "mixed reads": (48, mixed_read),
+    "manifests": (200, manifest),
     "pipelined": (200, pipelined),
     "streams": (40, stream),
     "dear ballots": (4, dear_upload),

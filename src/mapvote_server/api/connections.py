@@ -7,14 +7,15 @@ trailers) to ``HeadLimits.head_bytes``, too.
 
 Requests are parsed in one thread, so their order decides who waits. A request that came before the answer to the one
 before it (pipelining) is not read: its connection is closed after that answer, as RFC 9112, 9.3.2 lets a server do.
-Only a few requests of one address are under way at a time until their key is known (:class:`Line`).
+Only a few requests of one key, or of one address without a right key, are under way at a time (:class:`Line`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import re
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
+from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, cast
@@ -58,7 +59,9 @@ class Crowding:
     headers: int = 100
     """Headers of one request, at most."""
     strangers: int = 8
-    """Requests of one address under way at a time whose key is not known yet."""
+    """Requests of one address under way at a time without a right key: probes, without any key, with a new one."""
+    of_key: int = 32
+    """Requests of one right key under way at a time."""
     kept: int = 8
     """Connections beyond the limit for probes and for keys of reviewers and operators."""
 
@@ -138,46 +141,63 @@ class Crowd:
         return next(one for one in reversed(self._busy) if one.holder == holder and not one.privileged)
 
 
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who sends a request, as far as its head tells."""
+
+    name: str = ""
+    """The hash of a right key; else what kind of request of an address it is."""
+    has_key: bool = False
+    """Whether its key was right when it came last."""
+
+
 class Line:
-    """Requests whose key is not known yet: so many of one address at a time, the others wait in order."""
+    """Requests that wait for others of the same caller: so many at a time, the others wait in order."""
 
     def __init__(self, numbers: Crowding = CROWDING) -> None:
-        self._at_once = numbers.strangers
-        self._under_way: Counter[str] = Counter()
-        self._waiting: OrderedDict[str, deque[Connection]] = OrderedDict()
+        self._numbers = numbers
+        self._under_way: Counter[Caller] = Counter()
+        self._waiting: dict[Caller, deque[Connection]] = {}
 
     def enter(self, connection: Connection) -> bool:
         """Whether its request may begin; else :meth:`Connection.go_on` is called once it may."""
-        if self._under_way[connection.address] < self._at_once:
-            self._under_way[connection.address] += 1
+        caller = connection.caller
+        most = self._numbers.of_key if caller.has_key else self._numbers.strangers
+        if self._under_way[caller] < most:
+            self._under_way[caller] += 1
             return True
-        self._waiting.setdefault(connection.address, deque()).append(connection)
+        self._waiting.setdefault(caller, deque()).append(connection)
         return False
 
-    def leave(self, address: str) -> None:
-        """One of this address is done, or its key is known: the next one may begin."""
-        queue = self._waiting.get(address)
+    def leave(self, caller: Caller) -> None:
+        """One of this caller is done, or its key is known: the next one may begin."""
+        queue = self._waiting.get(caller)
         if queue:
             queue.popleft().go_on()
         else:
-            self._under_way[address] -= 1
-            if not self._under_way[address]:
-                del self._under_way[address]
+            self._under_way[caller] -= 1
+            if not self._under_way[caller]:
+                del self._under_way[caller]
         if not queue:
-            self._waiting.pop(address, None)
+            self._waiting.pop(caller, None)
 
     def give_up(self, connection: Connection) -> None:
         """It waits no longer."""
-        queue = self._waiting.get(connection.address)
+        queue = self._waiting.get(connection.caller)
         if queue and connection in queue:
             queue.remove(connection)
+
+
+Know = Callable[[bytes], Caller]
+"""From a request's head to its caller, without the address."""
 
 
 class Connection(asyncio.Protocol):
     """One connection: passes everything on to ``inner``, and closes if the client exceeds a time limit."""
 
-    def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd, line: Line) -> None:
+    def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd, line: Line, know: Know) -> None:
         self._inner = inner
+        self._know = know
         self._patience = patience
         self._crowd = crowd
         self._line = line
@@ -195,7 +215,7 @@ class Connection(asyncio.Protocol):
         self._asked = self._answering = False
         self._body_left = self._refused = self._pipelined = False
         self._in_line = self._waits = False
-        self._key_known = self._key_known_before = False
+        self.caller = Caller()
         self.address = self.holder = ""
         self.privileged = False
 
@@ -242,23 +262,27 @@ class Connection(asyncio.Protocol):
     def identify(self, name: str, *, privileged: bool) -> None:
         """The key of the request under way is known: its name, and whether it is a reviewer's or an operator's.
         Unavailable if the connection has a place that is kept for those."""
-        self._key_known, self.privileged = True, privileged
+        self.privileged = privileged
         self.holder = name or self.address
-        self.step_aside()
+        if not self.caller.has_key:
+            self.step_aside()
         self._crowd.check_place(privileged=privileged)
 
     def step_aside(self) -> None:
         """Let the next one in line begin."""
         if self._in_line:
             self._in_line = False
-            self._line.leave(self.address)
+            self._line.leave(self.caller)
 
     def _end_head(self, data: bytes, after: int) -> bytes:
         """The head is complete, with so many bytes after it: the part of ``data`` that belongs to its request."""
         assert self._head is not None
-        begun = bytes(self._head[: len(self._head) - after]).lower()
+        head = bytes(self._head[: len(self._head) - after])
         self._head = None
         self._crowd.busy(self)
+        caller = self._know(head)
+        self.caller = caller if caller.has_key else Caller(f"{self.address} {caller.name}")
+        begun = head.lower()
         if after and not any(length in begun for length in _LENGTHS):
             self._pipelined = True
             return data[:-after]
@@ -266,8 +290,6 @@ class Connection(asyncio.Protocol):
 
     def _may_begin(self, data: bytes) -> bool:
         """Whether the request of a complete head begins now; else it is held until its turn."""
-        if self._key_known_before:
-            return True
         self._in_line = self._line.enter(self)
         if not self._in_line:
             self._waits, self._held = True, data
@@ -282,7 +304,7 @@ class Connection(asyncio.Protocol):
             self._pass_on(data)
 
     def _discard(self, data: bytes) -> None:
-        """Discard bytes that nobody reads: to take them as fast as they come would cost the other clients their turns."""
+        """Discard bytes that nobody reads. To take them as fast as they come would cost other clients their turns."""
         self._surplus += len(data)
         if self._surplus > HEAD_LIMITS.surplus_bytes:
             self.transport.pause_reading()
@@ -342,7 +364,6 @@ class Connection(asyncio.Protocol):
         if not self._answering:
             return
         self._answering = False
-        self._key_known_before, self._key_known = self._key_known, False
         self.step_aside()
         self._crowd.silent(self)
         if self._pipelined:
@@ -398,10 +419,11 @@ def identify(name: str, *, privileged: bool) -> None:
         connection.identify(name, privileged=privileged)
 
 
-def step_aside() -> None:
-    """:meth:`Connection.step_aside` of the current request."""
+def step_aside(*, with_key: bool = True) -> None:
+    """Let the next request of the same caller begin, though the current one is still under way; without ``with_key``
+    only if it came without a right key."""
     connection = _CONNECTION.get()
-    if connection is not None:
+    if connection is not None and (with_key or not connection.caller.has_key):
         connection.step_aside()
 
 
@@ -418,10 +440,10 @@ def _fault_of(head: bytes) -> bytes | None:
     return _MALFORMED if all(length in lines for length in _LENGTHS) else None
 
 
-def watched(inner: type[asyncio.Protocol], patience: Patience) -> type[asyncio.Protocol]:
+def watched(inner: type[asyncio.Protocol], patience: Patience, know: Know) -> type[asyncio.Protocol]:
     """A factory of protocols, each behind a :class:`Connection`; uvicorn calls it as the class ``inner``."""
     crowd, line = Crowd(patience.connections), Line()
-    return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd, line))
+    return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd, line, know))
 
 
 def tracked(app: ASGIApp) -> ASGIApp:

@@ -16,6 +16,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 from standardwebhooks import Webhook
 
+from mapvote_server.api.connections import step_aside
 from mapvote_server.api.schemas import MOST_SEQ, problems
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import TooMany, Unauthorised, Unavailable
@@ -52,6 +53,7 @@ async def listen(
     if key is not None and parts.streams[key.name] >= parts.settings.server.streams_per_key:
         most = f"{key.name!r} listens to {parts.streams[key.name]} streams already"
         raise TooMany(f"{most} ([server] streams_per_key): end one of these first")
+    step_aside()  # as long as it is listened to, other requests of its key go on
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     stream = _counted(parts, key, _stream(request, parts, start, key, named))
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)

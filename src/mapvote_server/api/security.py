@@ -12,7 +12,7 @@ import binascii
 import ipaddress
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import key_form
-from mapvote_server.api.connections import identify, step_aside
+from mapvote_server.api.connections import Caller, identify, step_aside
 from mapvote_server.api.lanes import asker
 from mapvote_server.api.proxies import Proxies
 from mapvote_server.api.schemas import refuse
@@ -68,7 +68,7 @@ class Guard:
         self._parts = parts
         self._opened = opened
         self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
-        self._known: dict[str, keys.Key] = {}
+        self._known = parts.right_keys
         self._wrong = RateLimit(FLOODS.per_minute, FLOODS.at_once, "wrong keys")
 
     async def who(
@@ -195,6 +195,23 @@ def _authorization(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
 
 PROBES = ("/livez", "/readyz")
 """Who asks without a key, by any name of the server, gets a status without content."""
+
+
+def caller_of(head: bytes, right: Container[str]) -> Caller:
+    """Who sends a request, by its head: the hash of a key that is one of the ``right`` ones, or a kind of request.
+
+    It decides the order of requests alone; :class:`Guard` looks every key up.
+    """
+    first, *lines = head.lstrip(b"\r\n").split(b"\r\n")
+    pairs = (line.partition(b":") for line in lines)
+    secret = _secret_of(_authorization([(name.lower(), value.strip()) for name, _, value in pairs]))
+    if secret is None:
+        path = b" ".join(first.split(b" ")[1:2]).decode("latin-1")
+        return Caller("probe" if path in PROBES else "no key")
+    digest = keys.hash_of(secret)
+    return Caller(digest, has_key=True) if digest in right else Caller("new key")
+
+
 log = structlog.get_logger("mapvote")
 
 
@@ -243,7 +260,7 @@ class Watch:
             await self._app(scope, receive, watched)
         except MapvoteError as error:
             if isinstance(error, TooMany):  # a flood waits for its refusals instead of sending more
-                step_aside()
+                step_aside(with_key=False)
                 await asyncio.sleep(FLOODS.pause_s)
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
             probed = asks and scope["path"] in PROBES

@@ -10,6 +10,7 @@ import socket
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -24,7 +25,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote_server.api.app import create_app
 from mapvote_server.api.connections import HEAD_LIMITS, Patience, tracked, watched
-from mapvote_server.api.security import HEADERS
+from mapvote_server.api.security import HEADERS, caller_of
 from mapvote_server.store import keys
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import Gate
@@ -117,7 +118,7 @@ def serve(
     patience = Patience(most.header_timeout_s, most.body_timeout_s, most.answer_timeout_s, _room_for(most.connections))
     config = uvicorn.Config(
         tracked(app),
-        http=watched(H11Protocol, patience),
+        http=watched(H11Protocol, patience, partial(caller_of, right=app.state.services.right_keys)),
         h11_max_incomplete_event_size=HEAD_LIMITS.head_bytes,
         ws="none",
         access_log=False,

@@ -359,6 +359,8 @@ class Services:
         """The number of the newest version, read once for all requests that wait for it."""
         self.known_keys: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), SERVICE_SIZES.keys, self.lookups)
         """Whose keys these are, by their hashes; Unauthorised for those that open nothing."""
+        self.right_keys: dict[str, keys.Key] = {}
+        """Keys that were right when they came last, by their hashes."""
         self.manifests = Manifests(store)
         self.publishing = Publishing()
         self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()

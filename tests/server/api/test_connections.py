@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import cast
 
 import httpx2
 import numpy as np
@@ -14,6 +16,8 @@ import pytest
 
 from hand_made import make_map, make_tile
 from live_server import serving_here
+from mapvote_server.api.connections import CROWDING, Caller, Connection, Line
+from mapvote_server.api.security import caller_of
 from mapvote_server.store import keys
 from mapvote_server.store.store import Store
 
@@ -284,3 +288,58 @@ def test_who_holds_all_connections_gives_one_up_for_everybody_else(tmp_path: Pat
 def test_the_server_is_well_again_afterwards(url: str, tmp_path: Path) -> None:
     for _ in range(20):
         assert httpx2.get(f"{url}/v1/map", timeout=300.0).status_code == 200
+
+
+class Waiting:
+    """A request at the line."""
+
+    def __init__(self, name: str, has_key: bool = False) -> None:
+        self.caller = Caller(name, has_key=has_key)
+        self.begun = False
+
+    def enter(self, line: Line) -> bool:
+        self.begun = line.enter(cast("Connection", self))
+        return self.begun
+
+    def go_on(self) -> None:
+        self.begun = True
+
+
+def test_a_flood_lets_nobody_wait_but_those_who_come_alike() -> None:
+    """A right key is not held up by a flood without keys, a probe by neither, and those who wait go on in order."""
+    line = Line()
+    flood = [Waiting("10.0.0.1 no key") for _ in range(100)]
+    begun = [one.enter(line) for one in flood]
+    assert begun == [True] * CROWDING.strangers + [False] * (100 - CROWDING.strangers)
+    greedy = [Waiting("a", has_key=True) for _ in range(CROWDING.of_key + 1)]
+    assert [one.enter(line) for one in greedy] == [True] * CROWDING.of_key + [False]
+    for other in (Waiting("b", has_key=True), Waiting("10.0.0.1 probe"), Waiting("10.0.0.1 new key")):
+        assert other.enter(line)
+        line.leave(other.caller)
+    line.give_up(cast("Connection", flood[8]))
+    line.leave(flood[0].caller)
+    assert [one.begun for one in flood[8:11]] == [False, True, False]
+    for _ in range(98):
+        line.leave(flood[0].caller)
+    assert Waiting("10.0.0.1 no key").enter(line)
+
+
+@pytest.mark.parametrize(
+    ("request_line", "header", "caller"),
+    [
+        ("GET /v1/map", "Authorization: Bearer RIGHT", "key"),
+        ("GET /v1/map", "AUTHORIZATION:bearer RIGHT", "key"),
+        ("GET /", "Cookie: a=b; mapvote_key=RIGHT", "key"),
+        ("GET /livez", "Authorization: Basic " + base64.b64encode(b"me:RIGHT").decode(), "key"),
+        ("GET /livez", "Authorization: Bearer WRONG", "new key"),
+        ("GET /livez", "Accept: */*", "probe"),
+        ("GET /v1/map", "Accept: */*", "no key"),
+        ("GET", "", "no key"),
+        ("", "Authorization", "no key"),
+    ],
+)
+def test_the_head_tells_the_caller(request_line: str, header: str, caller: str) -> None:
+    right = keys.hash_of("RIGHT")
+    head = f"\r\n{request_line} HTTP/1.1\r\nHost: localhost\r\n{header}\r\n\r\n".encode()
+    told = caller_of(head, {right: None})
+    assert told == (Caller(right, has_key=True) if caller == "key" else Caller(caller))
