@@ -60,8 +60,8 @@ class Crowding:
     """Headers of one request, at most."""
     strangers: int = 8
     """Requests of one address under way at a time without a right key: probes, without any key, with a new one."""
-    of_key: int = 32
-    """Requests of one right key under way at a time."""
+    of_key: int = 8
+    """Requests of one right key under way at a time, without those that wait for a thread."""
     kept: int = 8
     """Connections beyond the limit for probes and for keys of reviewers and operators."""
 

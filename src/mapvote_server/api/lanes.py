@@ -20,6 +20,7 @@ from typing import Any, Literal, ParamSpec, TypeVar
 
 from mapvote.core.record import record
 from mapvote_server import work as work_under_way
+from mapvote_server.api.connections import step_aside
 from mapvote_server.errors import TooMany
 from mapvote_server.work import Work
 
@@ -107,6 +108,7 @@ class Lane:
         """
         name = asker.get()
         self._check(name)
+        step_aside()  # the queue of this lane has an order of its own
         await self._turn(name)
         # From here on the thread gives the turn back, also if the client goes away meanwhile.
         under_way, loop = Work(self._limit_s), asyncio.get_running_loop()
