@@ -1,6 +1,7 @@
 """Every scan of a drive through our vehicle, through that of another checkout, and through peers: in turn, on one core.
 
-    python benchmarks/judge.py OUT --street street:2 --kitti ../shared/data/kitti/* [--source OTHER/src] [--last N]
+    python benchmarks/judge.py OUT --street street:2 --kitti ../shared/data/kitti/* [--last N]
+        [--source OTHER/src --python OTHER/.venv/bin/python]
 
 Times are CPU time, so that a busy neighbour counts little. Ours is everything that ``Vehicle.observe`` does, moving
 windows and first looks included. A first drive compiles; of the judged one the first WARM_UP scans do not count. Peers
@@ -38,57 +39,27 @@ from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
 from mapvote.matching.prepare import deskew, motion_at
 from mapvote.survey.build import build_map
-from mapvote.vehicle import Vehicle
 
 WARM_UP = 25
 """Scans: the first leaves for the voter after some fifteen."""
 LOOK_AHEAD = 10
 """Scans in a second: how late a peer says what moves, as we do."""
-STAGES = "localise", "ground", "moving", "see", "vote"
-WHOLE = "whole scan"
+VEHICLE = Path(__file__).parent / "judged_vehicle.py"
 LOST_M = 1.0
 VOXEL_M = 0.2
 """dufomap: at its usual 0.1 m a 32-beam scan hardly ever makes a voxel void."""
+Checkout = tuple[Path, Path]
+"""A source tree, and the interpreter that has its dependencies."""
 Clock = Callable[[str, Callable[[], Any]], Any]
 """Runs something and adds its CPU time to a stage."""
 
 
-def watch(drive_path: str, map_path: str) -> None:
-    """A vehicle in a process of its own: for each number on stdin one scan, and its CPU milliseconds by stage. In the
-    end its poses go to the file that is named last."""
-    drive, point_map = open_drive(drive_path), read_map(map_path)
-    T = drive.T_map_lidar_prior
-
-    def fresh() -> Vehicle:
-        sigmas = {"prior_sigma_m": drive.prior_sigma_m, "prior_sigma_deg": drive.prior_sigma_deg}
-        return Vehicle(drive.vehicle, drive.sensor, point_map, **sigmas)
-
-    vehicle = fresh()
-    for i in range(min(len(drive), WARM_UP)):
-        vehicle.observe(drive.read_scan(i), None if T is None else T[i])
-    vehicle.finish()  # so that what comes last is compiled too
-    vehicle = fresh()
-    print("ready", flush=True)
-    for line in sys.stdin:
-        if not line.strip().isdigit():
-            vehicle.finish()
-            np.save(line.strip(), np.array(vehicle.report.T_map_lidar))
-            print(len(vehicle.report.lost), flush=True)
-            return
-        i, stages = int(line), vehicle.report.stage_s
-        scan, before = drive.read_scan(i), {name: len(s) for name, s in stages.items()}
-        start = time.process_time()
-        vehicle.observe(scan, None if T is None else T[i])
-        ms = {WHOLE: 1e3 * (time.process_time() - start)}
-        ms |= {name: 1e3 * sum(stages.get(name, [])[before.get(name, 0) :]) for name in STAGES}
-        print(json.dumps(ms), flush=True)
-
-
 class Watched:
-    """Such a process, by the source tree ``src``."""
+    """A process of judged_vehicle.py, with the source tree and the interpreter of a checkout."""
 
-    def __init__(self, src: Path, drive: Path, map_path: Path) -> None:
-        command = [sys.executable, __file__, "--watch", str(drive), str(map_path)]
+    def __init__(self, checkout: Checkout, drive: Path, map_path: Path) -> None:
+        src, python = checkout
+        command = [str(python), str(VEHICLE), str(drive), str(map_path), str(WARM_UP)]
         environment = {**os.environ, "PYTHONPATH": str(src)}
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         self.process = subprocess.Popen(command, env=environment, text=True, **pipes)  # type: ignore[call-overload]
@@ -150,7 +121,9 @@ class Dufomap:
             clock("moving", lambda: self.dufo.segment(*scan, True))
 
 
-def judge(out: Path, drive: Drive, map_path: Path, T_true: F64, sources: dict[str, Path], last: int | None) -> str:
+def judge(
+    out: Path, drive: Drive, map_path: Path, T_true: F64, checkouts: dict[str, Checkout], last: int | None
+) -> str:
     """Rows of the table: CPU milliseconds of each side and stage, and how far its poses are off."""
     from mapvote_lab.evaluation.truths import error_summary, rigid_between
 
@@ -161,7 +134,7 @@ def judge(out: Path, drive: Drive, map_path: Path, T_true: F64, sources: dict[st
         peers["VGICP"] = Vgicp(import_module("small_gicp"), points_map, T_true)
     if find_spec("dufomap"):
         peers["dufomap"] = Dufomap(import_module("dufomap"), T_true)
-    watched = {name: Watched(src, drive.path, map_path) for name, src in sources.items()}
+    watched = {name: Watched(checkout, drive.path, map_path) for name, checkout in checkouts.items()}
     ms: dict[tuple[str, str], F64] = defaultdict(lambda: np.zeros(count))
     order = np.random.default_rng(0)
 
@@ -207,11 +180,16 @@ def main() -> None:
     parser.add_argument("--street", action="append", default=[], metavar="SCENARIO:SEED[:SENSOR]")
     parser.add_argument("--kitti", type=Path, nargs="*", default=[], metavar="DRIVE")
     parser.add_argument("--source", type=Path, metavar="OTHER/src", help="of another checkout, to compare with")
+    parser.add_argument(
+        "--python", type=Path, default=Path(sys.executable), metavar="OTHER/bin/python", help="its interpreter"
+    )
     parser.add_argument("--last", type=int, metavar="N", help="stop each drive after so many scans")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    sources = {"ours": Path(__file__).parents[1] / "src"} | ({"other": options.source} if options.source else {})
+    checkouts = {"ours": (Path(__file__).parents[1] / "src", Path(sys.executable))}
+    if options.source:
+        checkouts["other"] = options.source, options.python
     print("| drive | stage | side | CPU ms: median / mean / worst | times ours, means |\n|---|---|---|---|---|")
 
     def judged(name: str, folder: Path, surveys: list[Drive], poses: Path) -> None:
@@ -219,7 +197,7 @@ def main() -> None:
         if not map_path.exists():
             write_map(build_map(surveys)[0], map_path)
         T_true = read_T_map_lidar(poses, folder)
-        print(judge(options.out, open_drive(folder), map_path, T_true, sources, options.last), flush=True)
+        print(judge(options.out, open_drive(folder), map_path, T_true, checkouts, options.last), flush=True)
 
     for scene in options.street:
         from mapvote_lab.simulation import simulate
@@ -237,7 +215,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--watch"]:
-        watch(*sys.argv[2:])
-    else:
-        main()
+    main()
