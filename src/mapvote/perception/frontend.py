@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import ceil
 from typing import Protocol
 
 import numpy as np
@@ -21,12 +22,26 @@ import numpy as np
 from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap
 from mapvote.core.points import Fields
+from mapvote.core.record import record
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, PosePrior, Reference, Scan
 from mapvote.matching.localiser import Localise
 from mapvote.matching.odometry import Fix
 from mapvote.perception.raycast import ScanView, Sky, cast_rays, find_obstacles
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How the work of confirmed scans is spread."""
+
+    calls: int = 6
+    """Calls within which a confirmed scan is worked on. A check of the pose confirms four scans at once: one of them is
+    taken with each call, and none waits longer for its turn than the first of them waited for the check."""
+
+
+SPREAD = Spread()
 
 
 class MoversFilter(Protocol):
@@ -173,8 +188,12 @@ class Frontend:
         *,
         with_sight: bool = True,
         sensor: Sensor | None = None,
+        spread: Spread = SPREAD,
     ) -> None:
         self.report = DriveReport()
+        self._spread = spread
+        self._confirmed: deque[Fix] = deque()
+        """Fixes whose scans wait for their turn."""
         self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
         self._with_sight, self._sky = with_sight, None if sensor is None else Sky(sensor)
         self._waiting: deque[PlacedScan] = deque()
@@ -192,15 +211,18 @@ class Frontend:
         report.stamps_ns.append(scan.stamp_ns)
         report.priors.append(prior)
         with report.timed("localise"):
-            fixes = self._localise.push(scan, prior)
-        return [seen for fix in fixes for seen in self._take(fix)]
+            self._confirmed.extend(self._localise.push(scan, prior))
+        turns = ceil(len(self._confirmed) / self._spread.calls)
+        return [seen for _ in range(turns) for seen in self._take(self._confirmed.popleft())]
 
     def finish(self) -> list[Observation]:
         """The drive has ended: the observations that still wait, decided with less than the full look ahead."""
         self._ended = True
         with self.report.timed("localise"):
-            fixes = self._localise.flush()
-        return [seen for fix in fixes for seen in self._take(fix)] + self._see(self._movers.flush())
+            self._confirmed.extend(self._localise.flush())
+        decided = [seen for fix in self._confirmed for seen in self._take(fix)]
+        self._confirmed.clear()
+        return decided + self._see(self._movers.flush())
 
     @property
     def done(self) -> int:
