@@ -22,12 +22,11 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import F32, I64, U8, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.core.types import F32, I64
 from mapvote.shapes.geojson import collection, utc
-from mapvote.shapes.outlines import pieces
 from mapvote_server.answers import answer
-from mapvote_server.questions.explain import said_by, seen, votes_on
+from mapvote_server.questions.contradictions import CONTRADICTIONS, Compared, Objects, compare, over_borders
+from mapvote_server.questions.explain import seen, votes_on
 from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.policy import policy_in
@@ -37,25 +36,6 @@ from mapvote_server.store.votes import FOREVER, Electorate
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
 Claim = Literal["occupied", "empty"]
-_SILENT, _OCCUPIED, _EMPTY = range(3)
-_CLAIMS = np.full(256, _SILENT, dtype=np.uint8)
-"""By state: what it says of the cell now."""
-_CLAIMS[[CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED]] = _OCCUPIED
-_CLAIMS[[CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY]] = _EMPTY
-
-
-@dataclass(frozen=True, slots=True)
-class Compared:
-    """One vehicle against the others on one tile."""
-
-    vehicle: str
-    cells: int
-    """Cells where the others agree before and after it, and it votes too."""
-    rows: I64
-    """(n,) the cells among them where it votes the opposite, on the lattice of the map, by row, then column."""
-    cols: I64
-    occupied: U8
-    """(n,) 1 where the vehicle votes occupied, 0 where it votes empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +58,7 @@ class VehicleStanding:
     cells: int
     """Cells compared."""
     objects: int
-    """Contradictions of at least ``min_cells`` cells among them."""
+    """Contradictions among them."""
     others_cells: int
     others_objects: int
     p_value: float
@@ -86,42 +66,7 @@ class VehicleStanding:
     threshold: float
     """Upper limit of ``p_value``: the significance divided by the number of vehicles tested (Bonferroni)."""
     evidence: tuple[Contradiction, ...]
-    """Largest first."""
-
-
-def compare(index: TileIndex, votes: Iterable[TileVote]) -> list[Compared]:
-    """Each vehicle's vote on a tile, all its drives as one, against the others'; one entry each, in order of name.
-
-    In a cell the others agree if more of them vote one way (occupied or empty now) than the other, and at least one
-    of these passed before the vehicle and one after it. Undetermined cells and cells without a vote are left out.
-    """
-    ordered = sorted(votes, key=lambda vote: (vote.end_ns, vote.vehicle))
-    if not ordered:
-        return []
-    claims = np.stack([_CLAIMS[said_by(vote).reshape(-1)] for vote in ordered])
-    occupied, empty = claims == _OCCUPIED, claims == _EMPTY
-    all_occupied, all_empty = (claim.sum(axis=0, dtype=np.int16) for claim in (occupied, empty))
-    before_occupied, before_empty = np.zeros_like(all_occupied), np.zeros_like(all_empty)
-    out = []
-    for i, vote in enumerate(ordered):
-        others_occupied, others_empty = all_occupied - occupied[i], all_empty - empty[i]
-        # A side that has the majority, and a vote both before this one and after it.
-        agree_occupied = (others_occupied > others_empty) & (before_occupied > 0) & (others_occupied > before_occupied)
-        agree_empty = (others_empty > others_occupied) & (before_empty > 0) & (others_empty > before_empty)
-        before_occupied += occupied[i]
-        before_empty += empty[i]
-        opposed = np.flatnonzero((agree_occupied & empty[i]) | (agree_empty & occupied[i]))
-        compared = int(((agree_occupied | agree_empty) & (claims[i] != _SILENT)).sum())
-        out.append(
-            Compared(
-                vehicle=vote.vehicle,
-                cells=compared,
-                rows=index[0] * TILE_CELLS + opposed // TILE_CELLS,
-                cols=index[1] * TILE_CELLS + opposed % TILE_CELLS,
-                occupied=occupied[i][opposed].astype(np.uint8),
-            )
-        )
-    return sorted(out, key=lambda entry: entry.vehicle)
+    """The largest contradictions, largest first (``Contradictions.told``)."""
 
 
 def vehicle_standings(store: Store) -> list[VehicleStanding]:
@@ -149,35 +94,39 @@ class _AllCompared:
 
     def __init__(self) -> None:
         self.tiles: KeptTiles[Sequence[Compared]] = KeptTiles(self._come, self._go)
-        self._cells: Counter[str] = Counter()
+        self._sums: dict[str, Compared] = {}
         self._tiles: Counter[str] = Counter()
         self._opposed: dict[int, Sequence[Compared]] = {}
         self.standings: list[VehicleStanding] | None = None
-        """What follows from all tiles; None: not asked since one came or went."""
+        """Standings that follow from all tiles; None: not asked since one came or went."""
 
     def entries(self) -> list[Compared]:
-        """The comparisons that represent all: one a vehicle with its cells, and those with contradictions."""
-        none, no_claim = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)
-        sums = [Compared(name, self._cells[name], none, none, no_claim) for name in self._tiles]
-        return sums + [replace(entry, cells=0) for entries in self._opposed.values() for entry in entries]
+        """As many comparisons as say the same as all: one a vehicle with its sums, and those with contradictions."""
+        opposed = [replace(entry, cells=0, inside=0) for entries in self._opposed.values() for entry in entries]
+        return [*self._sums.values(), *opposed]
 
     def _come(self, compared: Sequence[Compared]) -> None:
         self.standings = None
         for entry in compared:
-            self._cells[entry.vehicle] += entry.cells
             self._tiles[entry.vehicle] += 1
-        opposed = [entry for entry in compared if len(entry.rows)]
+            self._add(entry, 1)
+        opposed = [entry for entry in compared if entry.contradicts]
         if opposed:
             self._opposed[id(compared)] = opposed
 
     def _go(self, compared: Sequence[Compared]) -> None:
         self.standings = None
         for entry in compared:
-            self._cells[entry.vehicle] -= entry.cells
             self._tiles[entry.vehicle] -= 1
+            self._add(entry, -1)
             if not self._tiles[entry.vehicle]:
-                del self._tiles[entry.vehicle], self._cells[entry.vehicle]
+                del self._tiles[entry.vehicle], self._sums[entry.vehicle]
         self._opposed.pop(id(compared), None)
+
+    def _add(self, entry: Compared, times: int) -> None:
+        before = self._sums.get(entry.vehicle, Compared(entry.vehicle, 0))
+        sums = before.cells + times * entry.cells, before.inside + times * entry.inside
+        self._sums[entry.vehicle] = Compared(entry.vehicle, *sums)
 
 
 _compared: WeakKeyDictionary[Store, _AllCompared] = WeakKeyDictionary()
@@ -190,7 +139,6 @@ def standings_of(
     *,
     tolerated: float = 2.0,
     significance: float = 0.01,
-    min_cells: int = 4,
 ) -> list[VehicleStanding]:
     """The standing of every vehicle over all tiles, in order of name.
 
@@ -198,19 +146,20 @@ def standings_of(
     of all objects is binomial (the exact comparison of two Poisson rates, Przyborowski and Wilenski 1940). It
     "contradicts" if the chance of what was seen is below ``significance`` shared out among the vehicles tested;
     it is "undecidable" if nothing could be compared, or if its rate is above the tolerated one but the data are too
-    few for significance. Objects of fewer than ``min_cells`` cells are noise and not counted.
+    few for significance. Objects of fewer than ``Contradictions.least_cells`` cells are noise and not counted.
     """
     by_vehicle: dict[str, list[Compared]] = {}
     for entry in compared:
         by_vehicle.setdefault(entry.vehicle, []).append(entry)
     names = sorted(by_vehicle)
     cells = {name: sum(entry.cells for entry in by_vehicle[name]) for name in names}
-    evidence = {name: _objects(by_vehicle[name], lattice, min_cells) for name in names}
-    all_cells, all_objects = sum(cells.values()), sum(len(found) for found in evidence.values())
+    spread = {name: over_borders([entry.border for entry in by_vehicle[name]]) for name in names}
+    objects = {name: len(spread[name]) + sum(entry.inside for entry in by_vehicle[name]) for name in names}
+    all_cells, all_objects = sum(cells.values()), sum(objects.values())
     threshold = significance / max(1, sum(n > 0 for n in cells.values()))
     out = []
     for name in names:
-        mine, found = cells[name], len(evidence[name])
+        mine, found = cells[name], objects[name]
         others, others_found = all_cells - mine, all_objects - found
         p_value = _tail(found, others_found, tolerated * mine, others)
         verdict: Stance = "undecidable"
@@ -218,9 +167,8 @@ def standings_of(
             verdict = "contradicts"
         elif mine and found * others <= tolerated * mine * others_found:
             verdict = "consistent"
-        out.append(
-            VehicleStanding(name, verdict, mine, found, others, others_found, p_value, threshold, evidence[name])
-        )
+        evidence = _evidence([spread[name], *(entry.largest for entry in by_vehicle[name])], lattice)
+        out.append(VehicleStanding(name, verdict, mine, found, others, others_found, p_value, threshold, evidence))
     return out
 
 
@@ -232,26 +180,12 @@ def _tail(mine: int, others: int, my_exposure: float, others_exposure: float) ->
     return float(scipy.special.betainc(mine, others + 1, share))
 
 
-def _objects(entries: Sequence[Compared], lattice: Lattice, min_cells: int) -> tuple[Contradiction, ...]:
-    """The 8-connected contradictions of one vehicle, over all tiles, largest first."""
-    rows, cols = np.concatenate([e.rows for e in entries]), np.concatenate([e.cols for e in entries])
-    says = np.concatenate([e.occupied for e in entries])
-    order = np.lexsort((cols, rows))
-    rows, cols, says = rows[order], cols[order], says[order]
-    if not len(rows):
-        return ()
-    label = pieces(rows, cols, says.astype(np.int64)).objects
-    size = np.bincount(label)
-    x = lattice.x0 + CELL_SIZE * (np.bincount(label, weights=cols) / size + 0.5)
-    y = lattice.y0 + CELL_SIZE * (np.bincount(label, weights=rows) / size + 0.5)
-    first = np.unique(label, return_index=True)[1]
-    ranked = [int(i) for i in np.argsort(-size, kind="stable") if size[i] >= min_cells]
-    return tuple(
-        Contradiction(
-            round(float(x[i]), 2), round(float(y[i]), 2), int(size[i]), "occupied" if says[first[i]] else "empty"
-        )
-        for i in ranked
-    )
+def _evidence(found: Sequence[Objects], lattice: Lattice) -> tuple[Contradiction, ...]:
+    """The largest of the objects."""
+    largest = Objects.all_of(found).largest(CONTRADICTIONS.told)
+    x, y = (np.round(metres, 2).tolist() for metres in largest.places_m(lattice))
+    claims: list[Claim] = ["occupied" if says else "empty" for says in largest.occupied.tolist()]
+    return tuple(map(Contradiction, x, y, largest.cells.tolist(), claims))
 
 
 def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from mapvote.core.grid import TILE_CELLS, Lattice
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
-from mapvote_server.questions.vehicles import VehicleStanding, _tail, compare, standings_of
+from mapvote.shapes.packed_cloud import SIDE_M
+from mapvote_server.questions.contradictions import CONTRADICTIONS, Objects, compare
+from mapvote_server.questions.vehicles import VehicleStanding, _tail, standings_of
 
 UO, UE, CO, CE, UN = CellState
 
@@ -92,6 +95,43 @@ def test_a_ghost_over_two_tiles_is_one_object() -> None:
         compared += compare(index, [said("a", 0, plane()), said("x", 1, states), said("b", 2, plane())])
     found = {s.vehicle: s for s in standings_of(compared, Lattice())}
     assert [(e.cells, e.x) for e in found["x"].evidence] == [(24, 76.8)]
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.02, 0.2, 0.5]))
+@settings(max_examples=15, deadline=None)
+def test_objects_are_the_connected_cells_of_the_whole_map(seed: int, share: float) -> None:
+    """Tile by tile and joined: as many, of the same sizes and at the same places as on one large raster."""
+    rng = np.random.default_rng(seed)
+    raster = np.full((2 * TILE_CELLS, 2 * TILE_CELLS), CellState.UNCHANGED_EMPTY, dtype=np.uint8)
+    at_border = np.abs(np.arange(2 * TILE_CELLS) - TILE_CELLS) < 6
+    raster[(rng.random(raster.shape) < share) & (at_border[:, None] | at_border)] = CO
+    raster[40:44, 40:47] = CO
+    compared = []
+    for row, col in np.ndindex(2, 2):
+        tile = raster[TILE_CELLS * row :, TILE_CELLS * col :][:TILE_CELLS, :TILE_CELLS]
+        three = said("a", 0, plane()), said("x", 1, tile), said("b", 2, plane())
+        compared += compare((row - 1, col - 1), three)
+    found = {s.vehicle: s for s in standings_of(compared, Lattice())}["x"]
+    label, _ = scipy.ndimage.label(raster == CO, np.ones((3, 3)))
+    sizes = np.bincount(label.reshape(-1))[1:]
+    large = np.flatnonzero(sizes >= CONTRADICTIONS.least_cells)
+    assert found.objects == len(large)
+    told = np.array([(e.x, e.y, e.cells) for e in found.evidence])
+    assert told[:, 2].tolist() == sorted(sizes[large].tolist(), reverse=True)[: CONTRADICTIONS.told]
+    rows, cols = np.array(scipy.ndimage.center_of_mass(raster == CO, label, large + 1)).T
+    expected = np.column_stack([CELL_SIZE * (cols + 0.5) - SIDE_M, CELL_SIZE * (rows + 0.5) - SIDE_M, sizes[large]])
+    apart = np.abs(told[:, None] - expected[None]).max(axis=2)
+    assert apart.min(axis=1).max() < 0.006, "centimetres are told"
+
+
+def test_who_contradicts_everywhere_takes_little_room() -> None:
+    """At worst every other cell: of 65,536 cells some kilobytes remain, and all objects are counted."""
+    states = np.where(np.random.default_rng(1).random((TILE_CELLS, TILE_CELLS)) < 0.5, np.uint8(CO), np.uint8(UE))
+    _, _, liar = compare((0, 0), [said("a", 0, plane()), said("b", 2, plane()), said("x", 1, states)])
+    arrays = [liar.border.part, liar.border.rows, liar.border.cols]
+    arrays += [getattr(some, name) for some in (liar.largest, liar.border.parts) for name in Objects.__slots__]
+    assert sum(array.nbytes for array in arrays) < 50_000
+    assert liar.inside >= len(liar.largest)
 
 
 def test_flicker_is_not_counted() -> None:
