@@ -29,20 +29,21 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from command_line import typed
 from faults import MAP_FILES, Bytes, Files, Recording, broken, kinds_of, mounted, verdict
+from mapvote.codec.ballot import decode
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import all_points
 from mapvote.core.types import Drive, MapvoteError
 from mapvote.doctor import Finding
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.maps import examine_map, examine_points
-from mapvote.formats import open_drive, open_drive_on, read_map
+from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
 from mapvote.formats.registry import WRITERS
 from mapvote.fusion.fuse import update_map
-from mapvote.vehicle import vote_drive
 from obey import obeyed
 
 Case = tuple[str, list[str], Callable[[], list[Finding]]]
@@ -117,30 +118,27 @@ def with_times(drive: Drive) -> Recording:
     return replace(r, scans=scans, toml={"prior_sigma_m": drive.prior_sigma_m, "columns": "x,y,z,intensity,time"})
 
 
-def voted(folder: Path, point_map: PointMap) -> tuple[int, int]:
-    """(points added, points deleted) by one ballot of the drive alone."""
-    settings = Settings()
-    ballot, _ = vote_drive(open_drive_on(point_map, folder), point_map, settings)
-    fuse = settings.fuse.model_copy(update={"min_votes": 1})
-    decisions = update_map(point_map, [ballot], fuse)[1].values()
-    return sum(d.added for d in decisions), sum(d.deleted for d in decisions)
-
-
-def counted(r: Recording, point_map: PointMap) -> str:
+def counted(r: Recording, point_map: Path) -> str:
+    """Points added and deleted by one ballot of the drive alone, as `mapvote vote` writes it with its checks; or why
+    there is none."""
     with tempfile.TemporaryDirectory() as scratch:
-        r.write(Path(scratch) / "drive")
+        folder = Path(scratch)
+        r.write(folder / "drive")
         try:
-            added, deleted = voted(Path(scratch) / "drive", point_map)
+            typed("vote", folder / "drive", "--map", point_map, "--out", folder / "a.ballot")
         except MapvoteError as error:
-            return str(error).replace(scratch, "")
-    return f"{added}, {deleted}"
+            return f"no ballot: {str(error).replace(scratch, '')}"
+        ballot = decode((folder / "a.ballot").read_bytes())
+    fuse = Settings().fuse.model_copy(update={"min_votes": 1})
+    decisions = update_map(read_map(point_map), [ballot], fuse)[1].values()
+    return f"{sum(d.added for d in decisions)}, {sum(d.deleted for d in decisions)}"
 
 
 def obey(where: str, kinds: str) -> Iterator[dict[str, object]]:
     """Of each kind: is it named, what remains once the doctor's advice is followed, and how the drive then votes."""
     at, folder = where.split("+")
     sound, point_map = recorded(opened(at)), read_map(folder)
-    yield {"kind": "as it is", "verdict": "sound", "mends": 0, "left": "", "votes": counted(sound, point_map)}
+    yield {"kind": "as it is", "verdict": "sound", "mends": 0, "left": "", "votes": counted(sound, Path(folder))}
 
     def look(r: Recording) -> list[Finding]:
         with tempfile.TemporaryDirectory() as scratch:
@@ -154,7 +152,7 @@ def obey(where: str, kinds: str) -> Iterator[dict[str, object]]:
         said = verdict(rights, look(r))
         r, found, done = obeyed(r, look)
         left = " | ".join(f"{f.severity}: {f.what}" for f in found if f.severity != "note")
-        yield {"kind": kind, "verdict": said, "mends": done, "left": left, "votes": counted(r, point_map)}
+        yield {"kind": kind, "verdict": said, "mends": done, "left": left, "votes": counted(r, Path(folder))}
 
 
 def mounts(where: str, kinds: str) -> Iterator[dict[str, object]]:
@@ -172,7 +170,7 @@ def mounts(where: str, kinds: str) -> Iterator[dict[str, object]]:
             r.write(Path(scratch) / "drive")
             found = diagnose(Path(scratch) / "drive", None, point_map).findings
         told = " | ".join(f"{f.severity}: {f.what}" for f in found if f.severity != "note")
-        yield {"mount": " ".join(map(str, rpy_deg)), "told": told, "votes": counted(r, point_map)}
+        yield {"mount": " ".join(map(str, rpy_deg)), "told": told, "votes": counted(r, Path(folder))}
 
 
 def main() -> None:

@@ -84,7 +84,8 @@ ADVICE: list[tuple[str, str, Callable[[re.Match[str], re.Match[str]], Mend]]] = 
     (r"", r"swap the first two coordinates", lambda w, m: positions(lambda p: p[:, [1, 0, 2]])),
     (r"", r"negate y of its positions", lambda w, m: positions(lambda p: p * [1, -1, 1])),
     (r"", r"chain them", lambda w, m: poses(chained)),
-    (r"", r"reverse one of them", lambda w, m: poses(lambda T: T[::-1])),
+    (r"", r"reverse its rows", lambda w, m: poses(lambda T: T[::-1])),
+    (r"", r"reverse the scans", lambda w, m: lambda r: replace(r, scans=r.scans[::-1])),
     (r"", rf"turn its rotations by {NUMBER} deg", lambda w, m: poses(lambda T: T @ turn(yaw=float(m[1])))),
     # of the times
     (r"times are milliseconds", r"convert times", lambda w, m: times(lambda t: t / 1e3)),

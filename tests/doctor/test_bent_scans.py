@@ -43,10 +43,10 @@ SOUND = {
 }
 WRONG = {
     "bent, without times": (with_scans(without), "error: the points are not motion-compensated", "= false"),
-    "bent, stated to be straight": (with_scans(without, "compensated"), "warning: the points are not", "= false"),
+    "bent, stated to be straight": (with_scans(without, "compensated"), "error: the points are not", "= false"),
     "bent, times backwards": (with_scans(backwards, "field"), "error: the times of points do not belong", '"none" and'),
     "straight, with times": (with_scans(straight, "field"), "error: the points are motion-compensated already", "true"),
-    "bent, from azimuths of the wrong turn": (with_scans(backwards, "azimuth"), "warning: the points are not", "false"),
+    "bent, from azimuths of the wrong turn": (with_scans(backwards, "azimuth"), "error: the points are not", "false"),
 }
 
 

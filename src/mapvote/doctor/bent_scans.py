@@ -16,7 +16,7 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
-from mapvote.doctor import Finding, Severity
+from mapvote.doctor import Finding
 from mapvote.formats.drives.point_fields import spinning_time_s
 from mapvote.matching.ndt_map import MapWindow
 from mapvote.matching.ndt_voxels import LEVELS
@@ -113,13 +113,12 @@ def _finding(best: str, how: str, as_read: F64, fits: F64) -> Finding:
     """The finding in words: a warning if the user stated the times."""
     shown = f"{(fits > as_read).sum()} of {len(fits)} scans fit the map better ({np.median(fits):.2f}, as read "
     shown += f"{np.median(as_read):.2f})"
-    grave: Severity = "warning" if how in ("compensated", "azimuth") else "error"
     if best == _NONE:
         what = f"the points are motion-compensated already: without their times {shown}"
-        return Finding(grave, what, "set motion_compensated = true in drive.toml")
+        return Finding("error", what, "set motion_compensated = true in drive.toml")
     what = f"the points are not motion-compensated: with times of a sensor that spins {best} {shown}"
     if how == "field":
         what = f"the times of points do not belong to them: with times of a sensor that spins {best} {shown}"
     field = 'time_field = "none" and ' if how == "field" else ""
     spin = "" if best == _CLOCKWISE else ", and clockwise = false in its table [sensor]"
-    return Finding(grave, what, f"set {field}motion_compensated = false in drive.toml{spin}")
+    return Finding("error", what, f"set {field}motion_compensated = false in drive.toml{spin}")

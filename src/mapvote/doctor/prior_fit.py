@@ -126,7 +126,7 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     time = measure_time(T, runs, drive.stamps_ns)
     numbers = [measure_scale(T, runs), turn if abs(pitch.value) <= abs(turn.value) else pitch]
     numbers += [time] if time is not None else []
-    fits = [_fit(reading, T, runs) for reading in READINGS]
+    fits = [_fit(_with_side(reading, runs), T, runs) for reading in READINGS]
     fits += [_fit(_reading_of(number, T, runs, e.road_below), T, runs, special=False) for number in numbers]
     # What the prior's own errors explain is no reason to read it otherwise.
     likely = [h for h in fits if as_it_is.median > _explained_m(drive, h.reading, h.median, length_m)]
@@ -165,7 +165,7 @@ def _two_at_once(T: F64, fits: Sequence[_Fit], runs: Sequence[Run], road: Road) 
         mended = one.reading.poses(T)
         if one.reading.catch_all or np.linalg.det(mended[0, :3, :3]) < 0:
             continue
-        others = [_fit(reading, mended, runs) for reading in READINGS if not reading.catch_all]
+        others = [_fit(_with_side(reading, runs), mended, runs) for reading in READINGS if not reading.catch_all]
         for number in (measure_scale(mended, runs), *measure_turn(mended, runs)):
             others.append(_fit(_reading_of(number, mended, runs, road), mended, runs, special=False))
         pairs.append((one, min(others, key=lambda h: h.median)))
@@ -234,6 +234,16 @@ def _for_a_map(group: Sequence[_Fit], fits: Sequence[_Fit], as_it_is: _Fit, T: F
         if not alike and len(out) < PRIOR_FIT_RULE.firsts + len(group):
             out.append(h.reading)
     return tuple(out)
+
+
+def _with_side(reading: Reading, runs: Sequence[Run]) -> Reading:
+    """A reading in which the order is wrong names whose: vehicles drive forwards, and scans in reverse order show one
+    that drives backwards."""
+    if reading.told_by != "order":
+        return reading
+    if abs(_forward_deg(runs)) > 90.0:
+        return replace(reading, name="the scans are in reverse order", mend="reverse the scans: name their files anew")
+    return replace(reading, name="the prior's rows are in reverse order", mend="reverse its rows")
 
 
 def _forward_deg(runs: Sequence[Run]) -> float:

@@ -52,9 +52,14 @@ def degrees_of(k: int) -> list[object]:
         (HEADER + rows(lambda k: [f"2025-10-01 15:00:{k:02d}.25+02:00", *tum(k)[1:]])).encode(),
         (ANGLES + rows(lambda k: [START_S + k + 0.25, *T[k, :3, 3].tolist(), *RPY[k].tolist()])).encode(),
         (ANGLES + rows(degrees_of)).encode(),
+        (HEADER + "s,m,m,m,1,1,1,1\n" + rows(tum)).encode(),
+        (ANGLES + "[s],[m],[m],[m],[deg],[deg],[deg]\n" + rows(degrees_of)).encode(),
+        rows(lambda k: [tum(k)[0], *(f"{v:.12E}".replace("E", "D") for v in tum(k)[1:])], " ").encode(),
+        (rows(tum, " ") + " ".join(map(str, tum(5))) + "\n").encode(),
     ],
     ids=["utf-16", "byte order mark", "CRLF", "decimal commas", "decimal commas, header", "tabs, decimal commas",
-         "dates", "dates of another zone", "radians", "few degrees without a unit"],
+         "dates", "dates of another zone", "radians", "few degrees without a unit", "a row of units",
+         "a row of units, degrees", "doubles of Fortran", "a row twice"],
 )  # fmt: skip
 def test_a_table_is_read_right_however_it_is_written(tmp_path: Path, data: bytes) -> None:
     file = tmp_path / "poses.csv"
@@ -94,6 +99,14 @@ def test_rows_of_another_kind_are_refused_by_line_cause_and_mend(tmp_path: Path,
     (tmp_path / "prior.txt").write_text(text)
     with pytest.raises(MapvoteError, match=said):
         read_poses(tmp_path / "prior.txt")
+
+
+def test_two_tracks_of_one_time_are_refused(tmp_path: Path) -> None:
+    """Whichever counted would be a guess."""
+    file = tmp_path / "p.tum"
+    file.write_text(rows(tum, " ") + " ".join(map(str, [tum(3)[0], 22.0, *tum(3)[2:]])) + "\n")
+    with pytest.raises(MapvoteError, match=r"p\.tum: row 13 lies 9\.0 m off row 4, which has its time"):
+        read_trajectory(file)
 
 
 def test_a_position_that_is_no_number_is_refused_by_its_line(tmp_path: Path) -> None:

@@ -6,9 +6,10 @@ Headers of EuRoC (``#timestamp [ns], p_RS_R_x [m], .., q_RS_w [], q_RS_x []``), 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _AXES = {"x": "x|east|easting", "y": "y|north|northing", "z": "z|up|altitude|alt|height"}
 _PLACE = r"(?:.*_)?(?:position|pos|translation|trans|location|loc)(?:_[a-z]+)*?_?"
@@ -92,10 +93,32 @@ def find_header(lines: Sequence[str]) -> Header | None:
         if words and is_number(words[0]):
             break
         header = _header_of(number, line)
+        if header is None and found is not None and _are_units(words, found):
+            return _with_units(found, number, words)
         found = header or found
         if header is None and not line.lstrip().startswith(("#", "%", "//")):
             break
     return found
+
+
+_UNITLESS = ("", "-", "1", "none", "unitless")
+
+
+def _are_units(words: Sequence[str], header: Header) -> bool:
+    """Whether a row below the header gives the units of its columns."""
+    stripped = [word.strip("[]()").lower() for word in words]
+    known = all(word in _UNITS_OF_POSES or word in _UNITLESS for word in stripped)
+    return known and len(words) == len(header.names) and any(word in _UNITS_OF_POSES for word in stripped)
+
+
+def _with_units(header: Header, line: int, words: Sequence[str]) -> Header:
+    """The header, which ends at ``line``, with the units that the row there gives."""
+    units = [word.strip("[]()").lower() for word in words]
+    columns = {
+        role: column if column.unit or units[column.index] in _UNITLESS else replace(column, unit=units[column.index])
+        for role, column in header.columns.items()
+    }
+    return replace(header, line=line, columns=columns)
 
 
 def _header_of(number: int, line: str) -> Header | None:
@@ -126,10 +149,21 @@ def _role(name: str) -> tuple[str, str]:
     return next((role for role, pattern in _ROLES if re.fullmatch(pattern, word)), ""), unit
 
 
-def is_number(text: str) -> bool:
-    """Whether a word of a table is a number."""
+def number_in(text: str) -> float:
+    """The number that a word of a table is, also as Fortran writes doubles (1.5D+00); NaN if it is none."""
     try:
-        float(text)
+        return float(text)
     except ValueError:
-        return False
-    return True
+        pass
+    try:
+        return float(_FORTRAN.sub(r"\1e\2", text))
+    except ValueError:
+        return float("nan")
+
+
+_FORTRAN = re.compile(r"(\d|\.)[dD]([-+]?\d+)$")
+
+
+def is_number(text: str) -> bool:
+    """Whether a word of a table is a number; NaN and infinity, spelt out, are."""
+    return not math.isnan(number_in(text)) or text.strip().lstrip("+-").lower() == "nan"

@@ -23,7 +23,7 @@ from mapvote.core.types import F64, I64, Bool, MapvoteError
 from mapvote.formats.drives.fixes import FIX_RULES, Fixes, fixes_of, priors_at
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame, mount_of
 from mapvote.formats.drives.point_fields import log
-from mapvote.formats.drives.pose_header import Column, find_header, is_number, split_row
+from mapvote.formats.drives.pose_header import Column, find_header, is_number, number_in, split_row
 from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 from mapvote.formats.listing import entry
@@ -43,6 +43,8 @@ class TrajectoryRule:
     """A pose is not interpolated over a longer hole, nanoseconds."""
     steady: float = 0.97
     """Least length of the mean direction of travel, in the axes of poses that are read right."""
+    one_time_m: float = 1.0
+    """Greatest distance of two poses of one time, metres."""
     unsteady: float = 0.9
     """Greatest such length where quaternions are read in the wrong order."""
 
@@ -56,7 +58,7 @@ def read_numbers(file: Path, columns: int) -> F64:
     rows = [(number, split_row(line)) for number, line in enumerate(lines, 1) if _holds(line)]
     out = np.empty((len(rows), columns))
     for i, (number, words) in enumerate(rows):
-        values = [_number(word) for word in words]
+        values = [number_in(word) for word in words]
         wrong = next((word for word, value in zip(words, values, strict=True) if not np.isfinite(value)), None)
         if wrong is not None:
             raise MapvoteError(f"{file}:{number}: not a number: {wrong[:40]!r}; correct the line, or leave it out")
@@ -216,6 +218,18 @@ def sorted_trajectory(times_ns: I64, T_map: F64, *, of_vehicle: bool, frame: Map
     return Trajectory(times_ns[first], T_map[first], of_vehicle, frame)
 
 
+def check_equal_times(file: Path, times_ns: I64, T_map: F64) -> None:
+    """MapvoteError if poses of one time lie farther apart than one vehicle can be: which of them counts?"""
+    _, first, which = np.unique(times_ns, return_index=True, return_inverse=True)
+    apart_m = np.linalg.norm(T_map[:, :3, 3] - T_map[first[which], :3, 3], axis=1)
+    row = int(np.argmax(np.nan_to_num(apart_m)))
+    if apart_m[row] > TRAJECTORY_RULE.one_time_m:
+        what = (
+            f"{file}: row {row + 1} lies {apart_m[row]:.1f} m off row {int(first[which[row]]) + 1}, which has its time"
+        )
+        raise MapvoteError(f"{what}: two tracks in one file, or a clock that stood? Leave one of them out")
+
+
 def has_times(file: Path) -> bool:
     """Whether a text file of poses carries times: TUM's eight numbers a row, or a header of names."""
     lines = read_text(file).splitlines()
@@ -239,6 +253,7 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
             )
         rows = read_numbers(file, 8)
         T, times_ns = _motions_of_quaternions(file, _in_tum_order(file, rows[:, 1:])), _ns(file, rows[:, 0])
+        check_equal_times(file, times_ns, T)
         return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
     times_ns, columns = read_columns(file)
     zero = np.zeros(len(times_ns))
@@ -252,6 +267,7 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
         T, frame = poses_from_gnss(place, rpy[keep], frame)
         has_heading = bool({"yaw", "heading", "qw"} & set(columns))
         T = T if has_heading else yaw_from_track(T)
+        check_equal_times(file, times_ns[keep], T)
         trajectory = sorted_trajectory(times_ns[keep], T, of_vehicle=True, frame=frame)
         # A whole pose without a standard deviation of its own is taken as it is.
         if has_heading and "sigma" not in columns:
@@ -266,6 +282,7 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
         T = motions_of_rpy(np.column_stack([position, rpy]))
     else:
         raise MapvoteError(f"{file}: no orientation: name columns qx, qy, qz, qw, or roll, pitch, yaw")
+    check_equal_times(file, times_ns, T)
     return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
 
 
@@ -360,7 +377,7 @@ def read_columns(file: Path) -> tuple[I64, dict[str, F64]]:
     if time is None:
         raise MapvoteError(f"{file}: no column of times among {', '.join(header.names)}; name one timestamp, time or t")
     times_ns = exact_ns(file, [row[time.index] for row in rows], time.scale)
-    values = {role: np.array([_number(row[column.index]) for row in rows]) for role, column in header.columns.items()}
+    values = {role: np.array([number_in(row[column.index]) for row in rows]) for role, column in header.columns.items()}
     columns = {role: values[role] * _scale(role, column) for role, column in header.columns.items()}
     unstated = [role for role in _ANGLES if role in columns and header.columns[role].scale is None]
     if _in_degrees(file, columns, unstated):
@@ -438,7 +455,7 @@ def exact_ns(file: Path, texts: Sequence[str], unit_ns: float | None = None) -> 
     if unit_ns is not None and all(is_number(text) for text in texts):
         return np.array([round(Fraction(text) * int(unit_ns)) for text in texts], dtype=np.int64)
     if not all(text.strip().lstrip("-").isdigit() for text in texts):
-        return _ns(file, np.array([_number(text) for text in texts]))
+        return _ns(file, np.array([number_in(text) for text in texts]))
     whole = [int(text) for text in texts]
     unit = _unit(float(max(map(abs, whole), default=0)))
     try:
@@ -459,11 +476,6 @@ def _ns(file: Path, seconds: F64) -> I64:
     whole = np.floor(seconds)
     ns: I64 = whole.astype(np.int64) * unit + np.round((seconds - whole) * unit).astype(np.int64)
     return ns
-
-
-def _number(text: str) -> float:
-    """NaN if it is none."""
-    return float(text) if is_number(text) else np.nan
 
 
 def of_scans(lines: NDArray[Any], files: list[Path], table: Path) -> NDArray[Any]:
