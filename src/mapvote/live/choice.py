@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from mapvote.core.types import MapvoteError
-from mapvote.live.dds import Network, PublishedTopic, TopicRate
+from mapvote.live.dds import Network, PublishedTopic, Subscription, TopicRate
 from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
 from mapvote.live.names import RosNames
 
@@ -26,6 +26,8 @@ class Waits:
     """Between two sentences on the same lack, seconds."""
     settle_s: float = 2.0
     """From the first cloud topic until the choice, so that a second LiDAR can appear, seconds."""
+    silent_s: float = 2.0
+    """From the subscription to a cloud topic until it counts as silent, seconds."""
     odometry_s: float = 10.0
     """From the first cloud topic until the drive begins without odometry, seconds."""
 
@@ -103,6 +105,46 @@ def choose_topics(
 ) -> Chosen | None:
     """The topics of ``wish``; None if ``ended`` first. MapvoteError if there is a choice to make, or if something is
     missing after ``limit_s``."""
+    listening = _Listening(network, voice.patience)
+    try:
+        return _choose(network, wish, voice, ended, limit_s, listening)
+    finally:
+        listening.close()
+
+
+class _Listening:
+    """Whether the clouds that are announced are sent, while the drive waits for odometry."""
+
+    def __init__(self, network: Network, waits: Waits) -> None:
+        self._network = network
+        self._waits = waits
+        self._readers: dict[str, tuple[Subscription, float]] = {}
+        self._heard: set[str] = set()
+
+    def silent(self, clouds: Sequence[PublishedTopic]) -> str:
+        """The lack of the first of ``clouds`` that sends nothing; "" if each sends, or may still do."""
+        now_s = time.monotonic()
+        for one in clouds:
+            if one.topic not in self._readers:
+                reader = self._network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=1)
+                self._readers[one.topic] = reader, now_s
+            reader, since_s = self._readers[one.topic]
+            if one.topic not in self._heard and reader.take():
+                self._heard.add(one.topic)
+            if one.topic not in self._heard and now_s - since_s > self._waits.silent_s:
+                return f"{one.topic} is announced but sends no cloud: is the LiDAR on?"
+        return ""
+
+    def close(self) -> None:
+        """Read no more."""
+        for reader, _ in self._readers.values():
+            reader.close()
+
+
+def _choose(
+    network: Network, wish: Wish, voice: Voice, ended: Callable[[], bool], limit_s: float, listening: _Listening
+) -> Chosen | None:
+    """:func:`choose_topics`."""
     start_s = time.monotonic()
     seen_s = float("inf")
     while not ended():
@@ -114,7 +156,7 @@ def choose_topics(
             seen_s = min(seen_s, now_s)
         text = lack_of_clouds(published, wish, network.domain)
         if not text and not poses:
-            text = lack_of_odometry(published, wish, voice.patience)
+            text = listening.silent(clouds) or lack_of_odometry(published, wish, voice.patience)
         settled = now_s - seen_s >= (voice.patience.settle_s if not wish.points else 0.0)
         hopeless = wish.odometry is None and now_s - seen_s >= voice.patience.odometry_s
         if len(clouds) >= max(len(wish.points), 1) and settled and (poses or hopeless):
@@ -212,9 +254,11 @@ def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish, waits: Wai
             f"no {ODOMETRY} or other pose is sent. {waits.odometry_s:.0f} s after the first cloud the drive begins "
             f"with the fixes of {fixes[0].topic}; or type --odometry {fixes[0].topic}"
         )
+    useless = [one.topic for one in _of_kinds(published, (GNSS,), (), wish.names)]
+    why = f" {useless[0]} is of no use: the map's place on Earth is unknown (import --crs EPSG:n)." if useless else ""
     return (
-        f"no {ODOMETRY} or other pose is sent. The drive begins without it {waits.odometry_s:.0f} s after the first "
-        "cloud, and the whole map is searched; or start the odometry, or type --odometry TOPIC"
+        f"no {ODOMETRY} or other pose is sent.{why} The drive begins without it {waits.odometry_s:.0f} s after the "
+        "first cloud, and the whole map is searched; or start the odometry, or type --odometry TOPIC"
     )
 
 

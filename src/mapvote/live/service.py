@@ -29,6 +29,7 @@ _SILENT_S = 10.0
 """Without a message for so long, a topic on the road is silent."""
 _JUDGED = 50
 """Scans after which it is judged whether they find map and place."""
+_NO_PLACE = "no scan has a sure place: is this the map of this road? mapvote doctor says more"
 _KEPT_SCANS, _KEPT_POSES = 50, 5000
 """Scans and poses that wait until sensor and frames are known; the oldest are dropped."""
 
@@ -233,6 +234,8 @@ class Needs:
         if topics.poses != self._poses:
             self._poses = topics.poses
             self._pose_s = now_s
+        if topics.clocks.trouble():
+            return topics.clocks.trouble()
         if silent_s > _SILENT_S:
             return "no cloud comes any more: is the LiDAR on, and the network up?"
         if topics.chosen.odometry is not None:
@@ -240,7 +243,8 @@ class Needs:
                 return f"{_lack(topics, self._plan)}. The drive goes on without odometry"
             if now_s - self._pose_s > _SILENT_S:
                 return f"no pose comes from {topics.chosen.odometry.topic}: the drive goes on without odometry"
-        return self._lack_of_place(live.counts)
+        missed = _NO_PLACE if live.counts.observed and not live.counts.localised else ""
+        return self._lack_of_place(live.counts) or missed
 
     def _lack_of_place(self, counts: Counts) -> str:
         """Whether scans find the map and a place on it, judged each few seconds."""
@@ -253,7 +257,7 @@ class Needs:
                 away = getattr(self._maps, "away", "") or "the map has none there: is this the map of this road?"
                 self._lacking_place = f"tiles around the vehicle are not here: {away}"
             elif counts.localised == before.localised:
-                self._lacking_place = "no scan has a sure place: is this the map of this road? mapvote doctor says more"
+                self._lacking_place = _NO_PLACE
             self._before = replace(counts)
         return self._lacking_place
 
