@@ -41,7 +41,8 @@ class Work:
     def refusal(self) -> TooSlow:
         """The error of work that takes too long."""
         limit = f"this takes longer than {self.limit_s:g} s ([server] question_s)"
-        return TooSlow(f"{limit}: ask for less, such as fewer versions or one vehicle")
+        more = "ask again, for most answers go on from what was found, or ask for less, such as fewer versions"
+        return TooSlow(f"{limit}: {more}")
 
 
 current: ContextVar[Work | None] = ContextVar("mapvote_work", default=None)

@@ -24,6 +24,7 @@ from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import said_by
 from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
+from mapvote_server.store.database import Question
 from mapvote_server.store.queries import tile_as_of, version_of
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import Electorate, electorate_now, from_sound_ballots, judged_on
@@ -97,8 +98,13 @@ def waiting_votes(store: Store) -> Waiting | None:
             def look(index: TileIndex) -> _Tile | None:
                 if _vehicles_on(connection, index) >= quorum:
                     return None
-                drives = _counting(connection, newest, asked, store.lattice.tile(index))
-                waits = None if drives is None else _waits(drives, _states(drives, store, index, asked), quorum)
+                window = store.lattice.tile(index)
+                counting = _counting(connection, newest, asked, window)
+                if counting is None:
+                    return None
+                drives = list(counting.values())
+                states = [said_by(vote) for vote in one_each(by_voter(drives, asked.settings), window)]
+                waits = _waits(drives, states, quorum)
                 return None if waits is None else _Tile(waits)
 
             tiles.refresh(connection, asked, now_ns, look)
@@ -107,14 +113,19 @@ def waiting_votes(store: Store) -> Waiting | None:
 
 def _vehicles_on(connection: sa.Connection, index: TileIndex) -> int:
     """Vehicles with a standing ballot on a tile."""
-    b, t = schema.ballots.c, schema.ballot_tiles.c
-    vehicles = sa.select(sa.func.count(sa.distinct(b.vehicle))).join(schema.ballot_tiles, b.seq == t.ballot)
-    here = vehicles.where(t.row == index[0], t.col == index[1], b.gone_seq.is_(None))
-    return int(connection.execute(here).scalar_one())
+    return int(_VEHICLES.ask(connection, row=index[0], col=index[1]).scalar_one())
 
 
-def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> list[TileVote] | None:
-    """The votes on a tile of the newest version of the drives that count, in the cells where they do; None if the tile
+_B, _T = schema.ballots.c, schema.ballot_tiles.c
+_VEHICLES = Question(
+    sa.select(sa.func.count(sa.distinct(_B.vehicle)))
+    .join(schema.ballot_tiles, _B.seq == _T.ballot)
+    .where(_T.row == sa.bindparam("row"), _T.col == sa.bindparam("col"), _B.gone_seq.is_(None))
+)
+
+
+def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> dict[int, TileVote] | None:
+    """By ballot the votes on a tile of the newest version that count, in the cells where they do; None if the tile
     cannot be read."""
     try:
         tile = tile_as_of(connection, window, newest)
@@ -123,12 +134,7 @@ def _counting(connection: sa.Connection, newest: int, asked: Electorate, window:
     except MapvoteError:
         return None
     judged = from_sound_ballots(connection, asked, lambda now: judged_on(connection, tile, now))
-    return [one.vote for one in judged if one.vote is not None]
-
-
-def _states(drives: Sequence[TileVote], store: Store, index: TileIndex, asked: Electorate) -> list[U8]:
-    """(256, 256) of each voter."""
-    return [said_by(vote) for vote in one_each(by_voter(drives, asked.settings), store.lattice.tile(index))]
+    return {one.stored.seq: one.vote for one in judged if one.vote is not None}
 
 
 def _waits(drives: Sequence[TileVote], states: Sequence[U8], quorum: int) -> _Waits | None:
@@ -193,11 +199,12 @@ def _look(
 ) -> _Tile | None:
     """Changes that one more pass would decide on a tile of the newest version; None without any."""
     quorum = asked.settings.min_votes
-    drives = _counting(connection, newest, asked, window)
-    if drives is None:
+    counting = _counting(connection, newest, asked, window)
+    if counting is None:
         return _Tile(None, damaged=tile_key(window.tile_index))
-    if not drives:
+    if not counting:
         return None
+    drives = list(counting.values())
     named = by_voter(drives, asked.settings)
     vehicles = {voter.vehicle: drive.vehicle for voter, drive in zip(named, drives, strict=True)}
     voters = one_each(named, window)
@@ -207,38 +214,32 @@ def _look(
     waits = _waits(drives, states, quorum)
     if not waiting.any():
         return None if waits is None else _Tile(waits)
-    paths = _paths_on(connection, window, path_of)
+    paths = defaultdict[str, list[F64]](list)
+    for ballot, drive in counting.items():
+        paths[drive.vehicle] += _part_near(window, path_of(ballot))
     witnesses = [Witness(said_by(vote), paths[vehicles[vote.vehicle]]) for vote in voters]
     seen = [w.states == short for w in witnesses if any(len(path) > 1 for path in w.paths_m)]
     unseen = int((waiting & ~np.any(seen, axis=0)).sum() if seen else waiting.sum())
     return _Tile(waits, stretches(window, witnesses, quorum), int(waiting.sum()), unseen)
 
 
-def _paths_on(connection: sa.Connection, window: Grid, path_of: Callable[[int], F64]) -> dict[str, list[F64]]:
-    """By vehicle: of each standing drive with a path that votes on a tile the part from where it first comes near to
-    where it leaves, (n, 2) map metres."""
-    b, t, p = schema.ballots.c, schema.ballot_tiles.c, schema.paths.c
-    row, col = window.tile_index
-    here = (
-        sa.select(b.seq, b.vehicle).join(schema.ballot_tiles, t.ballot == b.seq).join(schema.paths, p.ballot == b.seq)
-    )
-    here = here.where(t.row == row, t.col == col, b.gone_seq.is_(None)).order_by(b.seq)
+def _part_near(window: Grid, path: F64) -> list[F64]:
+    """The part of a path from where it first comes near a tile to where it leaves, (n, 2) map metres; none without."""
     low = np.array([window.x0, window.y0]) - COVERAGE_SIZES.reach_m
     high = low + 2 * COVERAGE_SIZES.reach_m + TILE_CELLS * CELL_SIZE
-    out = defaultdict[str, list[F64]](list)
-    for ballot, vehicle in connection.execute(here).all():
-        path = path_of(ballot)
-        near = np.flatnonzero(((path >= low) & (path <= high)).all(axis=1))
-        if len(near):
-            out[vehicle].append(path[near[0] : near[-1] + 1])
-    return out
+    near = np.flatnonzero(((path >= low) & (path <= high)).all(axis=1))
+    return [path[near[0] : near[-1] + 1]] if len(near) else []
 
 
 def _driven(connection: sa.Connection, store: Store, ballot: int) -> F64:
-    """(n, 2) the path of a ballot's drive, map metres."""
-    p = schema.paths.c
-    path = connection.execute(sa.select(p.path).where(p.ballot == ballot)).scalar_one()
+    """(n, 2) the path of a ballot's drive, map metres; empty if the ballot has none."""
+    path = _PATH.ask(connection, ballot=ballot).scalar_one_or_none()
+    if path is None:
+        return np.zeros((0, 2))
     return np.array([store.lattice.x0, store.lattice.y0]) + (unpack_path(path)[:, ::-1] + 0.5) * CELL_SIZE
+
+
+_PATH = Question(sa.select(schema.paths.c.path).where(schema.paths.c.ballot == sa.bindparam("ballot")))
 
 
 def _in_order(found: Sequence[Stretch]) -> list[Stretch]:

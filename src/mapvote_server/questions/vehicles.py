@@ -9,7 +9,7 @@ test is exact for few data, and "undecidable" is one of its results.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from threading import Lock
@@ -21,6 +21,7 @@ import scipy
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import unpack_path
+from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F32, I64
 from mapvote.shapes.geojson import collection, utc
@@ -30,7 +31,7 @@ from mapvote_server.questions.explain import seen, votes_on
 from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.policy import policy_in
-from mapvote_server.store.queries import load_tile, tiles_of, version_of
+from mapvote_server.store.queries import load_blob, tiles_of, version_of
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import FOREVER, Electorate
 
@@ -255,7 +256,8 @@ def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
 
         @cache
         def ground(index: TileIndex) -> F32:
-            return load_tile(connection, store.lattice.tile(index), known.get(index)).ground_z
+            plane = known[index].ground if index in known else None
+            return _NO_GROUND if plane is None else unpack_ground_plane(load_blob(connection, plane), plane)
 
         lines = [_line(store, path, ground) for path in driven]
     return collection(
@@ -276,11 +278,16 @@ def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
     )
 
 
-def _line(store: Store, path: I64, ground: Any) -> list[list[float]]:
+_NO_GROUND = np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32)
+
+
+def _line(store: Store, path: I64, ground: Callable[[TileIndex], F32]) -> list[list[float]]:
     rows, cols = path.T
-    z = np.array(
-        [ground((int(r) // TILE_CELLS, int(c) // TILE_CELLS))[r % TILE_CELLS, c % TILE_CELLS] for r, c in path]
-    )
+    tiles, which = np.unique(path // TILE_CELLS, axis=0, return_inverse=True)
+    z = np.empty(len(path))
+    for k, (row, col) in enumerate(tiles.tolist()):
+        here = which.reshape(-1) == k
+        z[here] = ground((row, col))[rows[here] % TILE_CELLS, cols[here] % TILE_CELLS]
     known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
     first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
     height = np.where(known >= 0, z[known], first)

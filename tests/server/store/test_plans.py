@@ -13,6 +13,8 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote_server.questions.changes import changes_between
+from mapvote_server.questions.coverage import waiting_votes, wanted_passes
+from mapvote_server.questions.vehicles import vehicle_standings
 from mapvote_server.store.admission import Intake
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
@@ -91,3 +93,11 @@ def test_a_publish_a_manifest_since_a_version_and_changes_between_two_read_what_
     assert scans(store, lambda: publish(store)) == []
     assert scans(store, lambda: store.manifest(since=1)) == []
     assert scans(store, lambda: changes_between(store, 1, store.current())) == []
+
+
+@pytest.mark.parametrize("question", [vehicle_standings, waiting_votes, wanted_passes])
+def test_a_question_asked_again_reads_what_an_event_touched(store: Store, question: Callable[[Store], object]) -> None:
+    question(store)
+    assert scans(store, lambda: question(store)) == []
+    vote(store, Intake(store), "d3", (10, 12))
+    assert scans(store, lambda: question(store)) == []
