@@ -13,6 +13,7 @@ from mapvote.cli.door import api_at, check_ending, is_url, sound_map, when
 from mapvote.cli.options import Config, KeyFile, Panel, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
 from mapvote.core.types import MapvoteError
+from mapvote_server.stores import LIST_LENGTHS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -270,14 +271,11 @@ def _print_versions(answer: Mapping[str, Any]) -> None:
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
 
 
-_MOST_CHANGES = 40
-
-
 def _print_changes(found: Mapping[str, Any]) -> None:
     """The changes as a table, the largest first."""
     rows = []
     largest_first = sorted(found["features"], key=lambda feature: -feature["properties"]["area_m2"])
-    for feature in largest_first[:_MOST_CHANGES]:
+    for feature in largest_first[: LIST_LENGTHS.changes]:
         about = feature["properties"]
         (x0, y0), (x1, y1) = about["box"]
         votes = f"{about['votes_min']}" if about["versions"] else "none: taken back"
@@ -288,8 +286,8 @@ def _print_changes(found: Mapping[str, Any]) -> None:
         print(f"nothing changed {versions}")
         return
     print_table(("change", "x (m)", "y (m)", "m2", "m high", "points", "votes at least"), rows)
-    if len(found["features"]) > _MOST_CHANGES:
-        print(f"and {len(found['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
+    if len(found["features"]) > LIST_LENGTHS.changes:
+        print(f"and {len(found['features']) - LIST_LENGTHS.changes} smaller ones; --out FILE writes all of them")
     print(f"{len(found['features'])} changes {versions}")
     if not all(feature["properties"]["versions"] for feature in found["features"]):
         print("taken back: no vehicle voted for it, a rollback or a replay took an earlier decision back")
@@ -350,9 +348,6 @@ def explain(
         print(f"    {before}; {now}")
 
 
-_MOST_STRETCHES = 20
-
-
 def coverage(
     store: StoreOrUrl,
     out: Annotated[
@@ -374,7 +369,7 @@ def coverage(
     with api_at(store, key_file) as server:
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
-    for feature in found["features"][:_MOST_STRETCHES]:
+    for feature in found["features"][: LIST_LENGTHS.stretches]:
         about, line = feature["properties"], feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
         counts = (str(about[what]) for what in ("cells", "built", "gone"))

@@ -58,31 +58,54 @@ class GroundLaying:
 GROUND_LAYING = GroundLaying()
 GAP_STEP_M = 0.5 * CELL_SIZE
 """Unit of a gap's width: a cell is 2 units straight on, 3 across a corner (chamfer 2-3; Borgefors 1986)."""
-WIDEST = 100
-"""Units: 15 m. Ground does not go on across a wider gap."""
+
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class GroundGrowth:
+    """Numbers by which the ground grows from cell to cell. Its unit of distance is ``GAP_STEP_M``."""
+
+    widest: int = 100
+    """Widest gap that the ground crosses, units: 15 m."""
+    near_cells: int = 5
+    """Cells within which ground bounds the height of a point from above and below: 1.5 m."""
+    noise_m: float = 0.06
+    """Noise of a voxel's mean height, metres: range and pose noise, a cobble."""
+    climb: float = 0.15
+    """Steepest rise of ground, metres per metre; a steeper one is an object."""
+    fall: float = 0.5
+    """Steepest fall of ground, metres per metre; beyond ``climb`` it must be a broad one."""
+    broad: int = 14
+    """Cells of the 24 around at a like height, before a point off the expected ground is ground: a steep fall, a kerb's
+    step up, a surface between measurements that contradict each other. Reflections make patches of 12."""
+    kerb_m: float = 0.2
+    """Rise of a step above a slope up to which it is ground, metres: a kerb."""
+    higher_around: int = 4
+    """Cells of the 8 around that lie higher behind a kerb, at least; before it there are 3."""
+    open_m: float = 1.0
+    """Free height above a kerb, metres: a car's underside has none."""
+    beyond_gap: int = 2
+    """Cells of the 24 around with points at a like height, before the ground goes on beyond a gap."""
+
+
+GROUND_GROWTH = GroundGrowth()
+# Kernels take no records: they read these names.
+WIDEST = GROUND_GROWTH.widest
 UNREACHED = 255
 """Gap of a cell that the ground never came to."""
 SEED = 254
 """Gap of a cell from which it shall grow."""
-_NEAR_CELLS = 5
-"""Ground this near (1.5 m) bounds how high and how low a point may be."""
+_NEAR_CELLS = GROUND_GROWTH.near_cells
 _AWAY_M = CELL_SIZE * np.sqrt(sum(axis**2 for axis in np.indices((2 * _NEAR_CELLS + 1,) * 2) - _NEAR_CELLS))
 """(11, 11) distances of the cells near by."""
-_NOISE_M = 0.06
-"""Noise of a voxel's mean height: range and pose noise, a cobble."""
-_CLIMB, _FALL = 0.15, 0.5
-"""Steepest ground, metres per metre. A steeper rise is an object; a steep fall must be a broad one."""
-_BROAD = 14
-"""Cells of the 24 around at a like height, before a point off the expected ground is ground: a steep fall, a kerb's
-step up, a surface between measurements that contradict each other. Reflections make patches of 12."""
-_KERB_M = 0.2
-"""Rise of a step above a slope up to which it is ground: a kerb."""
-_MOST_AROUND = 4
-"""Cells of the 8 around that lie higher behind a kerb, at least; before it there are 3."""
-_OPEN_M = 1.0
-"""Free height above a kerb: a car's underside has none."""
-_BEYOND_GAP = 2
-"""Cells of the 24 around with points at a like height, before the ground goes on beyond a gap."""
+_NOISE_M = GROUND_GROWTH.noise_m
+_CLIMB = GROUND_GROWTH.climb
+_FALL = GROUND_GROWTH.fall
+_BROAD = GROUND_GROWTH.broad
+_KERB_M = GROUND_GROWTH.kerb_m
+_MOST_AROUND = GROUND_GROWTH.higher_around
+_OPEN_M = GROUND_GROWTH.open_m
+_BEYOND_GAP = GROUND_GROWTH.beyond_gap
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""

@@ -18,6 +18,7 @@ import numpy as np
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.doctor import Finding, any_error, in_order
 from mapvote.doctor.localised import LocalisedDrive, written_if_localised
@@ -32,21 +33,35 @@ from mapvote.live.thinning import THINNING, Thinning
 from mapvote.vehicle import ClosedStretch, Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
-_FIXES = 400
-"""Poses of scans that voted that are kept at most."""
-_PATIENCE_NS = 300_000_000
-"""A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
-_BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
-"""A stamp so much before the last one, or after it: the clock has jumped."""
-_JUMPED = 3
-"""So many scans in turn make a jump. A single one is late or damaged."""
-_SECONDS_NS = 10 * 10**9
-_EVERY = 4
-"""Each scan is looked at, and one of so many is kept: 30 MB."""
-_SICK = 0.5
-"""If fewer scans have a sure place it is asked how the drive lies on the map."""
-_LATENCIES = 6000
-"""Latencies that are kept: ten minutes at 10 Hz."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class LiveRule:
+    """Numbers of a live drive."""
+
+    fixes: int = 400
+    """Poses of scans that voted that are kept at most."""
+    patience_ns: int = 300_000_000
+    """Time that a scan waits for a pose later than its own stamp, nanoseconds; then the newest ones are extrapolated,
+    or it has none."""
+    back_ns: int = 10**9
+    """Step of a stamp back after which the clock has jumped, nanoseconds."""
+    ahead_ns: int = 3600 * 10**9
+    """Step of a stamp ahead after which the clock has jumped, nanoseconds."""
+    jumped: int = 3
+    """Odd stamps in turn that make a jump; a single one is late or damaged."""
+    checked_ns: int = 10 * 10**9
+    """First part of a drive that the doctor checks, nanoseconds."""
+    kept_every: int = 4
+    """Scans of that part of which one is kept for the check: 30 MB."""
+    sick_share: float = 0.5
+    """Share of scans with a sure place below which the fit of the drive to the map is checked."""
+    latencies: int = 6000
+    """Latencies that are kept: ten minutes at 10 Hz."""
+
+
+LIVE_RULE = LiveRule()
 
 
 class WaitingScan(NamedTuple):
@@ -113,9 +128,9 @@ class FirstSeconds:
         self._priors.append(T_map_lidar_prior)
         self._kept[n] = scan
         self._looking.look([n])
-        if n % _EVERY:
+        if n % LIVE_RULE.kept_every:
             del self._kept[n]
-        return scan.stamp_ns - self._stamps_ns[0] >= _SECONDS_NS
+        return scan.stamp_ns - self._stamps_ns[0] >= LIVE_RULE.checked_ns
 
     def _drive(self, vehicle: Vehicle) -> Drive:
         priors = [T for T in self._priors if T is not None]
@@ -125,7 +140,7 @@ class FirstSeconds:
             vehicle.drive_id,
             vehicle.sensor,
             np.array(self._stamps_ns, dtype=np.int64),
-            lambda i: self._kept[i] if i in self._kept else self._kept[i - i % _EVERY],
+            lambda i: self._kept[i] if i in self._kept else self._kept[i - i % LIVE_RULE.kept_every],
             np.stack(priors) if priors and len(priors) == len(self._stamps_ns) else None,
             sensor_told=self._told,
         )
@@ -143,7 +158,7 @@ class FirstSeconds:
         found = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
         report = vehicle.report
         decided = len(report.T_map_lidar)
-        if decided and len(report.lost) > _SICK * decided and not any_error(found):
+        if decided and len(report.lost) > LIVE_RULE.sick_share * decided and not any_error(found):
             found += self._on_map(drive, point_map, len(report.lost), decided)
         return in_order(found)
 
@@ -179,7 +194,7 @@ class LiveDrive:
         :meth:`first_findings` was asked, and none of a stretch on which the vehicle did not know where it was. Without
         it nothing is checked."""
         self.counts, self._maps, self._outbox = Counts(), maps, outbox
-        self.latencies_s: deque[float] = deque(maxlen=_LATENCIES)
+        self.latencies_s: deque[float] = deque(maxlen=LIVE_RULE.latencies)
         """From stamp to vote, of the last scans that voted during the drive. Those of its last second vote at its
         end."""
         self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
@@ -200,7 +215,7 @@ class LiveDrive:
         self._waiting = deque[WaitingScan]()
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
-        self.fixes: deque[Fixed] = deque(maxlen=_FIXES)
+        self.fixes: deque[Fixed] = deque(maxlen=LIVE_RULE.fixes)
         """Fixes of the scans that voted last. The publisher of a fix removes it."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
@@ -239,9 +254,9 @@ class LiveDrive:
         """One scan, as it arrives. It is left out if it is not later than the last one, or if too many wait."""
         self.counts.scans += 1
         step_ns = scan.stamp_ns - self._last_ns
-        if self._last_ns >= 0 and (step_ns < -_BACK_NS or step_ns > _AHEAD_NS):
+        if self._last_ns >= 0 and (step_ns < -LIVE_RULE.back_ns or step_ns > LIVE_RULE.ahead_ns):
             self._odd_stamps += 1
-            if self._odd_stamps < _JUMPED:
+            if self._odd_stamps < LIVE_RULE.jumped:
                 self.counts.late += 1
                 return
             self._jump(step_ns)
@@ -251,7 +266,7 @@ class LiveDrive:
             return
         elif self._last_ns >= 0 and self._period_ns:
             self.counts.missing += max(0, round(step_ns / self._period_ns) - 1)
-        if 0 < step_ns < _BACK_NS:
+        if 0 < step_ns < LIVE_RULE.back_ns:
             self._period_ns = step_ns if not self._period_ns else min(step_ns, int(1.02 * self._period_ns))
         self._odd_stamps, self._last_ns = 0, scan.stamp_ns
         if self._thinning.admits(1e-9 * scan.sent_ns, len(self._waiting)):
@@ -333,7 +348,12 @@ class LiveDrive:
             return False
         scan = self._waiting[0]
         unknown = not self._priors.covers(scan.stamp_ns)
-        if self._with_poses and not ended and unknown and self._waiting[-1].stamp_ns - scan.stamp_ns < _PATIENCE_NS:
+        if (
+            self._with_poses
+            and not ended
+            and unknown
+            and self._waiting[-1].stamp_ns - scan.stamp_ns < LIVE_RULE.patience_ns
+        ):
             return False
         if ended or self.vehicle is not None or len(self._waiting) > THINNING.crowded:
             return True

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse
 from mapvote.core.points import point_field
+from mapvote.core.record import record
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.bag import Bag, is_rosbag
@@ -35,10 +37,19 @@ from mapvote.live.messages import (
     to_cdr,
 )
 
-_DISCOVERY_S = 0.5
-"""Between the first reader and the first message, so that every reader has found every topic."""
-_REPEATED_S = 30.0
-"""How long a slow reader may take for what was sent last."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class PlayWaits:
+    """Waits of a drive that is played on DDS."""
+
+    discovery_s: float = 0.5
+    """Time between the first reader and the first message, seconds: every reader has found every topic by then."""
+    delivery_s: float = 30.0
+    """Time that a slow reader has for the last messages, seconds."""
+
+
+PLAY_WAITS = PlayWaits()
 POINTS, POSES = "/points", "/odometry"
 
 
@@ -65,7 +76,7 @@ def play(path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0
     end = time.monotonic() + wait_s
     while time.monotonic() < end and not any(publication.readers for publication in out.values()):
         time.sleep(0.05)
-    time.sleep(_DISCOVERY_S)
+    time.sleep(PLAY_WAITS.discovery_s)
     count = 0
     for _ in range(loops):
         start, first = time.monotonic(), None
@@ -74,12 +85,12 @@ def play(path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0
             time.sleep(max(0.0, start + 1e-9 * (message.time_ns - first) / rate - time.monotonic()))
             out[message.topic].send(message.data)
             count += 1
-    late = [topic for topic, publication in out.items() if not publication.delivered(_REPEATED_S)]
+    late = [topic for topic, publication in out.items() if not publication.delivered(PLAY_WAITS.delivery_s)]
     if late:  # a reliable writer that is gone repeats nothing
         raise MapvoteError(
-            f"{path}: a reader has not got all of {', '.join(late)} in {_REPEATED_S:.0f} s; is it too slow?"
+            f"{path}: a reader has not got all of {', '.join(late)} in {PLAY_WAITS.delivery_s:.0f} s; is it too slow?"
         )
-    time.sleep(_DISCOVERY_S)
+    time.sleep(PLAY_WAITS.discovery_s)
     return count
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.frames import is_map_frame
 from mapvote.live.choice import Voice
@@ -24,14 +25,27 @@ from mapvote.live.sweeps import Cloud
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")
-_LOOP_S = 0.05
-_SILENT_S = 10.0
-"""Without a message for so long, a topic on the road is silent."""
-_JUDGED = 50
-"""Scans after which it is judged whether they find map and place."""
 _NO_PLACE = "no scan has a sure place: is this the map of this road? mapvote doctor says more"
-_KEPT_SCANS, _KEPT_POSES = 50, 5000
-"""Scans and poses that wait until sensor and frames are known; the oldest are dropped."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class LoopTimes:
+    """Numbers of the loop of a live vehicle."""
+
+    loop_s: float = 0.05
+    """Time of one round, seconds."""
+    silent_s: float = 10.0
+    """Time without a message after which a topic on the road is silent, seconds."""
+    judged: int = 50
+    """Scans after which it is judged whether they find map and place."""
+    kept_scans: int = 50
+    """Scans that wait until sensor and frames are known; the oldest are dropped."""
+    kept_poses: int = 5000
+    """Poses that wait until sensor and frames are known; the oldest are dropped."""
+
+
+LOOP_TIMES = LoopTimes()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +78,12 @@ def prepare(
     ``voice`` reports missing topics. MapvoteError if frames or odometry's mount are missing for the idle time.
     """
     voice = voice or Voice(log.warning)
-    scans: deque[list[Cloud]] = deque(maxlen=_KEPT_SCANS)
-    poses: deque[tuple[int, F64]] = deque(maxlen=_KEPT_POSES)
+    scans: deque[list[Cloud]] = deque(maxlen=LOOP_TIMES.kept_scans)
+    poses: deque[tuple[int, F64]] = deque(maxlen=LOOP_TIMES.kept_poses)
     start_s = time.monotonic()
     first_s = np.inf
     while not ended():
-        topics.network.wait(_LOOP_S)
+        topics.network.wait(LOOP_TIMES.loop_s)
         begun = topics.ways_begun
         came = topics.take_poses()
         if topics.ways_begun != begun:  # the poses before are in another frame
@@ -170,7 +184,7 @@ def run(
         for watcher in watchers:
             watcher(live, topics)
         if not stepped:
-            topics.network.wait(_LOOP_S)
+            topics.network.wait(LOOP_TIMES.loop_s)
         poses, scans = topics.take_poses(), topics.take_scans()
     _check(live, topics)
     live.finish()
@@ -236,12 +250,12 @@ class Needs:
             self._pose_s = now_s
         if topics.clocks.trouble():
             return topics.clocks.trouble()
-        if silent_s > _SILENT_S:
+        if silent_s > LOOP_TIMES.silent_s:
             return "no cloud comes any more: is the LiDAR on, and the network up?"
         if topics.chosen.odometry is not None:
             if self._plan.T_base_lidar is None and topics.T_base_lidar() is None:
                 return f"{_lack(topics, self._plan)}. The drive goes on without odometry"
-            if now_s - self._pose_s > _SILENT_S:
+            if now_s - self._pose_s > LOOP_TIMES.silent_s:
                 return f"no pose comes from {topics.chosen.odometry.topic}: the drive goes on without odometry"
         missed = _NO_PLACE if live.counts.observed and not live.counts.localised else ""
         return self._lack_of_place(live.counts) or missed
@@ -251,7 +265,7 @@ class Needs:
         before = self._before
         without_map = counts.without_map - before.without_map
         decided = counts.localised + counts.lost - before.localised - before.lost
-        if without_map + decided >= _JUDGED:
+        if without_map + decided >= LOOP_TIMES.judged:
             self._lacking_place = ""
             if without_map > decided:
                 away = getattr(self._maps, "away", "") or "the map has none there: is this the map of this road?"

@@ -8,12 +8,13 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mapvote.core.mount import Mount, mount_of_base
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of
@@ -38,14 +39,24 @@ from mapvote.live.names import RosNames
 from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 
 log = logging.getLogger("mapvote.live")
-_DEPTH = 200
-"""Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
-_POSES = 400
-"""Poses whose times of sending are kept: four seconds at 100 Hz."""
-_OTHER_CLOCK_NS = 10**9
-"""Stamps of clouds and poses that come together and differ by more are of two clocks."""
-_TOGETHER_NS = 500_000_000
-"""Clouds and poses that are sent, or that arrive, within so long come together."""
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class SubscriptionRule:
+    """Numbers of a vehicle's subscriptions."""
+
+    depth: int = 200
+    """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
+    poses: int = 400
+    """Poses whose times of sending are kept: four seconds at 100 Hz."""
+    other_clock_ns: int = 10**9
+    """Difference of the stamps of clouds and poses of one moment from which they are of two clocks, nanoseconds."""
+    together_ns: int = 500_000_000
+    """Time within which clouds and poses are of one moment, nanoseconds."""
+
+
+SUBSCRIPTION_RULE = SubscriptionRule()
 
 
 class Clocks:
@@ -56,7 +67,7 @@ class Clocks:
     """
 
     def __init__(self) -> None:
-        self._poses: deque[tuple[int, int]] = deque(maxlen=_POSES)
+        self._poses: deque[tuple[int, int]] = deque(maxlen=SUBSCRIPTION_RULE.poses)
         """(time of sending, stamp) of the last poses, nanoseconds."""
         self._arrived_s = -np.inf
         self.apart_ns = 0
@@ -73,15 +84,15 @@ class Clocks:
             return
         near = min(bisect_left(self._poses, (sent_ns, 0)), len(self._poses) - 1)
         together = []
-        if abs(self._poses[near][0] - sent_ns) <= _TOGETHER_NS:
+        if abs(self._poses[near][0] - sent_ns) <= SUBSCRIPTION_RULE.together_ns:
             together.append(self._poses[near][1] - stamp_ns)
-        if now_s - self._arrived_s <= 1e-9 * _TOGETHER_NS:
+        if now_s - self._arrived_s <= 1e-9 * SUBSCRIPTION_RULE.together_ns:
             together.append(self._poses[-1][1] - stamp_ns)
         self.apart_ns = min(together, key=abs, default=self.apart_ns)
 
     def trouble(self) -> str:
         """The fault if they are two clocks, else ""."""
-        if abs(self.apart_ns) <= _OTHER_CLOCK_NS:
+        if abs(self.apart_ns) <= SUBSCRIPTION_RULE.other_clock_ns:
             return ""
         return (
             f"odometry's stamps are {1e-9 * self.apart_ns:+.1f} s off those of the clouds that come with them: two "
@@ -133,16 +144,21 @@ class Subscriptions:
         self._sweeps = Sweeps(len(chosen.points))
         self._revolutions = [Revolutions() for _ in chosen.points]
         self._points, self._odometry = (
-            [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
+            [
+                network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=SUBSCRIPTION_RULE.depth)
+                for one in topics
+            ]
             for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
         )
         self._imu = [
-            network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in [chosen.imu] if one
+            network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=SUBSCRIPTION_RULE.depth)
+            for one in [chosen.imu]
+            if one
         ]
         self.tf = self._frames_topic("tf")
         self.tf_static = self._frames_topic("tf_static")
         self._tf_static = network.subscribe(self.tf_static, TF, reliable=True, transient_local=True)
-        self._tf = network.subscribe(self.tf, TF, reliable=False, depth=_DEPTH)
+        self._tf = network.subscribe(self.tf, TF, reliable=False, depth=SUBSCRIPTION_RULE.depth)
         self._clock = network.subscribe(self.names.resolve("/clock"), CLOCK, reliable=False, depth=1)
         self.sim_time = sim_time
         self._clock_ns = 0

@@ -10,26 +10,45 @@ voxel. Pose errors are (6,) vectors (rho, phi) in map axes about the sensor: t' 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mapvote.core.kernel import fast_math, inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64
 from mapvote.matching.ndt_voxels import SEVEN, Vector, Window, holds, voxel_of
 
-COVARIANCE_SCALE = 5.0
-"""Factor for the correlation of neighbouring residuals, calibrated so that normalised squared errors average 6."""
-INLIER_E = 7.81
-"""Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
-CUTOFF_E = 25.0
-"""Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
-_SUM_BLOCK = 1024
-"""Points whose sums are taken in float32 before they are added up in float64."""
-PAIRED_AT_ONCE = 64
-"""Points that are paired together."""
-TURN_LEVER_M = 20.0
-"""Distance at which a rotation is weighed against a shift, where one number must serve both."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class NdtAlignment:
+    """Numbers of the alignment of a scan with distributions."""
+
+    covariance_scale: float = 5.0
+    """Factor for the correlation of neighbouring residuals, calibrated so that normalised squared errors average 6."""
+    inlier_e: float = 7.81
+    """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of
+    freedom."""
+    cutoff_e: float = 25.0
+    """Squared Mahalanobis distance beyond which a voxel's pull on a point, exp(-e / 2), is neglected."""
+    sum_block: int = 1024
+    """Points whose sums are taken in float32 before they are added up in float64."""
+    paired_at_once: int = 64
+    """Points that are paired together."""
+    turn_lever_m: float = 20.0
+    """Distance at which a rotation is weighed against a shift, metres."""
+
+
+NDT_ALIGNMENT = NdtAlignment()
+# Kernels take no records: they read these names.
+COVARIANCE_SCALE = NDT_ALIGNMENT.covariance_scale
+INLIER_E = NDT_ALIGNMENT.inlier_e
+CUTOFF_E = NDT_ALIGNMENT.cutoff_e
+_SUM_BLOCK = NDT_ALIGNMENT.sum_block
+PAIRED_AT_ONCE = NDT_ALIGNMENT.paired_at_once
+TURN_LEVER_M = NDT_ALIGNMENT.turn_lever_m
 _UNPAIRED = np.int32(-(1 << 30))
 """No point's home: all are to be paired."""
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import F64, I32, I64
 
 
@@ -35,10 +36,23 @@ class Level:
 
 LEVELS = Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15)
 """Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
-MIN_POINTS = 3
-"""A voxel with fewer points has no distribution: two make a line."""
-FLATNESS = 0.08
-"""A voxel whose points spread less than this share of its side in height is a flat patch."""
+
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class NdtVoxelRule:
+    """Voxels that have a distribution."""
+
+    min_points: int = 3
+    """Points of a voxel with a distribution, at least: two make a line."""
+    flatness: float = 0.08
+    """Spread of a voxel's points in height, as a share of its side, below which it is a flat patch."""
+
+
+NDT_VOXEL_RULE = NdtVoxelRule()
+# Kernels take no records: they read these names.
+MIN_POINTS = NDT_VOXEL_RULE.min_points
+FLATNESS = NDT_VOXEL_RULE.flatness
 SEVEN = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
 """(7, 3) ways to a point's own voxel and the six beside it (DIRECT7)."""
 

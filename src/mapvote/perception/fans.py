@@ -8,6 +8,7 @@ The work for each ray is inlined: a call would pass five arrays, member by membe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,26 @@ import numpy as np
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, U32, U64
 
-FANS = 2048
-"""Fans in a turn (0.18 deg, a firing or two): two cross every cell at 40 m. A fan's direction is its rays' mean."""
-FULL_RANGE_M = 25.0
-"""Nearer than this every second fan suffices for two to a cell, nearer than half of it every fourth, and so on."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class FanRule:
+    """Fans of rays in the plane."""
+
+    fans: int = 2048
+    """Fans in a turn (0.18 deg, a firing or two): two cross every cell at 40 m. A fan's direction is its rays' mean."""
+    full_range_m: float = 25.0
+    """Range, metres, within which every second fan suffices for two to a cell; within half of it every fourth, and so
+    on."""
+
+
+FAN_RULE = FanRule()
+# Kernels take no records: they read these names.
+FANS = FAN_RULE.fans
+FULL_RANGE_M = FAN_RULE.full_range_m
 _LANES = 16
 """Cells that a ray is entered into at once. If the ray ends within them, the rest is masked."""
 _HALF_COLUMN = 32

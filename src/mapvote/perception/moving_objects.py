@@ -40,12 +40,24 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, U8, U16, Bool
 from mapvote.core.voxels import grouped, voxel_key
 
-PER_M = np.float32(500.0)
-"""Ranges are held in steps of 2 mm, up to 131 m."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class RangeImages:
+    """Numbers of the range images in which moving objects are found."""
+
+    steps_per_m: float = 500.0
+    """Steps of a range per metre: 2 mm, up to 131 m."""
+    least_range_m: float = 0.5
+    """Distance of points from the sensor in the plane below which they have no usable direction, metres."""
+
+
+RANGE_IMAGES = RangeImages()
+# Kernels take no records: they read these names.
+PER_M = np.float32(RANGE_IMAGES.steps_per_m)
 NO_RETURN = np.uint16(65535)
 """Value of a range image in directions without a return."""
-LEAST_RANGE_M = np.float32(0.5)
-"""Points nearer than this to the sensor in the plane have no usable direction."""
+LEAST_RANGE_M = np.float32(RANGE_IMAGES.least_range_m)
 
 
 class Pixels(NamedTuple):

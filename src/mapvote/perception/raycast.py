@@ -26,8 +26,20 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 from mapvote.perception.fans import FANS, Fans, Rays, follow_rays, gather_rays, mark_passed, set_out
 
-CLEARANCE_M = 0.45
-"""A ray proves emptiness only up to here before its own hit: half a voxel's diagonal, range noise and pose error."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class RayRule:
+    """Emptiness along a ray."""
+
+    clearance_m: float = 0.45
+    """Distance before its own hit up to which a ray proves emptiness, metres: half a voxel's diagonal, range noise and
+    pose error."""
+
+
+RAY_RULE = RayRule()
+# Kernels take no records: they read these names.
+CLEARANCE_M = RAY_RULE.clearance_m
 
 
 class Sight(IntEnum):

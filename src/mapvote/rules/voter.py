@@ -18,6 +18,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, cut_tiles
 from mapvote.core.points import Fields, Values, point_field
+from mapvote.core.record import record
 from mapvote.core.rule import Rule
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, N_STATES, U8, U64, Bool
@@ -83,11 +84,22 @@ class Tally:
             cast(self.tiles[tile][inner], states[outer], weights[outer])
 
 
-_COMPACT_AT = 50_000
-"""Points sorted together: so many take a few milliseconds, so that no scan waits longer."""
-REACH_M = 70.0
-"""New points are taken up to this range, farther than votes are cast: the map is at hand for a tile's width around the
-vehicle."""
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class NewPointsRule:
+    """Points of possible new objects."""
+
+    sorted_together: int = 50_000
+    """Points sorted together: so many take a few milliseconds, so that no scan waits longer."""
+    reach_m: float = 70.0
+    """Range up to which new points are taken, metres, farther than votes are cast: the map is at hand for a tile's
+    width around the vehicle."""
+
+
+NEW_POINTS_RULE = NewPointsRule()
+# Kernels take no records: they read these names.
+_COMPACT_AT = NEW_POINTS_RULE.sorted_together
+REACH_M = NEW_POINTS_RULE.reach_m
 
 
 def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:

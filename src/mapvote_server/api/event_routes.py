@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 from standardwebhooks import Webhook
 
+from mapvote.core.record import record
 from mapvote_server.api.connections import step_aside
 from mapvote_server.api.schemas import MOST_SEQ, problems
 from mapvote_server.api.services import Known, Parts, Services
@@ -23,8 +25,23 @@ from mapvote_server.errors import TooMany, Unauthorised, Unavailable
 from mapvote_server.questions.history import Event, newest_event, take, taken_up_to, without_names
 from mapvote_server.store.keys import Key, any_issued
 
-_EVERY_S = 1.0
-_STILL_THERE_S = 15.0
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ListenerTimes:
+    """Times of the listeners of events."""
+
+    poll_s: float = 1.0
+    """Time between two looks for events, seconds."""
+    still_there_s: float = 15.0
+    """Time without an event after which a comment keeps the connection, seconds."""
+    timeout_s: float = 10.0
+    """Time limit of one delivery to a webhook, seconds."""
+    longest_s: float = 60.0
+    """Longest pause between two attempts of a delivery, seconds."""
+
+
+LISTENER_TIMES = ListenerTimes()
 router = APIRouter()
 
 
@@ -91,9 +108,9 @@ async def _stream(request: Request, parts: Services, seq: int, key: Key | None, 
         if found:
             seq, silent = found[-1].seq, 0.0
             continue
-        await asyncio.sleep(_EVERY_S)
-        silent += _EVERY_S
-        if silent >= _STILL_THERE_S:
+        await asyncio.sleep(LISTENER_TIMES.poll_s)
+        silent += LISTENER_TIMES.poll_s
+        if silent >= LISTENER_TIMES.still_there_s:
             silent = 0.0
             yield b": still here\n\n"
 
@@ -116,10 +133,6 @@ def as_sse(event: Event) -> bytes:
     return b"id: %d\ndata: %b\n\n" % (event.seq, msgspec.json.encode(event))
 
 
-_TIMEOUT_S = 10.0
-_LONGEST_S = 60.0
-
-
 def signed(secret: str, events: Sequence[Event], at: datetime, body: bytes) -> dict[str, str]:
     """The headers of a post of some events (Standard Webhooks 1.0.0): the same events have the same id when they are
     sent again."""
@@ -140,8 +153,8 @@ async def deliver(parts: Services) -> None:
     """
     asked = parts.settings.server
     seq = noted = await parts.look_up(taken_up_to, parts.store, asked.webhook_url)
-    wait = _EVERY_S
-    async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
+    wait = LISTENER_TIMES.poll_s
+    async with httpx2.AsyncClient(timeout=LISTENER_TIMES.timeout_s, follow_redirects=False) as client:
         while True:
             try:
                 events = await parts.look_up(parts.feed.after, seq)
@@ -154,8 +167,8 @@ async def deliver(parts: Services) -> None:
                 if seq != noted:
                     await parts.look_up(take, parts.store, asked.webhook_url, seq)
                     noted = seq
-                wait = _EVERY_S
+                wait = LISTENER_TIMES.poll_s
             except (httpx2.HTTPError, Unavailable) as error:
                 structlog.get_logger("mapvote").warning("webhook", error=type(error).__name__, again_in_s=wait)
-                wait = min(2 * wait, _LONGEST_S)
+                wait = min(2 * wait, LISTENER_TIMES.longest_s)
             await asyncio.sleep(wait)

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import utc
 from mapvote_server.answers import answer
@@ -35,7 +36,21 @@ from mapvote_server.store.queries import (
 )
 from mapvote_server.store.store import Store
 
-_LOOKED_AT = 3
+
+@record()
+@dataclass(frozen=True, slots=True)
+class EventPolls:
+    """Numbers of the content and the log of a store."""
+
+    field_tiles: int = 3
+    """Tiles with fields that are read for their names."""
+    most: int = 500
+    """Events of one poll, at most."""
+    poll_s: float = 0.9
+    """Least time between two polls of the database, seconds."""
+
+
+EVENT_POLLS = EventPolls()
 
 
 @answer
@@ -147,7 +162,7 @@ def overview(store: Store) -> Info:
 def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
     """Names of the point fields, by the first readable tiles that have any."""
     names: dict[str, None] = {}
-    for digest in islice((hashes.fields for hashes in tiles if hashes.fields is not None), _LOOKED_AT):
+    for digest in islice((hashes.fields for hashes in tiles if hashes.fields is not None), EVENT_POLLS.field_tiles):
         try:
             names |= dict.fromkeys(names_in_plane(load_blob(connection, digest), digest))
         except Unavailable:
@@ -184,9 +199,6 @@ OF_THE_MAP = ("import", "publish", "rollback", "replay")
 """Kinds that concern the map alone: actor and reason are open to every reader."""
 OF_VEHICLES = ("ballot", "withdraw", "two places")
 """Kinds that reveal the minute of a drive."""
-_MOST = 500
-POLL_S = 0.9
-"""Least time between two polls of the database."""
 
 
 def newest_event(store: Store) -> int:
@@ -218,7 +230,7 @@ def events_after(store: Store, seq: int) -> list[Event]:
     e = schema.events
     query = sa.select(e.c.seq, e.c.at_ns, e.c.kind, e.c.actor, e.c.detail).where(e.c.seq > seq).order_by(e.c.seq)
     with store.database.reading() as connection:
-        rows = connection.execute(query.limit(_MOST)).all()
+        rows = connection.execute(query.limit(EVENT_POLLS.most)).all()
         version = current_number(connection) if rows else 0
     return [Event(*row, version) for row in rows]
 
@@ -237,10 +249,12 @@ class Feed:
     The first listener that calls :meth:`after` within ``poll_s`` seconds polls the database.
     """
 
-    def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, store: Store, poll_s: float = EVENT_POLLS.poll_s, seconds: Callable[[], float] = time.monotonic
+    ) -> None:
         self._store, self._poll_s, self._seconds = store, poll_s, seconds
         self._lock = Lock()
-        self._recent: deque[Event] = deque(maxlen=_MOST)
+        self._recent: deque[Event] = deque(maxlen=EVENT_POLLS.most)
         self._newest: int | None = None
         self._polled_s = -poll_s
 
