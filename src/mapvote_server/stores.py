@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 
 import structlog
 
@@ -20,7 +19,6 @@ from mapvote.cli.terminal import complain
 from mapvote.client.connection import Connection
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
-from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.doctor import Finding, in_order
 from mapvote.doctor.maps import check_cloud, check_map, classified_ground, tile_by_tile
@@ -32,22 +30,8 @@ from mapvote_server.store.keys import listed
 from mapvote_server.store.store import Store, url_of
 
 _MEND = "mapvote check STORE --mend --from BACKUP"
-
-
-@record()
-@dataclass(frozen=True, slots=True)
-class ListLengths:
-    """Lengths of lists on the terminal."""
-
-    damaged: int = 5
-    """Damaged records of one kind."""
-    changes: int = 40
-    """Changes."""
-    stretches: int = 20
-    """Stretches of road."""
-
-
-LIST_LENGTHS = ListLengths()
+_LISTED = 5
+"""Damaged records of one kind that are listed one by one."""
 _SIZES = "tiles", "ballots", "vehicles", "plane_bytes"
 
 
@@ -140,10 +124,10 @@ def check_store(store: Store) -> list[Finding]:
     damaged = check(store)
     found = []
     for kind, count in Counter(damage.kind for damage in damaged).items():
-        some = [damage for damage in damaged if damage.kind == kind][: LIST_LENGTHS.damaged]
+        some = [damage for damage in damaged if damage.kind == kind][:_LISTED]
         found += [Finding("error", f"damaged: {damage}", _MEND) for damage in some]
-        if count > LIST_LENGTHS.damaged:
-            found.append(Finding("error", f"damaged: {count - LIST_LENGTHS.damaged} more of the kind {kind}", _MEND))
+        if count > _LISTED:
+            found.append(Finding("error", f"damaged: {count - _LISTED} more of the kind {kind}", _MEND))
     glance = overview(store)
     sizes = ", ".join(f"{getattr(glance, key):,} {key.replace('_', ' ')}" for key in _SIZES)
     found.append(Finding("note", f"version {glance.version}: {sizes}"))

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, check_ending, is_url, sound_map, when
+from mapvote.cli.door import api_at, check_ending, is_url, sound_map
 from mapvote.cli.options import Config, KeyFile, Panel, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
+from mapvote.core.times import utc
 from mapvote.core.types import MapvoteError
-from mapvote_server.stores import LIST_LENGTHS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -182,9 +182,7 @@ def policy(
     ask = {"values": {key: value for key, _, value in pairs}, "reason": reason}
     with api_at(store, key_file) as server:
         answer = server.ask_json("PATCH", "/v1/policy", json=ask) if pairs else server.ask_json("GET", "/v1/policy")
-    print(
-        f"policy of {when(answer['at_ns'])} by {answer['by']}" + (f": {answer['reason']}" if answer["reason"] else "")
-    )
+    print(f"policy of {utc(answer['at_ns'])} by {answer['by']}" + (f": {answer['reason']}" if answer["reason"] else ""))
     for section, entries in answer["policy"].items():
         for key, value in entries.items():
             print(f"{section}.{key}={value}")
@@ -264,18 +262,21 @@ def _print_versions(answer: Mapping[str, Any]) -> None:
     rows = []
     for v in answer["versions"]:
         origin = v["target"] if v["target"] is not None else v["parent"]
-        made = v["kind"], str(origin or ""), when(v["created_ns"]), v["published_by"], v["reason"]
+        made = v["kind"], str(origin or ""), utc(v["created_ns"]), v["published_by"], v["reason"]
         rows.append((str(v["number"]), *made))
     print_table(("version", "kind", "from", "when", "by", "reason"), rows)
     for event in answer["events"]:
-        print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
+        print(f"{event['seq']} {utc(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
+
+
+_MOST_CHANGES = 40
 
 
 def _print_changes(found: Mapping[str, Any]) -> None:
     """The changes as a table, the largest first."""
     rows = []
     largest_first = sorted(found["features"], key=lambda feature: -feature["properties"]["area_m2"])
-    for feature in largest_first[: LIST_LENGTHS.changes]:
+    for feature in largest_first[:_MOST_CHANGES]:
         about = feature["properties"]
         (x0, y0), (x1, y1) = about["box"]
         votes = f"{about['votes_min']}" if about["versions"] else "none: taken back"
@@ -286,8 +287,8 @@ def _print_changes(found: Mapping[str, Any]) -> None:
         print(f"nothing changed {versions}")
         return
     print_table(("change", "x (m)", "y (m)", "m2", "m high", "points", "votes at least"), rows)
-    if len(found["features"]) > LIST_LENGTHS.changes:
-        print(f"and {len(found['features']) - LIST_LENGTHS.changes} smaller ones; --out FILE writes all of them")
+    if len(found["features"]) > _MOST_CHANGES:
+        print(f"and {len(found['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
     print(f"{len(found['features'])} changes {versions}")
     if not all(feature["properties"]["versions"] for feature in found["features"]):
         print("taken back: no vehicle voted for it, a rollback or a replay took an earlier decision back")
@@ -348,6 +349,9 @@ def explain(
         print(f"    {before}; {now}")
 
 
+_MOST_STRETCHES = 20
+
+
 def coverage(
     store: StoreOrUrl,
     out: Annotated[
@@ -369,7 +373,7 @@ def coverage(
     with api_at(store, key_file) as server:
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
-    for feature in found["features"][: LIST_LENGTHS.stretches]:
+    for feature in found["features"][:_MOST_STRETCHES]:
         about, line = feature["properties"], feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
         counts = (str(about[what]) for what in ("cells", "built", "gone"))
@@ -533,7 +537,7 @@ def keys(
     with api_at(store, key_file) as server:
         if action == "list":
             rows = [
-                (key["role"], key["name"], when(key["created_ns"]), _state(key))
+                (key["role"], key["name"], utc(key["created_ns"]), _state(key))
                 for key in server.ask_json("GET", "/v1/keys")["keys"]
             ]
             print_table(("role", "name", "issued", "state"), rows)
@@ -571,7 +575,7 @@ def _ask_to_keep(server: Connection, name: str | None) -> bool:
 
 def _state(key: Mapping[str, Any]) -> str:
     if key["revoked_ns"] is not None:
-        return f"revoked {when(key['revoked_ns'])}"
+        return f"revoked {utc(key['revoked_ns'])}"
     if key["expires_ns"] is None:
         return "valid"
-    return f"{'valid until' if key['valid'] else 'ended'} {when(key['expires_ns'])}"
+    return f"{'valid until' if key['valid'] else 'ended'} {utc(key['expires_ns'])}"

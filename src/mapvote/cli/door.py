@@ -192,13 +192,6 @@ def region_in(text: str) -> Region:
     return x0, y0, x1, y1
 
 
-def when(stamp_ns: int) -> str:
-    """A time stamp as text, UTC."""
-    from datetime import UTC, datetime
-
-    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
-
-
 @contextmanager
 def usable_drives(drives: Sequence[Drive], *, unchecked: bool = False) -> Iterator[list[Drive]]:
     """The drives, checked while they are read; nothing may be written before this ends.

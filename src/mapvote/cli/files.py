@@ -21,10 +21,10 @@ from mapvote.cli.door import (
     numbers_in,
     sound_map,
     stores,
-    when,
 )
 from mapvote.cli.options import Config, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
+from mapvote.core.times import utc
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def info(
         if vehicles:
             _print_standings(found["vehicles"])
             return
-        found["published"] = when(found.pop("published_ns"))
+        found["published"] = utc(found.pop("published_ns"))
         shown = [(key, f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
         title, rows = "store", [(key.replace("_", " "), value) for key, value in shown]
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import SOURCES, PointMap
 from mapvote.core.sensor_height import check_heights
+from mapvote.core.times import utc
 from mapvote.core.types import CellState, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import Cloud
@@ -95,7 +95,7 @@ def _sources(point_map: PointMap) -> Rows:
 
 def _drive(drive: Drive) -> Rows:
     seconds = (drive.stamps_ns[-1] - drive.stamps_ns[0]) * 1e-9
-    start = datetime.fromtimestamp(int(drive.stamps_ns[0]) // 10**9, UTC)
+    start = utc(int(drive.stamps_ns[0]))
     first = drive.read_scan(0)
     T = drive.T_map_lidar_prior
     rows = [
@@ -104,7 +104,7 @@ def _drive(drive: Drive) -> Rows:
         ("sensor", f"{drive.sensor.name}, {drive.sensor.beams} beams, {drive.sensor.rate_hz:g} Hz"),
         ("sensor is", drive.sensor_told),
         ("scans", f"{len(drive)} in {seconds:.1f} s, the first with {len(first.points):,} points"),
-        ("starts", f"{start:%Y-%m-%d %H:%M:%S} UTC" if start.year > 1990 else "time of day unknown"),
+        ("starts", start if start >= "1991" else "time of day unknown"),
         ("point times", _times(first)),
         ("mounted at", ", ".join(f"{v:.2f}" for v in drive.T_base_lidar[:3, 3]) + " m (T_base_lidar)"),
     ]

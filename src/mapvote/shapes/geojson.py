@@ -6,7 +6,6 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import shapely
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.record import record
+from mapvote.core.times import utc
 from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.shapes.change_objects import ChangeObject
@@ -133,16 +133,6 @@ def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
     metres = np.round(ring * CELL_SIZE + np.array([lattice.x0, lattice.y0]), 3) + 0.0  # + 0.0: no "-0.0" in the file
     corners: list[list[float]] = metres.tolist()
     return corners
-
-
-def utc(stamp_ns: int | None) -> str | None:
-    """ISO 8601 in UTC, whole seconds, the year 9999 at most; ``None`` where unknown."""
-    if stamp_ns is None:
-        return None
-    return datetime.fromtimestamp(min(stamp_ns // 10**9, _LAST_S), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-_LAST_S = 253_402_300_799
 
 
 @record()

@@ -18,6 +18,7 @@ from mapvote.codec.ballot import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
+from mapvote.core.times import utc
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
@@ -27,7 +28,6 @@ from mapvote.fusion.fuse import Decision, decide_tile, deletions
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
 from mapvote.fusion.next_pass import Waiting, lacks_quorum_only
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
-from mapvote.shapes.geojson import utc
 from mapvote_server.questions.falls import fell_with
 from mapvote_server.store import schema
 from mapvote_server.store.fusion_jobs import standings_of

@@ -17,8 +17,8 @@ from pydantic import Field
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
 from mapvote.core.record import record
+from mapvote.core.times import utc
 from mapvote.core.types import MapvoteError
-from mapvote.shapes.geojson import utc
 from mapvote_server.answers import answer
 from mapvote_server.errors import Unavailable
 from mapvote_server.store import schema
@@ -182,7 +182,7 @@ def dated_versions(store: Store, known: bool) -> list[DatedVersion]:
     return [
         DatedVersion(
             **_origin_of(version),
-            created=str(utc(version.created_ns)),
+            created=utc(version.created_ns),
             policy=dict(version.policy if known else without_drive(version.policy)),
         )
         for version in store.versions()

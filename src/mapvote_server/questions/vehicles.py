@@ -23,8 +23,9 @@ import sqlalchemy as sa
 from mapvote.codec.ballot import unpack_path
 from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.times import utc
 from mapvote.core.types import F32, I64
-from mapvote.shapes.geojson import collection, utc
+from mapvote.shapes.geojson import collection
 from mapvote_server.answers import answer
 from mapvote_server.questions.contradictions import CONTRADICTIONS, Compared, Objects, compare, over_borders
 from mapvote_server.questions.explain import seen, votes_on
