@@ -13,6 +13,10 @@ class Forbidden(MapvoteError):
     """A good key, but not for this."""
 
 
+class BadRequest(MapvoteError):
+    """A parameter that a standard answers by 400."""
+
+
 class NotFound(MapvoteError):
     """There is no such version, tile, ballot or key."""
 

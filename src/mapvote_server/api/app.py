@@ -15,7 +15,15 @@ from fastapi.exceptions import RequestValidationError
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote_server.api import change_routes, desk_routes, event_routes, operator_routes, page_routes, vehicle_routes
+from mapvote_server.api import (
+    change_routes,
+    desk_routes,
+    event_routes,
+    ogc_routes,
+    operator_routes,
+    page_routes,
+    vehicle_routes,
+)
 from mapvote_server.api.event_routes import deliver
 from mapvote_server.api.openapi import describe_keys, not_allowed
 from mapvote_server.api.proxies import Proxies
@@ -27,7 +35,7 @@ from mapvote_server.store.publish import Gate
 from mapvote_server.store.store import Store
 
 _EVERY_S = 2.0
-ROUTES = vehicle_routes, operator_routes, change_routes, desk_routes, event_routes, page_routes
+ROUTES = vehicle_routes, operator_routes, change_routes, desk_routes, event_routes, page_routes, ogc_routes
 
 
 def create_app(

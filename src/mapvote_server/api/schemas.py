@@ -23,6 +23,7 @@ from mapvote.shapes.change_objects import Kind, Size
 from mapvote.shapes.geojson import as_csv
 from mapvote_server.api.services import Progress
 from mapvote_server.errors import (
+    BadRequest,
     Conflict,
     Forbidden,
     Held,
@@ -42,6 +43,7 @@ from mapvote_server.store.policy import Policy, names_in
 from mapvote_server.work import count_rows
 
 STATUS: Mapping[type[MapvoteError], int] = {
+    BadRequest: 400,
     Unauthorised: 401,
     Forbidden: 403,
     NotFound: 404,
