@@ -147,7 +147,8 @@ class BallotRoute(APIRoute):
 
 
 _SLICE_S = 0.01
-"""A ballot is unpacked for this long, then other vehicles have their turn."""
+"""A ballot is unpacked for so much CPU time, then other vehicles have their turn. By the clock on the wall, a small
+ballot beside large ones would need several turns."""
 
 
 def _open(

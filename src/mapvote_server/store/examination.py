@@ -110,13 +110,13 @@ class Examination:
         return [tile.tile for tile in self.ballot.tiles]
 
     def go_on(self, for_s: float = math.inf) -> Incoming | None:
-        """Unpack tiles until all are done or ``for_s`` seconds have passed; the ballot once all are done, else None.
+        """Unpack tiles until all are done or ``for_s`` seconds of CPU are used; the ballot, or None if tiles remain.
 
         MapvoteError on the first defect.
         """
         if not self._votes and self.ballot.path is not None:
             check_path(self.ballot.path, self.tiles)
-        ends_s = time.monotonic() + for_s
+        ends_s = time.thread_time() + for_s
         for tile in self.ballot.tiles[len(self._votes) :]:
             planes = unpack_planes(tile)
             self._unpacked_bytes += planes.nbytes
@@ -124,7 +124,7 @@ class Examination:
                 most = f"ballot: larger than {EXAMINATION_RULE.unpacked_bytes} bytes when decompressed"
                 raise MapvoteError(f"{most}; send a shorter drive")
             self._votes.append(_votes_of(tile, self.ballot.base[tile_key(tile.tile)], planes))
-            if time.monotonic() > ends_s:
+            if time.thread_time() > ends_s:
                 break
         if len(self._votes) < len(self.ballot.tiles):
             return None
