@@ -147,8 +147,9 @@ def standings_of(
     Under the hypothesis that a vehicle contradicts at ``tolerated`` times the others' rate per compared cell, its share
     of all objects is binomial (the exact comparison of two Poisson rates, Przyborowski and Wilenski 1940). It
     "contradicts" if the chance of what was seen is below ``significance`` shared out among the vehicles tested;
-    it is "undecidable" if nothing could be compared, or if its rate is above the tolerated one but the data are too
-    few for significance. Objects of fewer than ``Contradictions.least_cells`` cells are noise and not counted.
+    it is "undecidable" if nothing could be compared, if it contradicts where no other vehicle could be compared, or if
+    its rate is above the tolerated one but the data are too few for significance. Objects of fewer than
+    ``Contradictions.least_cells`` cells are noise and not counted.
     """
     by_vehicle: dict[str, list[Compared]] = {}
     for entry in compared:
@@ -167,7 +168,7 @@ def standings_of(
         verdict: Stance = "undecidable"
         if mine and p_value < threshold:
             verdict = "contradicts"
-        elif mine and found * others <= tolerated * mine * others_found:
+        elif mine and (others or not found) and found * others <= tolerated * mine * others_found:
             verdict = "consistent"
         evidence = _evidence([spread[name], *(entry.largest for entry in by_vehicle[name])], lattice)
         out.append(VehicleStanding(name, verdict, mine, found, others, others_found, p_value, threshold, evidence))

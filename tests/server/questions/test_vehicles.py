@@ -68,6 +68,13 @@ def test_first_and_last_cannot_be_judged() -> None:
     assert [found[name].verdict for name in "abcd"] == ["undecidable", "consistent", "consistent", "undecidable"]
 
 
+def test_ghosts_are_not_consistent_where_no_other_vehicle_can_be_judged() -> None:
+    found = standings(("a", 0, plane()), ("x", 1, ghosts(40)), ("b", 2, plane()))
+    assert (found["x"].objects, found["x"].others_cells) == (40, 0)
+    assert [found[name].verdict for name in "axb"] == ["undecidable"] * 3
+    assert standings(("a", 0, plane()), ("x", 1, plane()), ("b", 2, plane()))["x"].verdict == "consistent"
+
+
 def test_one_ghost_proves_nothing() -> None:
     found = standings(*[(f"v{i}", i, plane()) for i in range(4)], ("x", 2, ghosts(1)))
     assert found["x"].objects == 1
