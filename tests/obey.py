@@ -58,8 +58,8 @@ ADVICE: list[tuple[str, str, Callable[[re.Match[str], re.Match[str]], Mend]]] = 
     (r"axis (..) points up", r"turn the points to x forward", lambda w, m: points(lambda p: p @ UPRIGHT[w[1]].T)),
     (rf"scans [^;]*turned by {NUMBER} deg", r"turn the points, or T_base_lidar, so that x is forward",
      lambda w, m: points(turned(yaw=-float(w[1])))),
-    (rf"in the scans: pitch {NUMBER}, roll {NUMBER}", r"level the points by that",
-     lambda w, m: points(turned(roll=float(w[2]), pitch=-float(w[1])))),
+    (r"", rf"turn the points by {NUMBER} deg about x and {NUMBER} deg about y",
+     lambda w, m: points(turned(roll=float(m[1]), pitch=float(m[2])))),
     (rf"scans are pitched by {NUMBER} deg", r"level the points, or put",
      lambda w, m: points(turned(pitch=float(w[1])))),
     (r"", r"turn the points back by the prior's rotation", lambda w, m: lambda r: replace(

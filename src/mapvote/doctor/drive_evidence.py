@@ -466,9 +466,10 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
     if tilt_deg > 4.0:
         pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
-        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg (in the scans: pitch {pitch:.1f}, "
-        mend = "level the points by that, or put the sensor's tilt into the prior's rotations; on a hill all is well"
-        yield Finding("error" if tilt_deg > 8.0 else "warning", f"{what}roll {roll:.1f})", mend)
+        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg"
+        mend = f"turn the points by {roll:.1f} deg about x and {pitch:.1f} deg about y, which levels the road in them, "
+        mend += "or put the sensor's tilt into the prior's rotations; on a hill all is well"
+        yield Finding("error" if tilt_deg > 8.0 else "warning", what, mend)
 
 
 def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:

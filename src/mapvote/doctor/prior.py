@@ -233,7 +233,7 @@ class Number:
                 "shift its times against the scans",
             ),
             "pitch": (
-                f"the scans are pitched {by} against the prior's motion",
+                f"the scans are pitched {by}, nose up, against the prior's motion",
                 "level the points, or put the sensor's pitch into T_base_lidar and the prior's rotations",
             ),
             "turn": (
