@@ -99,6 +99,9 @@ def test_a_verb_works_without_any_extra(plain: Path, line: str) -> None:
     """The lines follow each other: later ones read what earlier ones wrote."""
     done = run(plain, *line.split())
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    if line == "config --all":
+        assert "KeyGuess" not in done.stdout
+        assert "modules are not listed: this needs the package" in " ".join(done.stdout.split())
 
 
 @pytest.mark.parametrize(

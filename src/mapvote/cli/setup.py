@@ -61,8 +61,13 @@ def config(
         rows.append(None)
     print_table(("setting", "value", "source", "meaning"), rows, "Settings")
     if all_:
+        from mapvote.core.extras import missing_extra
         from mapvote.core.record import numbers
 
-        listed = [(number.name, str(number.value), number.meaning) for number in numbers()]
+        missing: dict[str, ModuleNotFoundError] = {}
+        listed = [(number.name, str(number.value), number.meaning) for number in numbers(missing=missing)]
         print_table(("number", "value", "meaning"), listed, "Numbers of the algorithms")
+        if missing:
+            hints = sorted({missing_extra(error) or str(error) for error in missing.values()})
+            print(f"The numbers of {len(missing)} modules are not listed: {'; '.join(hints)}.")
     print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.")

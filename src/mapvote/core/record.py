@@ -53,11 +53,24 @@ def record(*, votes: bool = False) -> Callable[[Record], Record]:
     return declare
 
 
-def numbers(*, votes: bool = False, packages: tuple[str, ...] = ("mapvote", "mapvote_server")) -> list[RecordField]:
-    """Every field of every record of ``packages`` ("mapvote_lab" is the laboratory's, which needs its extra);
-    ``votes``: only of those that vehicles vote by."""
+def numbers(
+    *,
+    votes: bool = False,
+    packages: tuple[str, ...] = ("mapvote", "mapvote_server"),
+    missing: dict[str, ModuleNotFoundError] | None = None,
+) -> list[RecordField]:
+    """Every field of every record of ``packages`` ("mapvote_lab" is the laboratory's, which needs its extra).
+
+    ``votes``: only of those that vehicles vote by. ``missing`` gets the modules that need a package which is not
+    installed; without it such a module is an error.
+    """
     for module in modules_with_records(packages, votes=votes):
-        import_module(module)
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if missing is None:
+                raise
+            missing[module] = error
     chosen = [
         cls
         for name, (cls, of_votes) in sorted(_declared.items())
