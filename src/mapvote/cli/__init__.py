@@ -34,7 +34,7 @@ app = typer.Typer(
 )
 VERBS = {
     Panel.DRIVE: (
-        drives.build, drives.vote, live.send, live.topics, live.play, live.drive, live.autoware, drives.diff,
+        drives.build, drives.vote, live.send, live.show, live.topics, live.play, live.drive, live.autoware, drives.diff,
         drives.merge, lanelets.affected, files.doctor,
     ),
     Panel.MAP: (files.import_map, files.export, files.info, files.update),

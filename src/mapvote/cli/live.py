@@ -46,6 +46,33 @@ def topics(
         print(f"missing: {sentence}")
 
 
+def show(
+    ballot: Annotated[Path, typer.Argument(metavar="BALLOT", help="a ballot")],
+    where: Annotated[str, typer.Option("--map", metavar="MAP|STORE|URL", help="the map that it was voted on")],
+    mcap: Annotated[Path, typer.Option("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove or RViz")],
+    key_file: KeyFile = None,
+) -> None:
+    """Show a ballot on its map in Foxglove or RViz: points that come and go, states of cells, the road driven.
+
+    mapvote show car_1.ballot --map my_map --mcap car_1.mcap
+    """
+    from mapvote.codec.ballot import decode
+    from mapvote.core.types import MapvoteError
+    from mapvote.formats.reading import read_whole, reading
+    from mapvote.live.ballot_messages import map_cloud, messages_of_ballot, write_mcap
+
+    with reading(ballot, "ballot"):
+        shown = decode(read_whole(ballot))
+    with map_at(where, key_file) as point_map:
+        if shown.map_id != point_map.map_id:
+            raise MapvoteError(
+                f"{ballot}: voted on map {shown.map_id}, not on {point_map.map_id} of {where}; name its map"
+            )
+        messages = [map_cloud(shown, point_map), *messages_of_ballot(shown, point_map)]
+    write_mcap(mcap, messages)
+    print(f"{mcap}: {', '.join('/' + message.topic for message in messages)}")
+
+
 def play(
     path: Annotated[Path, typer.Argument(metavar="DRIVE|BAG", help="a ROS 2 bag, or a drive in any format")],
     rate: Annotated[float, typer.Option(min=0.01, metavar="N", help="speed, in multiples of the recorded one")] = 1.0,
@@ -153,6 +180,7 @@ def drive(
     from mapvote.formats.drives.options import read_mount, read_sensor
     from mapvote.formats.drives.point_times import TimeRules
     from mapvote.formats.geo.frame import frame_of
+    from mapvote.live.changes_topics import ChangesTopics
     from mapvote.live.choice import Voice, Wish, choose_topics
     from mapvote.live.dds import Network
     from mapvote.live.messages import POSE_TOPIC
@@ -216,7 +244,7 @@ def drive(
         with _view(board, vehicle) if watch else nullcontext():
             if not watch:
                 board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
-            live = run(plan, topics, maps, outbox, ended, [board, ros.poses], voice)
+            live = run(plan, topics, maps, outbox, ended, [board, ros.poses, ChangesTopics(network, names)], voice)
         heartbeat.stopping()
     print(f"{vehicle}: {_result(live)}")
 

@@ -42,6 +42,8 @@ class LiveRule:
 
     fixes: int = 400
     """Poses of scans that voted that are kept at most."""
+    shown: int = 64
+    """Votes on single tiles that wait to be shown at most."""
     patience_ns: int = 300_000_000
     """Time that a scan waits for a pose later than its own stamp, nanoseconds; then the newest ones are extrapolated,
     or it has none."""
@@ -217,6 +219,8 @@ class LiveDrive:
         """Stamp and time of sending of the scans that are observed but not done."""
         self.fixes: deque[Fixed] = deque(maxlen=LIVE_RULE.fixes)
         """Fixes of the scans that voted last. The publisher of a fix removes it."""
+        self.kept: deque[Ballot] = deque(maxlen=LIVE_RULE.shown)
+        """The last votes on single tiles that went to the journal. Whoever shows them removes them."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
@@ -234,6 +238,11 @@ class LiveDrive:
     def drive_id(self) -> str:
         """Identifier of the open ballot."""
         return stretch_name(self.name, self.number)
+
+    @property
+    def place(self) -> F64 | None:
+        """(3,) where the last scan was that has a place, map metres."""
+        return self._place
 
     @property
     def waiting(self) -> int:
@@ -298,7 +307,9 @@ class LiveDrive:
         if self.vehicle is not None and overdue_s > (2.0 if ready else 0.0):
             tile = min(self._touched, key=lambda index: self._touched[index])
             del self._touched[tile]
-            self._outbox.keep(self.drive_id, self.vehicle.ballot([tile]))
+            kept = self.vehicle.ballot([tile])
+            self._outbox.keep(self.drive_id, kept)
+            self.kept.append(kept)
         if not ready:
             return False
         waiting = self._waiting.popleft()
