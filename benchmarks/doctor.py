@@ -1,4 +1,5 @@
-"""What the doctor says of drives and maps broken on purpose, kind by kind: rightly named, vaguely, wrongly, or sound.
+"""Findings of the doctor on drives and maps that were broken on purpose, kind by kind: rightly named, vaguely, wrongly,
+or sound.
 
     python benchmarks/doctor.py drives --source NAME=DRIVE ... --out results/doctor_drives.csv
     python benchmarks/doctor.py maps --source NAME=DRIVE+MAP ... --out results/doctor_maps.csv
@@ -135,7 +136,7 @@ def counted(r: Recording, point_map: Path) -> str:
 
 
 def obey(where: str, kinds: str) -> Iterator[dict[str, object]]:
-    """Of each kind: is it named, what remains once the doctor's advice is followed, and how the drive then votes."""
+    """By kind: is it named, what remains once the doctor's advice is followed, and how the drive then votes."""
     at, folder = where.split("+")
     sound, point_map = recorded(opened(at)), read_map(folder)
     yield {"kind": "as it is", "verdict": "sound", "mends": 0, "left": "", "votes": counted(sound, Path(folder))}
@@ -156,7 +157,7 @@ def obey(where: str, kinds: str) -> Iterator[dict[str, object]]:
 
 
 def mounts(where: str, kinds: str) -> Iterator[dict[str, object]]:
-    """Of each mount in steps of 45 deg: what is wrongly found, without a map and with it, and how the drive votes."""
+    """By mount in steps of 45 deg: what is wrongly found, without a map and with it, and how the drive votes."""
     at, folder = where.split("+")
     sound, point_map = with_times(opened(at)), read_map(folder)
     done: list[np.ndarray] = []

@@ -67,7 +67,7 @@ def street(tiles: Sequence[TileIndex]) -> PointMap:
 
 
 def said(rng: np.random.Generator) -> Say:
-    """What one vehicle says about a tile after driving along it."""
+    """One vehicle's statement on a tile after driving along it."""
     states = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
     reach = rng.integers(-6, 7, (2, 256)).cumsum(axis=1).clip(-12, 12)
     rows = np.arange(256)[:, None]
@@ -198,7 +198,7 @@ def noisy_street(tiles: Sequence[TileIndex]) -> PointMap:
 
 
 def kiosk_gone(say: Say) -> Say:
-    """What a vehicle says that passes when the house is history and the kiosk has left again."""
+    """Statement of a vehicle that passes when the house is history and the kiosk has left again."""
     assert say.states is not None
     say.states[tuple(np.transpose(HOUSE))] = CellState.UNCHANGED_EMPTY
     say.states[tuple(np.transpose(KIOSK))] = CellState.CHANGED_EMPTY

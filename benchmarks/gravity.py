@@ -1,4 +1,4 @@
-"""What falls with a demolished object (fusion/gravity.py): simulated streets decided with gravity and without.
+"""Voxels that fall with a demolished object (fusion/gravity.py): simulated streets decided with gravity and without.
 
     python benchmarks/gravity.py --seeds 301 302 303 304 305            # street570: some ten minutes a seed
     python benchmarks/gravity.py --scenario overhead --seeds 311 312    # wires, signs, bridges and crowns

@@ -50,7 +50,7 @@ HERE: set[int] = set()
 
 @dataclass
 class Target:
-    """What attackers know: the address, a key for each name, and bodies that were made before."""
+    """Knowledge of the attackers: the address, a key for each name, and bodies that were made before."""
 
     address: Address
     keys: dict[str, str]
@@ -284,7 +284,7 @@ def measured(at: Site, ballot: Ballot, seconds: float, prefix: str) -> tuple[Row
 
 
 def under_attack(at: Site, target: Target, ballot: Ballot, kinds: set[str], seconds: float) -> tuple[Row, list[str]]:
-    """As :func:`measured`, after an attack has unfolded and while it goes on."""
+    """The result of :func:`measured`, after an attack has unfolded and while it goes on."""
     process = multiprocessing.get_context("spawn").Process(target=attack, args=(target, kinds))
     process.start()
     try:

@@ -1,4 +1,4 @@
-"""What every compiled kernel costs, and what plain numpy costs in its place.
+"""Cost of every compiled kernel, and of plain numpy in its place.
 
     python benchmarks/kernels.py [ROOM.FILE ...]
 
@@ -231,7 +231,7 @@ NUMPY: dict[str, Callable[..., object]] = {
 
 
 def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
-    """What calls every kernel; of the ``laboratory`` too, which takes a minute more."""
+    """Calls of every kernel; of the ``laboratory`` too, which takes a minute more."""
     from mapvote import warmup
     from mapvote.__main__ import main
     from mapvote.config import Settings

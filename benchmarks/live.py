@@ -1,4 +1,4 @@
-"""What a live vehicle keeps. Real DDS between processes, on loopback.
+"""Resources of a live vehicle. Real DDS between processes, on loopback.
 
     python benchmarks/live.py drive DRIVE MAP --rate 1   # share of scans that voted, latency from sending to vote
     python benchmarks/live.py kills DRIVE MAP --kills 50 # kill -9 at random moments, in half of them without a server

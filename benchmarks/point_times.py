@@ -144,7 +144,7 @@ def voted(path: Path, point_map: PointMap) -> Ballot:
 
 
 def told(paths: list[Path], point_map: PointMap) -> str:
-    """What an update with the ballots of these drives does, or why there is none."""
+    """Effect of an update with the ballots of these drives, or why there is none."""
     try:
         ballots = [voted(path, point_map) for path in paths]
     except MapvoteError as error:

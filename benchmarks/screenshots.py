@@ -42,7 +42,8 @@ SLOW = {"offline": False, "latency": 400, "downloadThroughput": 120_000, "upload
 
 @dataclass(frozen=True)
 class Picture:
-    """What is opened, waited for and clicked; without ``still_s`` until all that is in view has come."""
+    """Pages that are opened, elements that are waited for and clicked; without ``still_s`` until all that is in view
+    has come."""
 
     at: str = ""
     until: str = LISTED

@@ -3,7 +3,8 @@
     python benchmarks/two_maps.py FOLDER --scenario street --seeds 401 402 --merge
 
 Each seed: three surveys, then three vehicles after the street changed; no parked car comes or goes. Maps are built of
-all surveys (before), of all vehicles (after) and of each survey alone. What is in FOLDER already is taken from there.
+all surveys (before), of all vehicles (after) and of each survey alone. Files that FOLDER holds already are taken from
+there.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ class Chromium:
         return value
 
     def text(self, selector: str) -> str:
-        """What the first element of a selector shows."""
+        """Text of the first element of a selector."""
         found: str = self.run(f"document.querySelector({selector!r}).innerText")
         return found
 
@@ -145,7 +145,7 @@ class Chromium:
         self.call("Input.insertText", text=text)
 
     def screenshot(self, file: Path) -> None:
-        """What the window shows now, as a PNG."""
+        """A PNG of the window."""
         time.sleep(0.3)
         file.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 

@@ -17,7 +17,7 @@ def typed(*words: object, code: int = 0, **environment: str) -> str:
 
 
 def type_in(line: str) -> str:
-    """What the program says on stdout to a command line, typed in the current folder; ``>`` works as in a shell."""
+    """The program's stdout for a command line, typed in the current folder; ``>`` works as in a shell."""
     words = shlex.split(line, comments=True)
     assert words[0] == "mapvote", line
     end = words.index(">") if ">" in words else len(words)

@@ -15,7 +15,7 @@ from mapvote.core.types import F64, I64, Scan
 from mapvote.formats.drives.scan_folder import write_poses
 
 Tables = list[NDArray[np.void]]
-"""Of each scan the points (n,) with x, y, z and other fields."""
+"""Points (n,) of each scan with x, y, z and other fields."""
 LIVOX = "livox_ros_driver2/msg/CustomMsg"
 
 

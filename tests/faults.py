@@ -49,7 +49,7 @@ class Recording:
 
 
 Change = Callable[..., Any]
-"""Of one array, float64."""
+"""Change of one array, float64."""
 
 
 Span = tuple[float, float]
@@ -84,17 +84,17 @@ Break = Callable[[Recording], Recording]
 
 
 def points(change: Change) -> Break:
-    """Of a scan's x, y, z (n, 3)."""
+    """Change of a scan's x, y, z (n, 3)."""
     return rows(lambda s: np.column_stack([change(s[:, :3].astype(np.float64)), s[:, 3:]]))
 
 
 def rows(change: Change) -> Break:
-    """Of a scan's rows (n, 4)."""
+    """Change of a scan's rows (n, 4)."""
     return lambda r: replace(r, scans=[change(s) for s in r.scans])
 
 
 def one_scan(change: Change) -> Break:
-    """Of one scan's rows, in the middle."""
+    """Change of one scan's rows, in the middle."""
     return lambda r: replace(r, scans=[change(s) if i == len(r.scans) // 2 + 1 else s for i, s in enumerate(r.scans)])
 
 
@@ -133,7 +133,7 @@ def order(of: Callable[[int], I64]) -> Break:
 
 @dataclass(frozen=True)
 class Files:
-    """What is done to the folder of a drive once it is written."""
+    """Change of the folder of a drive once it is written."""
 
     edit: Callable[[Path], None]
 
@@ -281,7 +281,7 @@ def as_floats(s: F64, kind: str) -> F64:
 
 
 def five_columns(s: F64) -> F64:
-    """What four columns make of a file of five, the fifth a ring."""
+    """A file of five columns, the fifth a ring, read as four."""
     five = np.column_stack([s, np.arange(len(s)) % 64])
     return five.ravel()[: five.size // 4 * 4].reshape(-1, 4)
 
@@ -455,7 +455,7 @@ TIME_MENDS: dict[str, dict[str, Any]] = {
     "a tenth of the times of points wrong": {"time_field": "none"},
     "scans that are not those of their stamps": {"time_field": "none"},
 }
-"""What the doctor says to write into drive.toml, by fault: after it the drive is sound."""
+"""Lines that the doctor advises for drive.toml, by fault: after it the drive is sound."""
 
 
 def moved(scale: float = 1.0, **pose: float) -> Change:
@@ -477,7 +477,7 @@ def twice(*shift_m: float) -> Change:
 
 
 def bent(p: F64) -> F64:
-    """As a survey without loops drifts: turned the more, the farther along."""
+    """Drift of a survey without loops: turned the more, the farther along."""
     c, s = np.cos(np.radians(0.15) * p[:, 0]), np.sin(np.radians(0.15) * p[:, 0])
     return np.column_stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]])
 
@@ -604,9 +604,9 @@ def broken(sound: Recording, change: Break | Files, folder: Path) -> Path:
 
 
 def verdict(rights: list[str], found: Iterable[Finding]) -> str:
-    """Of faults that the patterns ``rights`` name. "right": an error or a warning names each; "open": a note says that
-    it cannot be decided; "part": one of two is named; "vague": something is wrong but not what; "wrong": an error names
-    something else; "sound"."""
+    """Verdict on faults that the patterns ``rights`` name. "right": an error or a warning names each; "open": a note
+    says that it cannot be decided; "part": one of two is named; "vague": something is wrong but not what; "wrong": an
+    error names something else; "sound"."""
     found = list(found)
     named = [any(re.search(right, what) for what in serious(found)) for right in rights]
     if named and all(named):

@@ -84,7 +84,7 @@ def words_plane(cells: Mapping[Cell, int]) -> U64:
 
 @dataclass
 class Say:
-    """What a ballot says about one tile."""
+    """A ballot's statement on one tile."""
 
     states: U8 | None = None
     tally: U16 | None = None

@@ -296,7 +296,7 @@ def say(rng: random.Random, there: bool, mapped: CellMap, masks: bool, has_free:
 
 
 def held_by(tile: Tile, cell: Cell) -> CellMap:
-    """What a tile holds and remembers of a cell."""
+    """Content and memory of a tile in one cell."""
     heights = tile.points[tile.cells == cell[0] * 256 + cell[1], 2]
     remembered = (int(n) for n in (tile.memory or Memory.none()).planes[:, cell[0], cell[1]])
     free = 0 if tile.free is None else int(tile.free[cell])
@@ -305,7 +305,7 @@ def held_by(tile: Tile, cell: Cell) -> CellMap:
 
 @cache
 def _mask(way: str) -> Bool:
-    """What is seen from a way, but for the wall and the lawn: its border wanders, in parts of the tile of its own."""
+    """View from a path, without the wall and the lawn: its border wanders, in parts of the tile of its own."""
     if not way:
         return np.zeros((256, 256), dtype=np.bool_)
     borders = np.random.default_rng(WAYS.index(way)).integers(-5, 6, (2, 256)).cumsum(axis=1).clip(-20, 20)

@@ -34,7 +34,7 @@ ABSURD: tuple[Any, ...] = (
     [[[[[]]]]],
     {"a": {"b": {"c": 1}}},
 )
-"""What any field may be replaced by."""
+"""Values that replace any field."""
 
 
 def bomb(size: int = 1 << 30) -> bytes:

@@ -104,7 +104,7 @@ def copies(r: Recording) -> list[int]:
 
 
 def mends(finding: Finding) -> Iterator[Mend]:
-    """What a user may do on one finding, in the order of its words; nothing if it names no change that can be made."""
+    """Actions of a user on one finding, in the order of its words; nothing if it names no change that can be made."""
     found = []
     for what, mend, of in ADVICE:
         in_what, in_mend = re.search(what, finding.what), re.search(mend, finding.mend)

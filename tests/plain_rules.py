@@ -24,7 +24,7 @@ EVERY = (1 << 64) - 1
 
 @dataclass(frozen=True)
 class CellMap:
-    """What a version holds of one cell, and what is remembered of it."""
+    """Content of one cell in a version, and its memory."""
 
     heights: tuple[float, ...] = ()
     free: int = 0
@@ -42,7 +42,7 @@ class CellMap:
 
 @dataclass(frozen=True)
 class Spoken:
-    """What one drive says of one cell."""
+    """One drive's statement on one cell."""
 
     state: int
     gone: int | None = None
@@ -64,7 +64,7 @@ class Cast:
     seq: int
     gone_at: int | None = None
     way: str = ""
-    """Of a drive that determined much besides: where. Whoever says the same of one way sent one drive twice."""
+    """A drive that determined much besides: where. Whoever says the same of one way sent one drive twice."""
     plane: bytes = b""
     """All that it says, 256 x 256 states."""
 
@@ -252,7 +252,7 @@ def agreement(cast: Cast, others: list[Cast]) -> int:
 
 
 def liars(everyone: list[Cast], heard: list[Cast]) -> int:
-    """Of the vehicles that say one way and are not heard anywhere, one a way may be honest."""
+    """One vehicle of those that vote one way and are ignored everywhere may be honest, for each way."""
     left = {c.vehicle for c in heard}
     silent = [{c.vehicle for c in alike} - left for alike in alike_among(everyone)]
     return max(0, len(set().union(*silent)) - sum(1 for vehicles in silent if vehicles))
@@ -336,7 +336,7 @@ def state_of(
     settings: FuseSettings,
     quorum: int,
 ) -> int:
-    """What is decided of one cell: one vote a vehicle, its latest drive that says anything."""
+    """The decision on one cell: one vote a vehicle, its latest drive that says anything."""
     state = decide([s.state for s in says.values()], quorum)
     said = [(drives[-1].end_s, drives[-1].says[cell].state) for drives in heard.values()]
     state = state if state in (CO, CE) else turn(said, quorum) or state
@@ -406,7 +406,7 @@ def turn(said: list[tuple[int, int]], min_votes: int) -> int | None:
 
 
 def last_word(heard: dict[str, list[Cast]], cell: Cell) -> int:
-    """What the last drive says that determined the cell."""
+    """The statement of the last drive that determined the cell."""
     determined = [
         (c.end_s, c.says[cell].state) for drives in heard.values() for c in drives if c.says[cell].state != UN
     ]
@@ -464,7 +464,8 @@ def unbroken(recent: list[Cast], cell: Cell, settings: FuseSettings) -> tuple[in
 
 
 def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:
-    """What is new stays out until it can be expected to stay, by what came and went here before and its own age."""
+    """A new object stays out until it is expected to stay, by the objects that came and went here before and its own
+    age."""
     since, seen = unbroken(recent, cell, settings)
     age = 0.0 if since is None else (seen - since) / DAY_S
     expected = (settings.prior_stay_days + held.stayed_s / DAY_S + age) / (1.0 + held.stays)

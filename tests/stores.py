@@ -1,4 +1,4 @@
-"""What vehicles send to a store in tests, and its clock."""
+"""Ballots that vehicles send to a store in tests, and its clock."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 
 @dataclass
 class Clock:
-    """Of a store: nanoseconds since 1970. It stands until a test moves it on."""
+    """Clock of a store: nanoseconds since 1970. It stands until a test moves it on."""
 
     now: int
 

@@ -1,4 +1,5 @@
-"""What a reader of the documents relies on: links lead somewhere, lines fit a window, names are those of the house."""
+"""Facts that a reader of the documents relies on: links lead somewhere, lines fit a window, names are those of the
+house."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def test_every_page_is_reached_from_the_index_by_links() -> None:
 
 
 def test_every_benchmark_is_named_by_a_page_or_used_by_another() -> None:
-    """What no page cites measures for nobody."""
+    """A benchmark that no page cites measures for nobody."""
     scripts = sorted((ROOT / "benchmarks").glob("*.py"))
     texts = [page.read_text() for page in [*PAGES, *scripts]]
     assert [
@@ -78,7 +79,7 @@ def test_a_door_has_commands_output_a_picture_and_at_most_four_links(door: str) 
 
 
 def test_the_site_lists_every_page() -> None:
-    """What is not in the navigation is a warning of mkdocs, and warnings are errors."""
+    """A page outside the navigation is a warning of mkdocs, and warnings are errors."""
     listed = set(re.findall(r"(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
     pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
     assert pages == listed - {"pictures/*.md"}

@@ -28,11 +28,11 @@ MOST_FUNCTION_LINES = 60
 MOST_ARGUMENTS = 8
 MOST_NAMED_TWICE = 10
 """Public functions and classes with two meanings."""
-MOST_MODULE_NAMES = 990
+MOST_MODULE_NAMES = 1010
 """Names bound at the top level of modules, without functions and classes."""
-MOST_LOOSE_NUMBERS = 185
+MOST_LOOSE_NUMBERS = 140
 """Numbers among them: those that kernels read, sizes of formats, bits and codes."""
-MOST_NAMES_WITH_SEVERAL_VALUES = 5
+MOST_NAMES_WITH_SEVERAL_VALUES = 3
 MOST_PACKED_SHARE = 0.085
 """Share of assignments that pack several statements into one line."""
 MOST_ODD_SENTENCES = 8

@@ -1,4 +1,5 @@
-"""What works with `pip install mapvote` alone: every extra's packages are blocked, as on a machine that has none."""
+"""Verbs that work with `pip install mapvote` alone: every extra's packages are blocked, as on a machine that has
+none."""
 
 from __future__ import annotations
 

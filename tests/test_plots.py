@@ -1,4 +1,4 @@
-"""What a survey and the doctor found is drawn: the same picture each time, and whatever is not known."""
+"""Pictures of a survey and of the doctor's findings: the same picture each time, and whatever is not known."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -55,7 +55,7 @@ def street_map() -> PointMap:
 
 
 def scan_of(x: float, i: int) -> tuple[Scan, F64]:
-    """What is visible now from (x, 0): the new wall, and the back wall where the new one does not hide it."""
+    """Points visible from (x, 0): the new wall, and the back wall where the new one does not hide it."""
     behind = BACK[~((BACK[:, 1] / (20.25 - x) * (8.25 - x) > 1.9) & (BACK[:, 1] / (20.25 - x) * (8.25 - x) < 5.1))]
     near_road = RNG.uniform([-5.0, -8.0], [7.9, 8.0], (8000, 2))
     points = np.vstack([NEW, behind, np.column_stack([near_road, np.zeros(len(near_road))])])
@@ -247,7 +247,7 @@ def long_drive(n: int = 60) -> Drive:
 
 
 def test_a_drive_cut_into_ballots_has_every_scan_in_exactly_one_whenever_they_are_written() -> None:
-    """What a stretch says is fixed when it is cut: nothing that comes later changes a bit of it."""
+    """The ballot of a stretch is fixed when it is cut: nothing that comes later changes a bit of it."""
     drive_, point_map, cuts = long_drive(), street_map(), Cuts(length_m=7.0)
     ballots = [stretch.written() for stretch in vote_in_stretches(drive_, make(point_map), cuts)]
     assert [ballot.drive for ballot in ballots] == ["d-001", "d-002", "d-003"]

@@ -22,7 +22,7 @@ from mapvote_lab.simulation import simulate
 
 SOURCES = Path(mapvote.__file__).parent
 _BOUND = "-dac_override,-dac_read_search"
-"""Of root's capabilities: without them permissions hold for it too."""
+"""Two of root's capabilities: without them permissions hold for it too."""
 
 
 @pytest.mark.slow

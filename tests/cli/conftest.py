@@ -104,7 +104,8 @@ def desk(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callabl
 
 
 def make_clouds(street: F64) -> None:
-    """Of the street (n, 3): a session's cloud in a frame of its own, and two parts that overlap by 40 m, with noise."""
+    """Points of the street (n, 3): a session's cloud in a frame of its own, and two parts that overlap by 40 m, with
+    noise."""
     rng = np.random.default_rng(5)
     noisy = street + rng.normal(0.0, 0.01, street.shape)
     write_pcd(Path("session.pcd"), Cloud(transform(from_xyz_rpy(40.0, -15.0, 2.0, yaw=0.7), noisy)))

@@ -1,4 +1,4 @@
-"""What the program answers to an operator's everyday questions and mistakes."""
+"""Answers of the program to an operator's everyday questions and mistakes."""
 
 from __future__ import annotations
 

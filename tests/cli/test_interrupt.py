@@ -25,7 +25,7 @@ Desk = Callable[..., Path]
 
 @pytest.fixture(autouse=True)
 def _ctrl_c_is_heard() -> Iterator[None]:
-    """What a shell starts in the background hears no Ctrl-C, nor does what that starts: the tests may run there."""
+    """A process that a shell starts in the background gets no Ctrl-C, nor do its children: the tests may run there."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -1,7 +1,7 @@
 """docs/operations.md followed literally, from its first command to its last, as an operator would who knows nothing
 else: the wheel in a fresh environment, a real server, both databases.
 
-What is not mapvote's own (pip, systemctl, the databases' tools) is not run here.
+Commands of others (pip, systemctl, the databases' tools) are not run here.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
 
 
 def both(site: tuple[str, str], verb: str, *words: object) -> str:
-    """What a verb says of the store; of the server it says the same."""
+    """A verb's answer on the store; of the server it says the same."""
     said = typed(verb, site[0], *words)
     assert typed(verb, site[1], *words).replace(site[1], site[0]) == said
     return said

@@ -1,4 +1,4 @@
-"""What a vehicle's client loses: nothing. And what it asks for: only what it lacks."""
+"""Losses of a vehicle's client: nothing. And what it asks for: only what it lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What differs between two clouds: by geometry alone where neither knows free space."""
+"""Differences between two clouds: by geometry alone where neither knows free space."""
 
 from __future__ import annotations
 

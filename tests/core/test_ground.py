@@ -30,7 +30,7 @@ from mapvote.core.types import F32, F64, I32, I64, U8
 LATTICE = Lattice(-30.0, -30.0)
 """All that is tested lies well inside one tile."""
 X = 0.3 * (np.arange(100) + 0.5)
-"""Of the middles of a hundred cells."""
+"""Coordinates of the middles of a hundred cells."""
 ONE_TILE = tiles_around([(0, 0)])
 
 
@@ -77,8 +77,8 @@ def test_the_ground_of_strays_costs_no_memory_and_changes_nothing_of_the_street(
 
 
 def test_reflections_below_the_road_do_not_sink_the_ground() -> None:
-    """As behind a van in KITTI drive 0005: twenty points within a metre, four metres below the road. Where the driven
-    path is known not even a mirrored street sinks it."""
+    """A scene as behind a van in KITTI drive 0005: twenty points within a metre, four metres below the road. Where the
+    driven path is known not even a mirrored street sinks it."""
     road = at(spread(1), 0.0)
     alone = np.array([[9.0, 9.0, -5.4], [10.1, 9.6, -4.6], [21.0, 3.0, -23.0]])
     cluster = at(spread(2, 20, (12, 13), (12, 13)), np.random.default_rng(3).normal(-4.0, 0.1, 20))
@@ -302,7 +302,7 @@ def test_a_column_without_ground_begins_no_higher_than_a_gentle_slope_from_any_k
 
 
 def test_ground_that_is_sown_later_grows_and_what_had_grown_stays() -> None:
-    """As it does where all of it is looked at again."""
+    """The result is that of examining all of it again."""
     rng = np.random.default_rng(11)
     cells = np.sort(rng.choice(CELLS, CELLS // 3, replace=False))
     seen = starts(cells), rng.normal(0.0, 0.03, len(cells)).astype(np.float32), ONE_TILE

@@ -91,7 +91,7 @@ def test_what_lies_under_points_is_that_of_their_tiles_and_nothing_beyond_the_ma
 
 @pytest.mark.parametrize("side_m", [300.0, 90_000.0])
 def test_points_are_cut_into_tiles_in_ascending_order_and_keep_theirs_within_each(side_m: float) -> None:
-    """Of a few tiles as of more than two bytes can number."""
+    """The order holds for a few tiles and for more than two bytes can number."""
     points = np.random.default_rng(4).uniform(-side_m, side_m, (2000, 3))
     rows, cols = (cells // TILE_CELLS for cells in Lattice().cells_of(points))
     cut = list(cut_tiles(points, Lattice()))

@@ -1,4 +1,4 @@
-"""What a long drive no longer needs goes back to the system."""
+"""Memory that a long drive no longer needs returns to the system."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def sound() -> Recording:
 
 
 def seen_along(T_map_lidar: F64) -> Recording:
-    """What a sensor sees of the street at poses (24, 4, 4)."""
+    """Scans of the street at poses (24, 4, 4)."""
     rng = np.random.default_rng(9)
     points = sound_street()
     scans = []
@@ -141,7 +141,7 @@ LESS = {
     "rows 12 scans late": "sound",
     "points in millimetres + inverse poses": "part",
 }
-"""What does not show on 18 m of a street of points in no order, without rings; of points that no reader takes for
+"""Faults that do not show on 18 m of a street of points in no order, without rings; of points that no reader takes for
 metres, only the unit."""
 
 

@@ -1,4 +1,4 @@
-"""What is asked of a drive once it is localised: sound ones pass, those that were never sure of their place do not."""
+"""Checks of a drive once it is localised: sound ones pass, those that were never sure of their place do not."""
 
 from __future__ import annotations
 

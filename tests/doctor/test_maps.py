@@ -143,7 +143,7 @@ def city(seed: int = 3) -> tuple[F64, NDArray[np.uint8]]:
 
 
 def test_the_classification_says_which_way_is_up() -> None:
-    """Of a city of flat roofs the sheet of points is above; the file says where the ground is."""
+    """In a city of flat roofs the sheet of points is above; the file says where the ground is."""
     points, classes = city()
     guessed = serious(check_cloud(in_memory(points)))
     assert any(re.search(UP, what) for what in guessed), "else the case is none"

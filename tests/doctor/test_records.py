@@ -30,7 +30,7 @@ SAME, GONE = int(CellState.UNCHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)
 def told_of_bag(
     path: Path, *, T: F64 | None = T_BASE_LIDAR, poses_later_s: float = 0.0, tick_ns: int = 10**8, **said: Any
 ) -> str:
-    """What is said of a bag of six clouds of /points, odometry at 50 Hz, and where the LiDAR sits."""
+    """Findings on a bag of six clouds of /points, odometry at 50 Hz, and the LiDAR's mount."""
     recorder = Recorder(path)
     if T is not None:
         recorder.static({"lidar": T})

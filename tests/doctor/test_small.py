@@ -1,4 +1,4 @@
-"""What is wrong by a little is named where the drive surely shows it; a drive that shows too little says so."""
+"""A small fault is named where the drive surely shows it; a drive that shows too little says so."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def along(metres: float, curved: bool = False) -> F64:
 
 
 def straying(T: F64, sigma_m: float, seed: int = 1) -> F64:
-    """As a GNSS receiver strays: errors that last for ten seconds."""
+    """Errors of a GNSS receiver: errors that last for ten seconds."""
     rng, memory, error = np.random.default_rng(seed), np.exp(-0.01), np.zeros(3)
     out = T.copy()
     for one in out:
@@ -61,7 +61,7 @@ def runs_of(T: F64) -> list[Run]:
 def evidence(
     T: F64, sigma_m: float, runs: list[Run] | None = None, chain: Run | None = None, sigma_deg: float = 1.0
 ) -> DriveEvidence:
-    """Of a drive whose scans show the motion of poses T (n, 4, 4), a tenth of a second apart."""
+    """Evidence of a drive whose scans show the motion of poses T (n, 4, 4), a tenth of a second apart."""
     stamps_ns = np.arange(len(T)) * 100_000_000
     nothing = Scan(0, np.zeros((0, 3), np.float32))
     e = DriveEvidence(
@@ -73,7 +73,7 @@ def evidence(
 
 
 def compared(prior: F64, T: F64, runs: list[Run] | None = None, sigma_m: float = 1.0) -> list[Finding]:
-    """What the doctor says of a prior (n, 4, 4), where scans would show the motion of T."""
+    """Findings on a prior (n, 4, 4), where scans would show the motion of T."""
     return compare(evidence(T, sigma_m, runs), prior)[0]
 
 

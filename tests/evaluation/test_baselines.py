@@ -35,7 +35,7 @@ def old_map() -> PointMap:
 
 
 def today() -> tuple[np.ndarray, np.ndarray]:
-    """What a sensor at ORIGIN sees of the new world, and which points are above ground."""
+    """A scan of the new world from ORIGIN, and its points above ground."""
     new, stood = wall(BUILT, 8, 14), wall(STOOD, 8, 24)
     behind_new = (stood[:, 0] - ORIGIN[0]) / (STOOD - ORIGIN[1]) * (BUILT - ORIGIN[1]) + ORIGIN[0] < 14
     points = np.vstack([ground(), new, stood[~behind_new]])

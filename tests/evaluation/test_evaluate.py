@@ -91,7 +91,7 @@ def test_a_misspelt_case_is_named() -> None:
 
 
 def of_elsewhere(html: str) -> list[str]:
-    """What a page would load; the scripts inside it may name addresses."""
+    """Files that a page would load; the scripts inside it may name addresses."""
     return re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)
 
 

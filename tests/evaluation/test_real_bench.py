@@ -1,4 +1,4 @@
-"""What was cast into the scans is scored thing by thing, kind by kind, and told dry and in rain side by side."""
+"""Objects cast into the scans are scored one by one and by kind, dry and in rain side by side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a truth folder says, and how poses compare: by hand, and against exact geometry."""
+"""Content of a truth folder, and the comparison of poses: by hand, and against exact geometry."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Target:
     file: str
     read: Callable[[Path], object]
     what: str = ""
-    """What is read; the file itself if empty."""
+    """Readers under test; the file itself if empty."""
     times: int = 25
 
 

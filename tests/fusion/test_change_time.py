@@ -27,7 +27,7 @@ def decided(
     said: Sequence[int], min_votes: int = 2, ends_s: list[int] | None = None, whose: list[str] | None = None,
     rule: Rule = SURFACES, cell: tuple[int, int] = CELL, live: bool = False,
 ) -> int:  # fmt: skip
-    """What is decided of a cell if vehicles pass one after the other and say this; ``live``: as a server does."""
+    """The decision on a cell if vehicles pass one after the other with these votes; ``live``: as a server does."""
     votes = [
         TileVote(
             vehicle=f"v{i}" if whose is None else whose[i],

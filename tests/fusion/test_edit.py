@@ -157,8 +157,8 @@ def test_what_touches_what_stays_goes_if_more_than_two_thirds_mark_it(marking: i
 def test_a_voxel_that_stays_protects_what_touches_it_in_the_next_cell(
     beside: Cell, other: int, gone_there: int, stays: bool
 ) -> None:
-    """Two of three vehicles mark voxels of a cell that stands. Of a cell that is emptied only what the vehicles mark
-    goes; the rest stays, and protects its neighbours too."""
+    """Two of three vehicles mark voxels of a cell that stands. An emptied cell loses only the points that the vehicles
+    mark; the rest stays, and protects its neighbours too."""
     tile = make_tile(np.concatenate([wall([CELL], APART), wall([beside], [0.75])]))
     masks, states = {CELL: 0b1010, beside: gone_there}, {CELL: UO, beside: other}
     votes = [

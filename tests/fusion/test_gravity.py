@@ -1,4 +1,4 @@
-"""What hangs on a demolished object, or inside it, falls with it; nothing else does."""
+"""Points that hang on a demolished object, or inside it, fall with it; nothing else does."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def test_what_vehicles_built_is_fused_again_when_it_falls_because_its_stay_is_co
 
 
 def in_plain_words(rest: NDArray[np.bool_], holds: NDArray[np.bool_], deleted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What falls among voxels (rows, cols, layers)."""
+    """Voxels that fall among voxels (rows, cols, layers)."""
     groups, count = ndimage.label(rest, np.ones((3, 3, 3)))
     near = ndimage.binary_dilation(deleted, np.ones((5, 5, 5)))
     emptied = deleted.any(axis=2)
@@ -327,7 +327,7 @@ CORNER = 2 * TILE_CELLS - SIZE // 2
 
 
 def falls(remains_of: Mapping[TileIndex, Remains]) -> dict[TileIndex, Fallen]:
-    """What falls in each tile, first alone, then across borders."""
+    """Voxels that fall in each tile, first alone, then across borders."""
     sites, fell, undecided = dict(remains_of), dict[TileIndex, Fallen](), dict[TileIndex, Remains]()
     for index, site in remains_of.items():
         fell[index], missing = fall_within(index, site)

@@ -30,7 +30,7 @@ def honest() -> Say:
 
 
 def claim(states: U8) -> Say:
-    """As sure of it as can be; all that is mapped gone, poles of false points where something is said to be new."""
+    """The largest confidence; all that is mapped gone, poles of false points where something is said to be new."""
     gone = np.where(two_walls().tiles[TILE].obstacle_words != 0, ~np.uint64(0), np.uint64(0))
     gone[states == CellState.CHANGED_EMPTY] = ~np.uint64(0)
     cells = [(int(r), int(c)) for r, c in np.argwhere(states == CellState.CHANGED_OCCUPIED)]
@@ -89,8 +89,8 @@ LIES: Mapping[str, Callable[[], Say]] = {
 def test_k_liars_decide_nothing_among_k_plus_1_honest_vehicles_that_agree(name: str, k: int) -> None:
     """Where all honest vehicles say the same, min_votes = k + 1 decides and deletes as without the liars.
 
-    What liars can still do is to add a point in the voxel above or below one that the honest saw: a voxel counts as
-    supported by whoever saw its neighbour.
+    Liars can still add a point in the voxel above or below one that the honest saw: a voxel counts as supported by
+    whoever saw its neighbour.
     """
     point_map, settings = two_walls(), FuseSettings(min_votes=k + 1)
     true = [make_ballot(point_map, {TILE: honest()}, vehicle=f"v{i}") for i in range(k + 1)]

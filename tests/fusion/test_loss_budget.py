@@ -43,7 +43,7 @@ def vote(vehicle: str, steps: int | None, state: int = EMPTY) -> TileVote:
 
 
 def taken(says: list[int | None], quorum: int, against: int = 0) -> int:
-    """What is taken of what voters say of CELL."""
+    """The agreed confidence of the voters' statements on CELL."""
     votes = [vote(f"v{i}", steps) for i, steps in enumerate(says)]
     votes += [vote(f"w{i}", None, STANDS) for i in range(against)]
     return int(agreed_odds(votes, DECIDED, quorum).at(np.array([FLAT]))[0])

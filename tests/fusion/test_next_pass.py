@@ -27,7 +27,7 @@ SAID = st.sampled_from([*map(int, CellState), NO_VOTE])
 
 
 def decided(votes: list[int], quorum: int) -> int:
-    """What ``votes`` on one cell decide of a change, by the words of docs/method.md; NO_VOTE for none."""
+    """The decision of ``votes`` on a change of one cell, by the words of docs/method.md; NO_VOTE for none."""
     determined = [v for v in votes if v not in (NO_VOTE, CellState.UNDETERMINED)]
     for change in (CO, CE):
         if votes.count(change) >= quorum and 2 * votes.count(change) > len(determined):

@@ -1,4 +1,4 @@
-"""What one vehicle says of a tile: which drives speak, what they back, and how they become one vote."""
+"""One vehicle's statement on a tile: which drives speak, what they back, and how they become one vote."""
 
 from __future__ import annotations
 

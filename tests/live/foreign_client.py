@@ -77,7 +77,7 @@ class ForeignClient:
 
     @property
     def sees_a_service(self) -> bool:
-        """As rclcpp's ``service_is_ready``: both ends are matched."""
+        """The check of rclcpp's ``service_is_ready``: both ends are matched."""
         return bool(self._writer.get_matched_subscriptions() and self._reader.get_matched_publications())
 
     def ask(self, x: float, y: float, radius_m: float, patience_s: float) -> bool:

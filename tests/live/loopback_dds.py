@@ -40,7 +40,7 @@ def own_domain() -> int:
 
 
 def until(ask: Callable[[], T], what: str = "nothing came in a minute") -> T:
-    """What ``ask`` gives as soon as it is true."""
+    """The result of ``ask`` as soon as it is true."""
     end = time.monotonic() + 60.0
     while not (found := ask()):
         assert time.monotonic() < end, what

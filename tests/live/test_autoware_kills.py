@@ -25,7 +25,7 @@ from stores import vote_gone
 pytest.importorskip("cyclonedds")
 AWAY = "http://127.0.0.1:9"
 OLD = [f"/opt/autoware/map/{k}.pcd" for k in range(60)]
-"""What the client holds from the loader before."""
+"""Tiles that the client holds from the loader before."""
 
 
 @contextmanager

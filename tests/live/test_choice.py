@@ -43,7 +43,7 @@ START = 1_700_000_000 * 10**9
 
 
 class Said:
-    """What the voice says, and when it ends: after so many sentences, or seconds."""
+    """Sentences of the voice, and its end: after so many sentences, or seconds."""
 
     def __init__(self, sentences: int = 1) -> None:
         self.lines: list[str] = []

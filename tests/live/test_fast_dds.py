@@ -1,4 +1,4 @@
-"""What most ROS 2 installations speak: clouds of a Fast DDS writer, compiled here, are read by our reader."""
+"""The DDS of most ROS 2 installations: clouds of a Fast DDS writer, compiled here, are read by our reader."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ LONGEST_S = 10.0
 UTM = MapFrame("EPSG:32632", (457_000.0, 5_428_000.0, 0.0))
 POINTS = np.random.default_rng(1).uniform((4, 4, 0), (30, 30, 5), (3000, 3)).astype(np.float32)
 Send = Callable[[int, int], dict[str, bytes]]
-"""What is sent in the n-th tenth of a second, at a stamp: messages by topic."""
+"""Messages of the n-th tenth of a second, at a stamp: messages by topic."""
 
 
 @dataclass

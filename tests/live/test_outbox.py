@@ -1,4 +1,4 @@
-"""What is on disk survives a kill at any moment: no ballot is lost, none comes twice, none is damaged."""
+"""Ballots on disk survive a kill at any moment: no ballot is lost, none comes twice, none is damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What others see of a live drive: on DDS, by Prometheus, by systemd, in a terminal."""
+"""The status of a live drive for others: on DDS, by Prometheus, by systemd, in a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a vehicle receives over DDS: LiDARs joined by /tf_static, and what its first seconds refuse."""
+"""Messages that a vehicle receives over DDS: LiDARs joined by /tf_static, and what its first seconds refuse."""
 
 from __future__ import annotations
 

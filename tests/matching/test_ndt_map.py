@@ -17,7 +17,7 @@ from mapvote.matching.ndt_voxels import Level, NdtGrid
 
 SIZE, FLOOR_M = 2.0, 0.1
 MIDDLE = np.array([3.0, -3.0, 1.0])
-"""Of the voxel in which a cloud lies."""
+"""Middle of the voxel in which a cloud lies."""
 
 
 def one_level(size: float = SIZE, half_m: float = 10.0) -> NdtMap:
@@ -27,7 +27,7 @@ def one_level(size: float = SIZE, half_m: float = 10.0) -> NdtMap:
 
 
 def grid_of(*clouds: F64) -> NdtGrid:
-    """Of clouds that come one after the other."""
+    """Voxels of clouds that come one after the other."""
     made = one_level()
     for cloud in clouds:
         made.enter(cloud)
@@ -146,7 +146,7 @@ def by_place(grid: NdtGrid) -> dict[tuple[int, ...], F64]:
 
 
 def assert_whole(joined: NdtMap, point_map: PointMap, position: F64) -> None:
-    """As the map of all points at once of the tiles that the window around ``position`` touches."""
+    """The result equals the map of all points at once of the tiles that the window around ``position`` touches."""
     clouds = [point_map.tiles[tile].points_map for tile in tiles_within(point_map, position)]
     whole = build_ndt(np.concatenate([np.zeros((0, 3)), *clouds]), position)
     for ours, theirs in zip(joined.levels, whole.levels, strict=True):

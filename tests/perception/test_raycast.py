@@ -1,4 +1,4 @@
-"""What a scan saw and passed through, against a brute-force walk along every ray in 3D.
+"""Voxels that a scan saw and passed through, against a brute-force walk along every ray in 3D.
 
 Rays without return: where all below answers and nothing above does, they went into the sky.
 """
@@ -221,7 +221,7 @@ def directions(sensor: Sensor = SENSOR) -> tuple[F64, F64, F64]:
 
 
 def sky_of(answered: Bool, sensor: Sensor = SENSOR, up: F64 = UP, R: F64 | None = None) -> Rays:
-    """What went into the sky if of all rays those ``answered``, from 20 m; the sensor turned by ``R`` (3, 3)."""
+    """Rays into the sky if those ``answered``, from 20 m; the sensor turned by ``R`` (3, 3)."""
     rays = 20.0 * directions(sensor)[0][answered] @ (np.eye(3) if R is None else R).T
     return Sky(sensor).rays(up, follow_rays(np.ascontiguousarray(rays.T, dtype=np.float32), 0.45))
 

@@ -226,7 +226,7 @@ def test_a_return_hits_every_mapped_voxel_near_it_else_the_voxel_it_lies_in(seed
 WIDE = 20
 NOTHING = np.zeros((WIDE, WIDE), np.uint64)
 EVEN = np.zeros((WIDE, WIDE), np.int32)
-"""As often hit as passed."""
+"""Hits and passes are equally many."""
 
 
 def words(*marks: tuple[int, int, int]) -> U64:
@@ -286,7 +286,7 @@ def test_a_new_object_needs_more_voxels_the_more_cells_it_has_up_to_a_bound(cell
 
 
 def test_a_cell_beside_a_deleted_one_is_deleted_if_rays_passed_half_of_it_and_nothing_stands() -> None:
-    """A row of cells from a pole that went. Of the others rays passed half of what is mapped (P) or less (N); in S
+    """A row of cells from a pole that went. In the others rays passed half of the mapped voxels (P) or less (N); in S
     something stands."""
     row = "PPPPPNPP", "NPP", "PSPP"
     gone_along = "PPPPP", "", "P"

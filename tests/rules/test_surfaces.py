@@ -53,7 +53,7 @@ def after(
     scans: int = 8,
     passed: Callable[[int, U64], object] = lambda scan, words: None,
 ) -> TileVotes:
-    """What a drive says that saw ``points`` in so many scans; ``passed`` takes away of what the rays passed."""
+    """Votes of a drive that saw ``points`` in so many scans; ``passed`` takes away of what the rays passed."""
     voter = SurfaceVoter(VotingSettings(), point_map)
     for scan in range(scans):
         seen = one_scan(point_map, points)

@@ -1,4 +1,4 @@
-"""What lies near changes in a lanelet2 map: exact on a crossing drawn by hand, whichever way its lines are stored."""
+"""Elements near changes in a lanelet2 map: exact on a crossing drawn by hand, whichever way its lines are stored."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Houses in a row: where one ends and the next begins.
 
-What belongs together: the pieces of one building, and not the house next door.
+Cells of one object: the pieces of one building, and not the house next door.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def walls(x0: float, y0: float, x1: float, y1: float) -> F64:
 
 
 def count(*houses: F64, turn_deg: float = 0.0) -> int:
-    """Of the buildings found in houses turned about the origin."""
+    """Number of the buildings found in houses turned about the origin."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     cells = np.unique(np.floor(np.concatenate(houses) @ np.array([[s, c], [c, -s]])).astype(np.int64), axis=0)
     rows, cols = cells.T

@@ -1,4 +1,4 @@
-"""What a real LiDAR gives besides the truth, against the physics it is meant to have."""
+"""False returns of a real LiDAR, against the physics that they model."""
 
 from __future__ import annotations
 

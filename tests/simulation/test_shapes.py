@@ -1,4 +1,4 @@
-"""What the street is made of: solids by their measures, foliage that lets rays pass, the ground and its mesh."""
+"""Parts of the street: solids by their measures, foliage that lets rays pass, the ground and its mesh."""
 
 from __future__ import annotations
 

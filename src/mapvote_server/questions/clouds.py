@@ -48,7 +48,7 @@ _OVERVIEW_MAGIC = 0x3143564F
 
 
 class _Drawn(NamedTuple):
-    """What the coarse picture of a tile follows from."""
+    """Planes that the coarse picture of a tile follows from."""
 
     points: str
     ground: str
@@ -58,7 +58,7 @@ class _Drawn(NamedTuple):
 
     @classmethod
     def of(cls, hashes: TileHashes, share: int) -> _Drawn:
-        """Of a tile with these planes."""
+        """The coarse picture of a tile with these planes."""
         return cls(hashes.points, hashes.ground, hashes.fields, share)
 
 

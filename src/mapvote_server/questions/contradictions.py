@@ -1,7 +1,7 @@
 """Where one vehicle says the opposite of all others: objects of cells, found tile by tile and joined over borders.
 
 A vote is compared only where other vehicles agree both before it and after it, as a cell that differs before and after
-a drive may have changed. Of each tile remain the number of its objects, the largest of them and what touches its
+a drive may have changed. Each tile keeps the number of its objects, the largest of them and those that touch its
 border: a vehicle that contradicts everywhere costs kilobytes a tile.
 """
 
@@ -91,7 +91,7 @@ class Border:
 
     parts: Objects
     part: I64
-    """Of each cell the part that it belongs to."""
+    """The part that each cell belongs to."""
     rows: I64
     """On the lattice of the map."""
     cols: I64

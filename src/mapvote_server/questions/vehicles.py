@@ -103,7 +103,7 @@ class _AllCompared:
         """Standings that follow from all tiles; None: not asked since one came or went."""
 
     def entries(self) -> list[Compared]:
-        """As many comparisons as say the same as all: one a vehicle with its sums, and those with contradictions."""
+        """The comparisons that represent all: one a vehicle with its sums, and those with contradictions."""
         opposed = [replace(entry, cells=0, inside=0) for entries in self._opposed.values() for entry in entries]
         return [*self._sums.values(), *opposed]
 

@@ -120,7 +120,7 @@ def text(name: str, content: str) -> Callable[[Path], object]:
 
 
 def rows(change: Callable[[Any], Any]) -> Callable[[Path], object]:
-    """Of scan 3."""
+    """Change the rows of scan 3."""
 
     def edit(folder: Path) -> None:
         file = folder / "velodyne" / "000003.bin"

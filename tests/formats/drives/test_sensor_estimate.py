@@ -24,7 +24,7 @@ MODELS: dict[str, tuple[tuple[float, ...], float]] = {
     "XT32": (tuple(np.linspace(15, -16, 32)), 0.18),
     "RS-32": ((15, 10.33, 7, 4.67, *np.linspace(3.33, -4.67, 24), -7.25, -10.3, -15.6, -25), 0.2),
 }
-"""As their manuals list them; uneven ones in outline."""
+"""Elevations and azimuth steps as their manuals list them; uneven ones in outline."""
 
 
 def street(elevations: F64, azimuths: F64, rng: np.random.Generator) -> tuple[F64, F64]:

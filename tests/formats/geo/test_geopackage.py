@@ -1,4 +1,4 @@
-"""What changed, as GIS read it: GeoJSON in longitude and latitude, a GeoPackage in the map's coordinate system."""
+"""Changes as GIS read them: GeoJSON in longitude and latitude, a GeoPackage in the map's coordinate system."""
 
 from __future__ import annotations
 

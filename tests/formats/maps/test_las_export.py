@@ -1,4 +1,4 @@
-"""What LAS files hold of a map: every coordinate in its unit, brightness on its scale, flags, the kind of times."""
+"""Content of LAS files of a map: every coordinate in its unit, brightness on its scale, flags, the kind of times."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ SCALED: dict[str, tuple[NDArray[Any], NDArray[Any], str]] = {
 def test_intensity_in_las_is_exact_or_on_a_stated_scale(
     tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Whole numbers to 65535 stay as they are; reals become 0 to 65535. What cannot be held is counted."""
+    """Whole numbers to 65535 stay as they are; reals become 0 to 65535. Values that LAS cannot hold are counted."""
     values, right, lost = (EXACT | SCALED)[name]
     points = np.random.default_rng(1).uniform(0, 50, (4000, 3))
     write_las(tmp_path / "a.las", Cloud(points, fields={"intensity": values}))

@@ -1,4 +1,4 @@
-"""What the API declares of itself: keys, limits, methods, encodings, ranges."""
+"""Declarations of the API: keys, limits, methods, encodings, ranges."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def assert_well_again(http: httpx2.Client, url: str, acknowledged: set[str]) -> 
 
 @pytest.mark.slow
 def test_no_room_for_the_file_to_grow(tmp_path: Path) -> None:
-    """As on a full disk, without being root: the process may not make its files longer than 3 MB for a while."""
+    """A full disk, without being root: the process may not make its files longer than 3 MB for a while."""
     url = f"sqlite:///{tmp_path / 'store.db'}"
     Store.create(url, two_walls()).close()
     with served(tmp_path / "store.db", tmp_path) as (http, process):
@@ -127,7 +127,8 @@ def ext4(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.slow
 def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path) -> None:
-    """As Linux does after a write error: the file system is read-only from one moment to the next, with files open."""
+    """Linux's behaviour after a write error: the file system is read-only from one moment to the next, with files
+    open."""
     url = f"sqlite:///{ext4 / 'store.db'}"
     Store.create(url, two_walls()).close()
     with served(ext4 / "store.db", tmp_path) as (http, _):

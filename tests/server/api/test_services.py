@@ -1,4 +1,4 @@
-"""Many requests, one piece of work: each gets its own answer. What is held in memory of ballots on their way."""
+"""Many requests, one piece of work: each gets its own answer. Memory of ballots on their way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a question keeps is what it would find anew, whatever has happened since: random histories of a street."""
+"""Kept results equal new ones, whatever has happened since: random histories of a street."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ class Street:
         self.store.change_policy({"fuse.min_votes": 1 + self.store.policy().fuse.min_votes % 3})
 
     def mend(self) -> None:
-        """What was lost is put back."""
+        """Lost planes are put back."""
         for digest, raw in self.lost.items():
             restore_plane(self.store, digest, raw, by="operator")
 
@@ -281,7 +281,7 @@ MATTER: dict[str, tuple[list[Step], Step]] = {
         ("withdraw", "b"),
     ),
 }  # fmt: skip
-"""What leads to an event that changes an answer, and the event."""
+"""Steps to an event that changes an answer, and the event."""
 
 
 @pytest.mark.parametrize("event", MATTER)

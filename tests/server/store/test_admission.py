@@ -1,5 +1,5 @@
-"""What a ballot must be: founded on enough scans, borne out by its priors, within what can be and what its vehicle may
-leave in the store. What was unpacked is remembered, within bounds."""
+"""Conditions on a ballot: founded on enough scans, borne out by its priors, within what can be and what its vehicle may
+leave in the store. Unpacked votes are remembered, within bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What hangs on a demolished house falls with it at the server, over the borders of tiles, and can be explained."""
+"""Points that hang on a demolished house fall with it at the server, over the borders of tiles, and can be
+explained."""
 
 from __future__ import annotations
 

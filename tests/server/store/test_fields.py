@@ -1,4 +1,4 @@
-"""What points carry besides their place (intensity, colours, classes, times) goes with them through a store."""
+"""Attributes of points (intensity, colours, classes, times) go with them through a store."""
 
 from __future__ import annotations
 

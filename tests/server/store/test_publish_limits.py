@@ -1,4 +1,5 @@
-"""What holds a version back, by hand: shares of a tile, and the size of one connected thing, across tiles too."""
+"""Reasons that hold a version back, by hand: shares of a tile, and the size of one connected thing, across tiles
+too."""
 
 from __future__ import annotations
 

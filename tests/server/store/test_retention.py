@@ -1,4 +1,4 @@
-"""What is cleared away, and that everything from the oldest kept version on goes on as if nothing had been."""
+"""Cleared rows; everything from the oldest kept version on works as before."""
 
 from __future__ import annotations
 

@@ -333,8 +333,8 @@ def _wkt(crs: Any) -> str:
 def las_header(laspy: Any, path: Path, clouds: CloudPieces) -> tuple[Any, F64]:
     """(laspy's header of LAS 1.4 for a cloud, (3,) metres to add to its points): coordinate system, steps and fields.
 
-    x is east or longitude, y north or latitude, whatever order the coordinate system names. What LAS cannot hold of
-    intensities and colours is a warning.
+    x is east or longitude, y north or latitude, whatever order the coordinate system names. Intensities and colours
+    that LAS cannot hold are a warning.
     """
     shift = np.zeros(3)
     geographic = False
