@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, check_ending, is_url, sound_map
+from mapvote.cli.door import all_changes, api_at, check_ending, is_url, sound_map
 from mapvote.cli.options import Config, KeyFile, Panel, Reason, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
 from mapvote.core.times import utc
@@ -233,7 +233,7 @@ def log(
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
     asked = f"from={old or 1}" + ("" if new is None else f"&to={new}")
     with api_at(store, key_file) as server, waiting("comparing versions"):
-        found = _all_changes(server, f"{asked}&lonlat={str(not local).lower()}")
+        found = all_changes(server, f"{asked}&lonlat={str(not local).lower()}")
         text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
     if page is not None:
         write_whole(page, text)
@@ -245,17 +245,6 @@ def log(
         print(json.dumps(found, indent=1))
     elif page is None:
         _print_changes(found)
-
-
-def _all_changes(server: Connection, asked: str) -> dict[str, Any]:
-    """The list of changes, part by part."""
-    whole = server.ask_json("GET", f"/v1/changes?{asked}&limit=10000")
-    part = whole
-    while part["features"] and len(whole["features"]) < whole["numberMatched"]:
-        versions = f"{asked}&to={whole['to_version']}"
-        part = server.ask_json("GET", f"/v1/changes?{versions}&limit=10000&offset={len(whole['features'])}")
-        whole["features"] += part["features"]
-    return {name: value for name, value in whole.items() if name not in ("numberMatched", "numberReturned")}
 
 
 def _print_versions(answer: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from mapvote.cli.terminal import progress, waiting
 from mapvote.core.types import MapvoteError
@@ -113,6 +113,17 @@ def client_of(url: str, key: str | None) -> MapClient:
     from mapvote.config import cache_folder
 
     return MapClient(url, key=key, home=cache_folder())
+
+
+def all_changes(server: Connection, asked: str) -> dict[str, Any]:
+    """The list of changes that a query of ``/v1/changes`` asks for, part by part."""
+    whole = server.ask_json("GET", f"/v1/changes?{asked}&limit=10000")
+    part = whole
+    while part["features"] and len(whole["features"]) < whole["numberMatched"]:
+        versions = f"{asked}&to={whole['to_version']}"
+        part = server.ask_json("GET", f"/v1/changes?{versions}&limit=10000&offset={len(whole['features'])}")
+        whole["features"] += part["features"]
+    return {name: value for name, value in whole.items() if name not in ("numberMatched", "numberReturned")}
 
 
 @contextmanager

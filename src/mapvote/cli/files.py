@@ -251,6 +251,10 @@ def export(
         float, typer.Option(min=0.1, metavar="SECONDS", help="with --follow: seconds between two requests")
     ] = 30.0,
     once: Annotated[bool, typer.Option("--once", help="with --follow: write the newest version once and end")] = False,
+    stac: Annotated[
+        bool,
+        typer.Option("--stac", help="write a STAC catalogue: a folder of all versions as COPC, with changes"),
+    ] = False,
     key_file: KeyFile = None,
 ) -> None:
     """Write a map's points in another format, in its own coordinate system or another. Reports what it drops.
@@ -261,9 +265,16 @@ def export(
         mapvote export my_map city.pcd
 
         mapvote export https://maps.example.org map --follow --key-file key
+
+        mapvote export fleet.db catalogue --stac
     """
     from mapvote.core.extras import require_for
 
+    if stac:
+        from mapvote.cli.catalogue import export_stac
+
+        export_stac(source, out, key_file, version)
+        return
     if follow:
         if not is_url(source) or out.suffix:
             raise MapvoteError("export: --follow takes the URL of a server and a folder")

@@ -43,6 +43,7 @@ from mapvote.formats.registry import DRIVES, MAPS, WRITERS, MapWriter, drive_for
 
 __all__ = [
     "DriveWriter",
+    "box_of",
     "export_map",
     "is_cloud",
     "open_drive",
@@ -189,7 +190,7 @@ def export_map(
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
         raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
-    stated, corners = frame_of(point_map.georeference), _corners(path, point_map)
+    stated, corners = frame_of(point_map.georeference), box_of(path, point_map)
     if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
         wanted: MapFrame | None = autoware_frame(stated, corners, projector)
         if crs is not None:
@@ -222,7 +223,7 @@ def _check_degrees(path: Path, frame: MapFrame, corners: F64, writer: MapWriter,
 
 def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) -> CloudPieces:
     """A map's points in a frame that Autoware supports: ``projector``'s, else the one that ``folder`` has already."""
-    stated, corners, chosen = frame_of(point_map.georeference), _corners(folder, point_map), folder / PROJECTOR
+    stated, corners, chosen = frame_of(point_map.georeference), box_of(folder, point_map), folder / PROJECTOR
     wanted = projector or (str(chosen) if chosen.is_file() and not stated.is_local else None)
     frame, convert = settle_out(str(folder), stated, autoware_frame(stated, corners, wanted), corners)
     return _pieces(point_map, frame, convert)
@@ -248,7 +249,7 @@ def _pieces(
     return CloudPieces.gathered(pieces, frame)
 
 
-def _corners(where: Path, point_map: PointMap) -> F64:
+def box_of(where: Path, point_map: PointMap) -> F64:
     """(2, 3) the lowest and the highest coordinates of a map's points; MapvoteError if it has none to write there."""
     boxes = [(t.points_map.min(axis=0), t.points_map.max(axis=0)) for t in point_map.tiles.values() if len(t.points)]
     if not boxes:

@@ -1,0 +1,118 @@
+"""A STAC catalogue of a map's versions (STAC 1.1; extensions pointcloud 2.0 and projection 2.0): files in folders.
+
+catalog.json    v1/v1.json    v1/cloud.copc.laz    v2/v2.json    v2/cloud.copc.laz    v2/changes.geojson
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.types import F64
+from mapvote.formats.atomic import write_whole
+from mapvote.formats.geo.frame import MapFrame, read_crs
+
+_STAC = "1.1.0"
+_EXTENSIONS = [
+    "https://stac-extensions.github.io/pointcloud/v2.0.0/schema.json",
+    "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
+]
+CLOUD, CHANGES = "cloud.copc.laz", "changes.geojson"
+"""Names of an item's files."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapVersion:
+    """A version of a map, as its item tells it."""
+
+    number: int
+    created: str
+    """RFC 3339, UTC."""
+    parent: int | None
+    """The version that it was made from, if that is in the catalogue."""
+    points: int
+    corners: F64
+    """(2, 3) lowest and highest coordinates, map metres."""
+    frame: MapFrame
+    has_changes: bool
+    """Whether there is a file of changes from the parent."""
+
+
+def name_of_item(number: int) -> str:
+    """Its folder, its id, and its file without the ending."""
+    return f"v{number}"
+
+
+def stac_item(version: MapVersion) -> dict[str, Any]:
+    """The item of a version. One whose place on Earth is unknown has no geometry, as STAC allows."""
+    name, frame = name_of_item(version.number), version.frame
+    properties: dict[str, Any] = {
+        "datetime": version.created,
+        "title": f"version {version.number}",
+        "pc:count": version.points,
+        "pc:type": "lidar",
+        "proj:code": frame.crs if frame.crs.startswith("EPSG:") else None,
+    }
+    place: dict[str, Any] = {"geometry": None}
+    if not frame.is_local:
+        if frame.crs.startswith("EPSG:"):
+            low, high = (version.corners + np.array(frame.offset_m)).round(3).tolist()
+            properties["proj:bbox"] = [*low, *high]
+            properties["proj:wkt2"] = read_crs(frame.crs).to_wkt()
+        place = _place(version)
+    assets = {
+        "cloud": {
+            "href": f"./{CLOUD}",
+            "type": "application/vnd.laszip+copc",
+            "title": "all points",
+            "roles": ["data"],
+        }
+    }
+    if version.has_changes:
+        assets["changes"] = {
+            "href": f"./{CHANGES}",
+            "type": "application/geo+json",
+            "title": f"built and demolished since version {version.parent}",
+            "roles": ["metadata"],
+        }
+    links = [{"rel": rel, "href": "../catalog.json", "type": "application/json"} for rel in ("root", "parent")]
+    if version.parent is not None:
+        before = name_of_item(version.parent)
+        links.append({"rel": "derived_from", "href": f"../{before}/{before}.json", "type": "application/geo+json"})
+    head = {"type": "Feature", "stac_version": _STAC, "stac_extensions": _EXTENSIONS, "id": name}
+    return head | place | {"properties": properties, "links": links, "assets": assets}
+
+
+def _place(version: MapVersion) -> dict[str, Any]:
+    """Footprint and box in longitude, latitude and height."""
+    (x0, y0, z0), (x1, y1, z1) = version.corners.tolist()
+    corners = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z1], [x0, y1, z1], [x0, y0, z0]])
+    degrees = version.frame.to_lonlat(corners).round(8)
+    low, high = degrees.min(axis=0).tolist(), degrees.max(axis=0).tolist()
+    return {"geometry": {"type": "Polygon", "coordinates": [degrees[:, :2].tolist()]}, "bbox": [*low, *high]}
+
+
+def stac_catalog(map_id: str, numbers: Sequence[int]) -> dict[str, Any]:
+    """The catalogue of these versions."""
+    links = [{"rel": "root", "href": "./catalog.json", "type": "application/json"}]
+    for number in numbers:
+        name = name_of_item(number)
+        links.append({"rel": "item", "href": f"./{name}/{name}.json", "type": "application/geo+json"})
+    about = {"id": map_id, "title": "mapvote", "description": "Versions of a point-cloud map that vehicles keep true"}
+    return {"type": "Catalog", "stac_version": _STAC} | about | {"links": links}
+
+
+def write_item(folder: Path, version: MapVersion) -> None:
+    """The item's file, beside its assets."""
+    name = name_of_item(version.number)
+    write_whole(folder / name / f"{name}.json", json.dumps(stac_item(version), indent=1) + "\n")
+
+
+def write_catalog(folder: Path, map_id: str, numbers: Sequence[int]) -> None:
+    """The catalogue's file: written last, so that it names only items that are there."""
+    write_whole(folder / "catalog.json", json.dumps(stac_catalog(map_id, numbers), indent=1) + "\n")
