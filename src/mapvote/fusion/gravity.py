@@ -4,7 +4,10 @@ Rays seldom cross the tops of facades and roofs. So votes on single cells leave 
 saw go. A group of remaining obstacle voxels (26 neighbours) falls if nothing holds it, and it
 
 - touches what a decided changed-empty deletes in this round, or
-- lies inside a demolished object: wholly within its outline from above, and beginning no higher than its top.
+- lies inside a demolished object: wholly within its outline from above, and beginning hardly higher than its top there.
+
+Only what stood on the ground carried anything. So a deleted voxel counts if deleted voxels around it lead up to it from
+the ground. If votes delete a piece of a bridge that crosses a demolished house, the rest of the bridge does not follow.
 
 A group is held by a voxel near the ground, by a cell that is decided occupied (unchanged or changed), and by a cell
 whose change waits (for a reviewer, for another vehicle, for the budget of false deletions). Wires, signs, bridges and
@@ -38,7 +41,7 @@ class Gravity:
 
     touch_voxels: int = 2
     """A group touches a deleted voxel that is at most so far away along each axis, voxels. So far an outline reaches
-    beyond its deleted cells, and a group may begin above the top of an object."""
+    beyond its deleted cells."""
     ground_voxels: int = 7
     """So many of the lowest voxels of a column hold; bit 0 holds the ground, so they reach 1.8 to 2.1 m above it."""
     longest_cells: int = 250
@@ -46,6 +49,14 @@ class Gravity:
     longest_object_cells: int = 500
     """An object that spans more rows or columns has no inside, cells: 150 m. So two tiles in each direction show all
     that decides about one tile."""
+    beside_cells: int = 10
+    """Deleted cells so near to each other, rows and columns, lead up from the ground together, cells: 3 m. The top of
+    an object at a place is that of its deleted cells at most so much farther away than the nearest one."""
+    gap_voxels: int = 2
+    """Up to so many layers without a deleted voxel are passed on the way up from the ground."""
+    rise_voxels: int = 3
+    """A group inside an object begins at most so many layers above its top there: the highest part of a wall is often
+    not seen to go."""
     reach_cells: int = 1
     """Deleted cells are of one object if their surroundings, so many cells wide, touch."""
     inside_cells: int = 45
@@ -126,7 +137,8 @@ class Fallen:
 
     def joined(self, other: Fallen) -> Fallen:
         """The voxels of both."""
-        words, beside = np.zeros(CELLS, np.uint64), np.full(CELLS, _NOWHERE)
+        words = np.zeros(CELLS, np.uint64)
+        beside = np.full(CELLS, _NOWHERE)
         for part in (self, other):
             words[part.cells] |= part.words
             beside[part.cells] = np.minimum(beside[part.cells], part.beside)
@@ -187,11 +199,11 @@ def fall_across(
     fallen: dict[TileIndex, Fallen] = {}
     for index in sorted(undecided):
         sites, missing = {index: undecided[index]}, frozenset({index})
-        found: dict[TileIndex, Fallen] = {}
+        by_tile: dict[TileIndex, Fallen] = {}
         while missing:
-            found, missing = _fall_in(index, sites, gravity)
+            by_tile, missing = _fall_in(index, sites, gravity)
             sites |= {tile: undecided[tile] if tile in undecided else remains_at(tile) for tile in missing}
-        for tile, more in found.items():
+        for tile, more in by_tile.items():
             fallen[tile] = fallen[tile].joined(more) if tile in fallen else more
     return fallen
 
@@ -203,14 +215,18 @@ def _fall_in(
     window = _Window.of(sites)
     own = window.slices_of(index)
     # Groups that touch a deletion of this tile.
-    corner, reach = (own[0].start, own[1].start), (gravity.touch_voxels, gravity.longest_cells)
-    deleted = read_only(np.ascontiguousarray(window.deleted[own]))
-    places = *corner, *window.lattice_corner, *reach, _ANYWHERE
-    _drop_touching(*window.shown, deleted, *places, *window.memory, *window.found)
+    corner = own[0].start, own[1].start
+    limits = gravity.touch_voxels, gravity.longest_cells
+    climb = gravity.ground_voxels, gravity.gap_voxels, gravity.beside_cells
+    _find_carried(read_only(window.deleted), read_only(window.base), *climb, window.carried)
+    planes = *window.shown, read_only(window.deleted), read_only(window.carried)
+    places = *corner, *window.lattice_corner
+    _drop_touching(*planes, *places, *limits, gravity.beside_cells, *window.memory, *window.outputs)
     # Groups inside an object of which a part lies in this tile.
     for body in _bodies(window, own, gravity):
-        limits = read_only(body.tops), *body.corner, body.key, gravity.longest_cells
-        _drop_inside(*window.shown, *limits, *window.memory, *window.found)
+        outline = body.inside, *body.corner, body.rows, body.cols, body.tops, body.key
+        reach = gravity.rise_voxels, gravity.longest_cells, gravity.beside_cells
+        _drop_inside(*window.shown, *outline, *reach, *window.memory, *window.outputs)
     fallen = {tile: window.fallen_in(tile) for tile in sites if window.words[window.slices_of(tile)].any()}
     # A group that leaves the tiles around is too long.
     around = gravity.longest_object_cells // TILE_CELLS + 1
@@ -222,16 +238,21 @@ class _Window:
     """The planes of some sites as one window of whole tiles, and what is found in it."""
 
     def __init__(self, corner: TileIndex, known: Bool, rest: U64, holds: U64, deleted: U64, base: I32) -> None:
-        self.corner, self.known = corner, known
-        self.base, self.deleted = base, deleted
+        self.corner = corner
+        self.known = known
+        self.base = base
+        self.deleted = deleted
         self.shown = read_only(rest), read_only(holds), read_only(base), known
+        self.loose = rest & ~holds != 0
         most = int(np.bitwise_count(rest & ~holds).sum()) + 1
+        self.carried = np.zeros(rest.shape, np.uint64)
         self.words = np.zeros(rest.shape, np.uint64)
         self.asked = np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
-        seen, stays = (np.zeros(rest.shape, np.uint64) for _ in range(2))
+        seen = np.zeros(rest.shape, np.uint64)
+        stays = np.zeros(rest.shape, np.uint64)
         self.memory = seen, stays, np.empty(most, np.int64), np.empty(most, np.uint64)
         self.beside = np.full(rest.shape, _NOWHERE)
-        self.found = self.asked, self.words, self.beside
+        self.outputs = self.asked, self.words, self.beside
 
     @classmethod
     def of(cls, sites: Mapping[TileIndex, Remains]) -> _Window:
@@ -296,17 +317,24 @@ def _slices(row: int, col: int) -> tuple[slice, slice]:
 class _Body:
     """The inside of a demolished object."""
 
-    tops: I32
-    """(h, w) lattice layer up to which a group may begin, in the cells within the outline; elsewhere _OUTSIDE."""
+    inside: Bool
+    """(h, w) the cells within the outline, and a little beyond."""
     corner: tuple[int, int]
     """Row and column of its first cell in the window."""
+    rows: I64
+    """(n,) of its deleted cells in the window."""
+    cols: I64
+    """(n,)"""
+    tops: I32
+    """(n,) lattice layer of their highest voxels that stood on the ground."""
     key: int
     """Its first deleted cell, by :func:`lattice_key`."""
 
 
-_OUTSIDE = -(1 << 30)
-_ANYWHERE = np.empty((0, 0), dtype=np.int32)
-_ANYWHERE.flags.writeable = False
+_ANYWHERE = read_only(np.empty((0, 0), dtype=np.bool_))
+_NO_CELLS = read_only(np.empty(0, dtype=np.int64))
+_NO_TOPS = read_only(np.empty(0, dtype=np.int32))
+_NOWHERE_HIGH = -(1 << 30)
 
 
 def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iterator[_Body]:
@@ -328,10 +356,11 @@ def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iter
     first = np.array([[side.start] for side in own])
     here = ((high >= first) & (low < first + TILE_CELLS)).all(axis=0)
     fits = here & (size.max(axis=0) <= gravity.longest_object_cells) & (size.prod(axis=0) >= gravity.inside_cells)
-    margin = 2 * gravity.reach_cells + gravity.touch_voxels
+    margin = gravity.beside_cells + 2 * gravity.reach_cells + gravity.touch_voxels
     for k in np.flatnonzero(fits).tolist():
-        mine = slice(starts[k], starts[k + 1] if k + 1 < len(starts) else None)
-        r, c = rows[mine], cols[mine]
+        of_object = slice(starts[k], starts[k + 1] if k + 1 < len(starts) else None)
+        r = rows[of_object]
+        c = cols[of_object]
         if not ((r >= first[0]) & (r < first[0] + TILE_CELLS) & (c >= first[1]) & (c < first[1] + TILE_CELLS)).any():
             continue
         (r0, c0), (r1, c1) = (low[:, k] - margin).tolist(), (high[:, k] + margin).tolist()
@@ -341,7 +370,8 @@ def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iter
 
 
 def _body_of(window: _Window, rows: I64, cols: I64, gravity: Gravity) -> _Body | None:
-    """The inside of the object of deleted cells (n,) of the window, by row, then column; None if it is too small."""
+    """The inside of the object of deleted cells (n,) of the window, by row, then column; None if it is too small, or if
+    all within it is held."""
     # The outline from above: the convex hull of the cells.
     first = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
     last = np.append(first[1:], len(rows)) - 1
@@ -358,12 +388,15 @@ def _body_of(window: _Window, rows: I64, cols: I64, gravity: Gravity) -> _Body |
     inside = np.ones((len(r), len(c)), dtype=np.bool_)
     for across, along, offset in hull.equations:
         inside &= across * r + along * c + offset <= touch
-    # The highest deleted voxel.
-    words = window.deleted[rows, cols]
-    highest = np.floor(np.log2(words.astype(np.float64))).astype(np.int64).clip(0, 63)
-    top = int((window.base[rows, cols] + highest).max()) + touch
+    box = slice(low[0], low[0] + len(r)), slice(low[1], low[1] + inside.shape[1])
+    if not (window.loose[box] & inside).any():
+        return None
+    # How high each of its cells stood.
+    words = window.carried[rows, cols]
+    highest = np.floor(np.log2(np.maximum(words, np.uint64(1)).astype(np.float64))).astype(np.int64).clip(0, 63)
+    tops = np.where(words > 0, window.base[rows, cols] + highest, _NOWHERE_HIGH).astype(np.int32)
     key = int(lattice_key(int(rows[0]) + window.lattice_corner[0], int(cols[0]) + window.lattice_corner[1]))
-    return _Body(np.where(inside, np.int32(top), np.int32(_OUTSIDE)), low, key)
+    return _Body(read_only(inside), low, read_only(rows), read_only(cols), read_only(tops), key)
 
 
 @inlined
@@ -398,40 +431,75 @@ def _label_near(rows: I64, cols: I64, deleted: U64, reach: int, labels: I32, sta
 
 
 @kernel
-def _drop_touching(
-    rest: U64, holds: U64, base: I32, known: Bool, deleted: U64, row0: int, col0: int, lattice_row: int,
-    lattice_col: int, touch: int, longest: int, nowhere: I32, seen: U64, stays: U64, cells: I64, words: U64,
-    asked: Bool, fallen: U64, beside: I64,
-) -> None:  # fmt: skip
-    """Into ``fallen`` and ``beside`` the groups that touch a voxel of ``deleted`` (256, 256) and that nothing holds.
+def _find_carried(deleted: U64, base: I32, ground: int, gap: int, beside: int, carried: U64) -> None:
+    """Into ``carried``, zeros, the deleted voxels to which deleted voxels of the cells at most ``beside`` rows and
+    columns away lead up from the lowest ``ground`` ones, over at most ``gap`` missing layers."""
+    rows, cols = deleted.shape
+    for r in range(rows):
+        for c in range(cols):
+            if deleted[r, c] == 0:
+                continue
+            around = np.uint64(0)
+            for a in range(max(r - beside, 0), min(r + beside + 1, rows)):
+                for b in range(max(c - beside, 0), min(c + beside + 1, cols)):
+                    if deleted[a, b]:
+                        around |= _seen_from(deleted[a, b], base[a, b] - base[r, c])
+            reached = (np.uint64(1) << np.uint64(ground)) - np.uint64(1)
+            grows = True
+            while grows:
+                above = reached
+                for _ in range(gap + 1):
+                    above |= above << np.uint64(1)
+                above &= around
+                grows = above & ~reached != 0
+                reached |= above
+            carried[r, c] = reached & deleted[r, c]
 
-    The other planes are of a window of tiles; ``known`` says which of them are shown. ``row0`` and ``col0`` are the
-    first cell of ``deleted`` in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. ``nowhere`` (0, 0):
-    groups need not be inside anything. ``seen`` and ``stays`` mark the voxels of groups that were followed, and of
-    those that are held; ``cells`` and ``words`` are memory for one group. Into ``asked``, which has one tile more on
-    every side, the tiles that would decide a group.
+
+@kernel
+def _drop_touching(
+    rest: U64, holds: U64, base: I32, known: Bool, deleted: U64, carried: U64, row0: int, col0: int,
+    lattice_row: int, lattice_col: int, touch: int, longest: int, beside_cells: int, seen: U64, stays: U64,
+    cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
+) -> None:  # fmt: skip
+    """Into ``fallen`` and ``beside`` the groups that touch a deleted voxel of one tile and that nothing holds.
+
+    The planes are of a window of tiles; ``known`` says which of them are shown. ``row0`` and ``col0`` are the first
+    cell of the tile in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. Only ``carried`` voxels of the
+    ``deleted`` ones count; cells up to ``beside_cells`` away may carry more of them. ``seen`` and ``stays`` mark the
+    voxels of groups that were followed, and of those that are held; ``cells`` and ``words`` are memory for one group.
+    Into ``asked``, which has one tile more on every side, the tiles that would decide a group.
     """
     rows, cols = rest.shape
-    for i in range(TILE_CELLS):
-        for j in range(TILE_CELLS):
-            if deleted[i, j] == 0:
+    for r in range(row0, row0 + TILE_CELLS):
+        for c in range(col0, col0 + TILE_CELLS):
+            if deleted[r, c] == 0:
                 continue
-            r, c = row0 + i, col0 + j
+            hangs = deleted[r, c] & ~carried[r, c]
             for a in range(r - touch, r + touch + 1):
                 for b in range(c - touch, c + touch + 1):
                     if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
                         asked[a // TILE_CELLS + 1, b // TILE_CELLS + 1] = True
                         continue
-                    near = _seen_from(deleted[i, j], base[r, c] - base[a, b])
+                    loose = rest[a, b] & ~holds[a, b] & ~seen[a, b]
+                    if loose == 0:
+                        continue
+                    if hangs:
+                        for i in range((r - beside_cells) // TILE_CELLS, (r + beside_cells) // TILE_CELLS + 1):
+                            for j in range((c - beside_cells) // TILE_CELLS, (c + beside_cells) // TILE_CELLS + 1):
+                                outside = i < 0 or j < 0 or i >= known.shape[0] or j >= known.shape[1]
+                                if outside or not known[i, j]:
+                                    asked[i + 1, j + 1] = True
+                    near = _seen_from(carried[r, c], base[r, c] - base[a, b])
                     for _ in range(touch):
                         near |= (near << np.uint64(1)) | (near >> np.uint64(1))
-                    near &= rest[a, b] & ~holds[a, b]
+                    near &= loose
                     while near & ~seen[a, b]:
                         start = near & ~seen[a, b]
                         start &= ~start + np.uint64(1)
                         n = _follow(
-                            rest, holds, base, known, a, b, start, nowhere, 0, 0, longest, seen, stays, cells, words,
-                            asked,
+                            rest, holds, base, known, a, b, start, _ANYWHERE, 0, 0, _NO_CELLS, _NO_CELLS, _NO_TOPS,
+                            touch, longest, 0, seen, stays, cells, words, asked,
                         )  # fmt: skip
                         for k in range(n):
                             x, y = cells[k] // cols, cells[k] % cols
@@ -441,23 +509,26 @@ def _drop_touching(
 
 @kernel
 def _drop_inside(
-    rest: U64, holds: U64, base: I32, known: Bool, tops: I32, row0: int, col0: int, key: int, longest: int, seen: U64,
-    stays: U64, cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
+    rest: U64, holds: U64, base: I32, known: Bool, inside: Bool, row0: int, col0: int, body_rows: I64,
+    body_cols: I64, body_tops: I32, key: int, rise: int, longest: int, nearest: int, seen: U64, stays: U64,
+    cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
 ) -> None:  # fmt: skip
-    """Into ``fallen`` and ``beside`` (``key``) the groups inside a body that nothing holds: ``tops`` (h, w) as in
-    :class:`_Body`, from ``row0``, ``col0`` of the window. The rest as in :func:`_drop_touching`."""
+    """Into ``fallen`` and ``beside`` (``key``) the groups inside a body that nothing holds: ``inside`` (h, w) as in
+    :class:`_Body`, from ``row0``, ``col0`` of the window; ``body_rows``, ``body_cols`` and ``body_tops`` (n,) are
+    of its deleted cells. The rest as in :func:`_drop_touching`."""
     cols = rest.shape[1]
-    for i in range(tops.shape[0]):
-        for j in range(tops.shape[1]):
-            if tops[i, j] == _OUTSIDE:
+    for i in range(inside.shape[0]):
+        for j in range(inside.shape[1]):
+            if not inside[i, j]:
                 continue
             a, b = row0 + i, col0 + j
             waiting = rest[a, b] & ~holds[a, b] & ~seen[a, b]
             while waiting:
                 start = waiting & (~waiting + np.uint64(1))
                 n = _follow(
-                    rest, holds, base, known, a, b, start, tops, row0, col0, longest, seen, stays, cells, words, asked
-                )
+                    rest, holds, base, known, a, b, start, inside, row0, col0, body_rows, body_cols, body_tops, rise,
+                    longest, nearest, seen, stays, cells, words, asked,
+                )  # fmt: skip
                 for k in range(n):
                     x, y = cells[k] // cols, cells[k] % cols
                     fallen[x, y] |= words[k]
@@ -467,15 +538,17 @@ def _drop_inside(
 
 @kernel
 def _follow(
-    rest: U64, holds: U64, base: I32, known: Bool, row: int, col: int, start: np.uint64, tops: I32, row0: int,
-    col0: int, longest: int, seen: U64, stays: U64, cells: I64, words: U64, asked: Bool,
+    rest: U64, holds: U64, base: I32, known: Bool, row: int, col: int, start: np.uint64, inside: Bool, row0: int,
+    col0: int, body_rows: I64, body_cols: I64, body_tops: I32, rise: int, longest: int, nearest: int, seen: U64,
+    stays: U64, cells: I64, words: U64, asked: Bool,
 ) -> int:  # fmt: skip
     """How many entries of ``cells`` and ``words`` are the group of a voxel that falls; 0 if it stays or is undecided.
 
-    With ``tops`` the group must be inside them; if it is not, it is not ``seen`` either.
+    With ``inside`` the group must be within it and begin no higher than its body's top; if it is not, it is not
+    ``seen`` either.
     """
     rows, cols = rest.shape
-    wide, confined = cols // TILE_CELLS + 2, tops.shape[0] > 0
+    wide, confined = cols // TILE_CELLS + 2, inside.shape[0] > 0
     low_row, high_row, low_col, high_col = row, row, col, col
     seen[row, col] |= start
     cells[0], words[0] = row * cols + col, start
@@ -486,7 +559,15 @@ def _follow(
             lowest = 0
             while not words[done] >> np.uint64(lowest) & np.uint64(1):
                 lowest += 1
-            begins = base[r, c] + lowest <= tops[r - row0, c - col0]
+            # The top of the body there: by its cells little farther away than the nearest one.
+            away = np.inf
+            for k in range(len(body_rows)):
+                away = min(away, float((body_rows[k] - r) ** 2 + (body_cols[k] - c) ** 2))
+            farthest, top = (np.sqrt(away) + nearest) ** 2, _NOWHERE_HIGH
+            for k in range(len(body_rows)):
+                if (body_rows[k] - r) ** 2 + (body_cols[k] - c) ** 2 <= farthest:
+                    top = max(top, body_tops[k])
+            begins = base[r, c] + lowest <= top + rise
         for a in range(r - 1, r + 2):
             for b in range(c - 1, c + 2):
                 if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
@@ -499,7 +580,7 @@ def _follow(
                 if near:
                     i, j = a - row0, b - col0
                     if confined and (
-                        i < 0 or j < 0 or i >= tops.shape[0] or j >= tops.shape[1] or tops[i, j] == _OUTSIDE
+                        i < 0 or j < 0 or i >= inside.shape[0] or j >= inside.shape[1] or not inside[i, j]
                     ):
                         leaves = True
                         continue

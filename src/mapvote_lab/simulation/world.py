@@ -306,13 +306,13 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
 
 def _overhead(scenario: Scenario, bodies: list[Body], terrain: Terrain, rng: np.random.Generator) -> list[Body]:
     """Objects over the street, and over those of its ``bodies`` that are removed."""
-    found = []
+    hanging = []
     for kind, triangles, s, side in overhead.across(scenario.overhead):
-        found.append(Body(kind, Side(0.0, terrain.axis_y, 0.0, side, ()).put(triangles, s, 0.0, terrain)))
+        hanging.append(Body(kind, Side(0.0, terrain.axis_y, 0.0, side, ()).put(triangles, s, 0.0, terrain)))
     gone = [body for body in bodies if body.role == Role.REMOVED] if scenario.overhead.over_demolished else []
     for house in gone:
-        found += [Body(kind, hangs) for kind, hangs in overhead.over_house(house.triangles, rng).items()]
-    return found
+        hanging += [Body(kind, body) for kind, body in overhead.over_house(house.triangles, rng).items()]
+    return hanging
 
 
 def _parked_cars(scenario: Scenario, terrain: Terrain, rng: np.random.Generator) -> list[Body]:
