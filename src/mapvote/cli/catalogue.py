@@ -56,12 +56,12 @@ def _write(folder: Path, point_map: PointMap, about: Mapping[str, Any], *, has_c
     """The cloud and the item of one version."""
     from mapvote.formats import box_of, export_map
     from mapvote.formats.geo.frame import frame_of
-    from mapvote.formats.geo.stac import CLOUD, MapVersion, name_of_item, write_item
+    from mapvote.formats.geo.stac import CLOUD_ASSET, MapVersion, name_of_item, write_item
 
     home = folder / name_of_item(about["number"])
     home.mkdir(parents=True, exist_ok=True)
     with waiting(f"writing version {about['number']}"):
-        export_map(point_map, home / CLOUD)
+        export_map(point_map, home / CLOUD_ASSET)
         corners, frame = box_of(home, point_map), frame_of(point_map.georeference)
         created = about["created"]
         version = MapVersion(about["number"], created, about["parent"], point_map.n_points, corners, frame, has_changes)

@@ -22,7 +22,8 @@ _EXTENSIONS = [
     "https://stac-extensions.github.io/pointcloud/v2.0.0/schema.json",
     "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
 ]
-CLOUD, CHANGES = "cloud.copc.laz", "changes.geojson"
+CLOUD_ASSET = "cloud.copc.laz"
+CHANGES = "changes.geojson"
 """Names of an item's files."""
 
 
@@ -67,7 +68,7 @@ def stac_item(version: MapVersion) -> dict[str, Any]:
         place = _place(version)
     assets = {
         "cloud": {
-            "href": f"./{CLOUD}",
+            "href": f"./{CLOUD_ASSET}",
             "type": "application/vnd.laszip+copc",
             "title": "all points",
             "roles": ["data"],
