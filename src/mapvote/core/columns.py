@@ -7,15 +7,30 @@ stands for everything from there upwards. Neighbouring cells are compared by shi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, read_only
 
-GROUND_MARGIN_M = 0.3
-"""Points lower than this above the ground are ground: they never make a cell occupied (docs/method.md)."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class ColumnRule:
+    """Columns above the ground."""
+
+    ground_margin_m: float = 0.3
+    """Height above the ground below which points are ground, metres: they never make a cell occupied
+    (docs/method.md)."""
+
+
+COLUMN_RULE = ColumnRule()
+# Kernels take no records: they read these names.
+GROUND_MARGIN_M = COLUMN_RULE.ground_margin_m
 TOP_BIT = 63
 
 

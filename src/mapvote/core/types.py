@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mapvote.core.grid import Grid
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 
 F32 = NDArray[np.float32]
@@ -71,9 +72,20 @@ class CellState(IntEnum):
     UNDETERMINED = 4
 
 
-PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
-"""A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place
-to 2 cm without an attitude would turn scans to where they hit it: .4 deg, .1 m at 10 m."""
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class PrecisePrior:
+    """A surveyor's prior, at least this good in both: it guides each registration and holds the map's frame. A place to
+    2 cm without an attitude would turn scans to where they hit it: .4 deg, .1 m at 10 m."""
+
+    position_m: float = 0.1
+    """Standard deviation of the position, metres."""
+    attitude_deg: float = 0.2
+    """Standard deviation of the attitude, degrees."""
+
+
+PRECISE_PRIOR = PrecisePrior()
+
 N_STATES = len(CellState)
 NO_VOTE = 255
 """In a uint8 state grid: never seen, or invalid. Not the same as UNDETERMINED."""
@@ -217,7 +229,7 @@ class Drive:
     @property
     def has_precise_prior(self) -> bool:
         """Whether its prior is a surveyor's."""
-        good = self.prior_sigma_m <= PRECISE_PRIOR_M and self.prior_sigma_deg <= PRECISE_PRIOR_DEG
+        good = self.prior_sigma_m <= PRECISE_PRIOR.position_m and self.prior_sigma_deg <= PRECISE_PRIOR.attitude_deg
         return self.T_map_lidar_prior is not None and self.prior_sigmas is None and good
 
     def __len__(self) -> int:

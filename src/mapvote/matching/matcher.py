@@ -9,6 +9,7 @@ A matcher lays a finished map out around a vehicle (:class:`MapAround`) and answ
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Protocol
@@ -16,10 +17,21 @@ from typing import Any, Protocol
 import numpy as np
 
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Bool, MapvoteError, PosePrior, Registration
 
-SETTLED = 0.05, 0.01
-"""A step shorter than this share of a level's floor has converged: on the way, and at the finest level."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """End of the steps at one level."""
+
+    settled: tuple[float, float] = 0.05, 0.01
+    """Steps, as shares of a level's floor, below which an alignment has converged: on the way, and at the finest
+    level."""
+
+
+CONVERGENCE = Convergence()
 
 
 class LocalMatcher(Protocol):
@@ -36,11 +48,11 @@ class LocalMatcher(Protocol):
         T_map_lidar_guess: F64,
         prior: PosePrior | None = None,
         first_level: int = 0,
-        settled: tuple[float, float] = SETTLED,
+        settled: tuple[float, float] = CONVERGENCE.settled,
     ) -> Registration:
-        """The pose of a scan from a guess. ``first_level``: the coarsest level that the guess needs. ``settled``: as
-        :data:`SETTLED`, for a hurried look. Never raises for bad overlap: then score and inlier share are low, and the
-        caller abstains."""
+        """The pose of a scan from a guess. ``first_level``: the coarsest level that the guess needs. ``settled``: see
+        :class:`Convergence`; larger for a hurried look. Never raises for bad overlap: then score and inlier share are
+        low, and the caller abstains."""
         ...
 
     def likelihood(self, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:

@@ -16,7 +16,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, PosePrior, Registration
-from mapvote.matching.matcher import SETTLED
+from mapvote.matching.matcher import CONVERGENCE
 from mapvote.matching.ndt import align, likelihoods, room_for
 from mapvote.matching.ndt_voxels import LEVELS, SEVEN, Level, NdtGrid, Voxels, window_of
 
@@ -98,7 +98,7 @@ class NdtMap:
         T_map_lidar_guess: F64,
         prior: PosePrior | None = None,
         first_level: int = 0,
-        settled: tuple[float, float] = SETTLED,
+        settled: tuple[float, float] = CONVERGENCE.settled,
     ) -> Registration:
         """See :class:`mapvote.matching.matcher.LocalMatcher`. ``prior`` enters as a factor at the finest level."""
         T = np.array(T_map_lidar_guess, dtype=np.float64)

@@ -34,15 +34,13 @@ class Level:
     """Most Gauss-Newton steps at this level."""
 
 
-LEVELS = Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15)
-"""Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
-
-
 @record(votes=True)
 @dataclass(frozen=True, slots=True)
 class NdtVoxelRule:
-    """Voxels that have a distribution."""
+    """Levels of voxels, and voxels that have a distribution."""
 
+    levels: tuple[Level, ...] = (Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15))
+    """Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
     min_points: int = 3
     """Points of a voxel with a distribution, at least: two make a line."""
     flatness: float = 0.08
@@ -50,6 +48,7 @@ class NdtVoxelRule:
 
 
 NDT_VOXEL_RULE = NdtVoxelRule()
+LEVELS = NDT_VOXEL_RULE.levels
 # Kernels take no records: they read these names.
 MIN_POINTS = NDT_VOXEL_RULE.min_points
 FLATNESS = NDT_VOXEL_RULE.flatness

@@ -15,7 +15,7 @@ import numpy as np
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.record import record
 from mapvote.core.types import F64, Bool
-from mapvote.matching.matcher import SETTLED, LocalMatcher
+from mapvote.matching.matcher import CONVERGENCE, LocalMatcher
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import in_rows
 
@@ -152,7 +152,7 @@ class Judge:
         on_the_way = in_rows(few[:: self.check.quick_every if quick else 1])
         clouds = [*[on_the_way] * (len(LEVELS) - 1), in_rows(few)]
         starts = [*unsettled, *(guess for _, guess in peaks[: self.check.refined])]
-        settled = self.check.quick_settled if quick else SETTLED
+        settled = self.check.quick_settled if quick else CONVERGENCE.settled
         return [around.refine(clouds, start, settled=settled).T_map_lidar for start in starts]
 
 

@@ -19,7 +19,7 @@ from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Bool, PosePrior, Registration
-from mapvote.matching.matcher import SETTLED
+from mapvote.matching.matcher import CONVERGENCE
 
 
 @record(votes=True)
@@ -112,7 +112,7 @@ class VgicpMap:
         T_map_lidar_guess: F64,
         prior: PosePrior | None = None,
         first_level: int = 0,
-        settled: tuple[float, float] = SETTLED,
+        settled: tuple[float, float] = CONVERGENCE.settled,
     ) -> Registration:
         """See :class:`mapvote.matching.matcher.LocalMatcher`. The finest cloud alone is used; ``prior`` is weighed
         against the scan by their information afterwards."""

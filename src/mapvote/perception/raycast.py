@@ -38,7 +38,6 @@ class RayRule:
 
 
 RAY_RULE = RayRule()
-# Kernels take no records: they read these names.
 CLEARANCE_M = RAY_RULE.clearance_m
 
 

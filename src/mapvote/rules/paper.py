@@ -11,6 +11,7 @@ Tables II to IV; docs/method.md says why.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import get_args
 
@@ -22,6 +23,7 @@ from mapvote.core.columns import EVERY_BIT, below_top, span_of
 from mapvote.core.grid import CELL_SIZE, Grid, TileIndex, window_around
 from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError, Reference
 from mapvote.core.voting import VOTE_UNIT, plurality, weight_table
@@ -29,8 +31,19 @@ from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
 from mapvote.rules.voter import Tally, TileVotes
 
-COUNTED_POINTS = 15
-"""Points are counted up to this number, where Eq. (1) has reached its bound."""
+
+@record(votes=True)
+@dataclass(frozen=True, slots=True)
+class PaperCounts:
+    """Counts of the paper's rule."""
+
+    counted_points: int = 15
+    """Number up to which points are counted, where Eq. (1) has reached its bound."""
+
+
+PAPER_COUNTS = PaperCounts()
+# Kernels take no records: they read these names.
+COUNTED_POINTS = PAPER_COUNTS.counted_points
 CLEAR, CLEAR_OF_CELLS, BEFORE_FARTHEST, THROUGH_COLUMN, FIRED = (1 << k for k in range(4, 9))
 """Bits of a word: no return above the ground before the cell; no return in an occupied cell before it; not behind the
 farthest return; a ray through the heights in which the map has points; any ray in this direction. Movers occlude."""

@@ -98,7 +98,6 @@ class NewPointsRule:
 
 NEW_POINTS_RULE = NewPointsRule()
 # Kernels take no records: they read these names.
-_COMPACT_AT = NEW_POINTS_RULE.sorted_together
 REACH_M = NEW_POINTS_RULE.reach_m
 
 
@@ -205,13 +204,13 @@ class NewPoints:
             sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
             self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
             self._count += len(points_map)
-            if self._count > _COMPACT_AT:
+            if self._count > NEW_POINTS_RULE.sorted_together:
                 self._compact()
 
     def _compact(self) -> None:
         """Sort the points since the last run into a new run, together with the last run if that is still small."""
         run = self._one_a_voxel([*self._short(), *self._waiting])
-        self._last = run if len(run) < _COMPACT_AT else None
+        self._last = run if len(run) < NEW_POINTS_RULE.sorted_together else None
         if self._last is None:
             for tile, points in self._of_tiles(run).items():
                 self._runs[tile].append(self._shelf.put(points.tobytes()))

@@ -21,7 +21,7 @@ import scipy
 
 from mapvote.core.geometry import transform
 from mapvote.core.record import record
-from mapvote.core.types import F64, PRECISE_PRIOR_DEG, Bool, Drive
+from mapvote.core.types import F64, PRECISE_PRIOR, Bool, Drive
 
 
 @record()
@@ -140,7 +140,7 @@ class WrongAttitude:
     @property
     def sigma_deg(self) -> float:
         """Sigma that the drive should state: at least its pitch, and too coarse for a surveyor's."""
-        return max(round(abs(self.pitch_deg) + 0.05, 1), PRECISE_PRIOR_DEG + 0.1)
+        return max(round(abs(self.pitch_deg) + 0.05, 1), PRECISE_PRIOR.attitude_deg + 0.1)
 
 
 def wrong_attitude(

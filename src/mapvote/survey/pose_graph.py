@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
 from mapvote.core.record import record
 from mapvote.core.sensor_height import NO_HEIGHTS, Heights
-from mapvote.core.types import F64, I64, PRECISE_PRIOR_M, Bool, Drive
+from mapvote.core.types import F64, I64, PRECISE_PRIOR, Bool, Drive
 from mapvote.survey.driven_road import WrongAttitude
 
 
@@ -295,7 +295,7 @@ def _anchors(drives: Sequence[Drive], T: F64, starts: I64, numbers: PoseSettling
             drive.T_map_lidar_prior,
             slack * drive.prior_sigma_m,
             sigma_rad if not drive.has_precise_prior else slack * float(np.radians(drive.prior_sigma_deg)),
-            stated_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
+            stated_m=max(drive.prior_sigma_m, PRECISE_PRIOR.position_m),
         )
         out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.stated_m, numbers)))
     return out
