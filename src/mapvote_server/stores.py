@@ -29,8 +29,8 @@ from mapvote_server.store.integrity import check
 from mapvote_server.store.keys import listed
 from mapvote_server.store.store import Store, url_of
 
-_MEND = "mapvote check STORE --mend --from BACKUP"
-_LISTED = 5
+_STORE_MEND = "mapvote check STORE --mend --from BACKUP"
+_DAMAGE_LISTED = 5
 """Damaged records of one kind that are listed one by one."""
 _SIZES = "tiles", "ballots", "vehicles", "plane_bytes"
 
@@ -124,16 +124,16 @@ def check_store(store: Store) -> list[Finding]:
     damaged = check(store)
     found = []
     for kind, count in Counter(damage.kind for damage in damaged).items():
-        some = [damage for damage in damaged if damage.kind == kind][:_LISTED]
-        found += [Finding("error", f"damaged: {damage}", _MEND) for damage in some]
-        if count > _LISTED:
-            found.append(Finding("error", f"damaged: {count - _LISTED} more of the kind {kind}", _MEND))
+        some = [damage for damage in damaged if damage.kind == kind][:_DAMAGE_LISTED]
+        found += [Finding("error", f"damaged: {damage}", _STORE_MEND) for damage in some]
+        if count > _DAMAGE_LISTED:
+            found.append(Finding("error", f"damaged: {count - _DAMAGE_LISTED} more of the kind {kind}", _STORE_MEND))
     glance = overview(store)
     sizes = ", ".join(f"{getattr(glance, key):,} {key.replace('_', ' ')}" for key in _SIZES)
     found.append(Finding("note", f"version {glance.version}: {sizes}"))
     if glance.quarantined:
         what = f"{glance.quarantined} damaged things were set aside: their votes and tiles do not count"
-        found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
+        found.append(Finding("warning", what, f"{_STORE_MEND} brings back what a backup has"))
     valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
     if valid["operator"]:
         roles = ", ".join(f"{count} {role}" for role, count in sorted(valid.items()))
@@ -145,4 +145,4 @@ def check_store(store: Store) -> list[Finding]:
         newest = store.point_map()
         return in_order([*found, *check_cloud(tile_by_tile(newest), classified_ground(newest)), *check_map(newest)])
     except MapvoteError as error:
-        return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])
+        return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _STORE_MEND)])

@@ -43,7 +43,7 @@ class LocalisedRules:
 
 
 LOCALISED_RULES = LocalisedRules()
-_MEND = (
+_PLACE_MEND = (
     "see `mapvote doctor DRIVE --map MAP`: are the scans in order, and is the prior of this drive and in this frame?"
 )
 
@@ -152,7 +152,7 @@ def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRu
     scans, sure = int(on_map.sum()), int(drive.sure.sum())
     if scans >= rules.least_scans and sure < rules.least_share * scans:
         what = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
-        yield Finding("error", what, f"is it the map of this street? {_MEND}")
+        yield Finding("error", what, f"is it the map of this street? {_PLACE_MEND}")
 
 
 def _leaps(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
@@ -164,7 +164,7 @@ def _leaps(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator
         worst = int(np.argmax(np.where(leaps, step_m, 0.0)))
         times = "once" if leaps.sum() == 1 else f"{int(leaps.sum())} times, most"
         what = f"the localised path leaps {times} before scan {found[worst + 1]} "
-        yield Finding("error", f"{what}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _MEND)
+        yield Finding("error", f"{what}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _PLACE_MEND)
 
 
 def _ways(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
@@ -184,7 +184,7 @@ def _ways(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[
     if np.median(np.abs(came_m - believed_m) - slack_m) > 0.0:
         apart_m = float(np.median(np.abs(came_m - believed_m)))
         what = f"over pieces of {piece:.0f} m the way found and the way by the prior differ by {apart_m:.1f} m (median)"
-        yield Finding("error", what, _MEND)
+        yield Finding("error", what, _PLACE_MEND)
 
 
 def _attitude(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
@@ -194,7 +194,7 @@ def _attitude(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Itera
     median_deg = float(np.median(apart_deg))
     if median_deg > rules.turn_deg + 4.0 * drive.sigma_deg:
         what = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the one found"
-        yield Finding("error", what, f"are the axes of prior and points the same (x forward, z up)? {_MEND}")
+        yield Finding("error", what, f"are the axes of prior and points the same (x forward, z up)? {_PLACE_MEND}")
 
 
 def _positions(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
@@ -203,4 +203,4 @@ def _positions(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iter
     scatter_m = float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
     if scatter_m > rules.off_m + 4.0 * drive.sigma_m:
         what = f"the prior lies {scatter_m:.1f} m (median) about its mean difference from the places found, but states "
-        yield Finding("error", f"{what}{drive.sigma_m:.2f} m", _MEND)
+        yield Finding("error", f"{what}{drive.sigma_m:.2f} m", _PLACE_MEND)

@@ -67,7 +67,7 @@ class Sheet:
         return f'<div class="scroll"><table><caption>{escape(self.title)}</caption>{body}</table></div>'
 
 
-_STYLE = """
+_PAGE_STYLE = """
 :root { color-scheme: light; }
 body { margin: 0 auto; max-width: 1080px; padding: 2rem 1.5rem 4rem; background: #fff; color: #22303c;
        font: 16px/1.55 system-ui, "DejaVu Sans", sans-serif; }
@@ -114,7 +114,7 @@ def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequ
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-        f"<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n"
+        f"<style>{_PAGE_STYLE}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n"
         f'<p class="lead">{escape(lead)}</p>\n<div class="facts">{cards}</div>\n{body}\n</body>\n</html>\n'
     )
 

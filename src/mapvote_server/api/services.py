@@ -74,7 +74,7 @@ class RateLimit:
         return min(self._burst, tokens + (now - then) * self._per_s)
 
 
-_MEND = "send a shorter drive, or raise [server] max_body_bytes"
+_SIZE_MEND = "send a shorter drive, or raise [server] max_body_bytes"
 
 
 class Uploads:
@@ -96,7 +96,7 @@ class Uploads:
         """A whole body. TooLarge beyond the limit for one; TooMany if the vehicle sends more than it may at a time;
         Unavailable if this one was dropped; MapvoteError if the client disconnected."""
         if declared is not None and declared.isdigit() and int(declared) > self._each:
-            raise TooLarge(f"the body has {declared[:20]} bytes, the limit is {self._each}: {_MEND}")
+            raise TooLarge(f"the body has {declared[:20]} bytes, the limit is {self._each}: {_SIZE_MEND}")
         if self._of[vehicle] >= self.AT_ONCE:
             raise TooMany(f"{vehicle[:64]!r} sends {self.AT_ONCE} ballots already: wait until these are answered")
         upload = _Upload()
@@ -124,7 +124,7 @@ class Uploads:
         if upload not in self._under_way:
             raise Unavailable("too many large ballots are on their way at once: send this one again")
         if upload.size > self._each:
-            raise TooLarge(f"the body is larger than {self._each} bytes: {_MEND}")
+            raise TooLarge(f"the body is larger than {self._each} bytes: {_SIZE_MEND}")
 
     def _forget(self, upload: _Upload) -> None:
         """Free its memory at once, even if its sender stays connected."""
