@@ -21,6 +21,7 @@ from mapvote_server.api.schemas import (
     Ask,
     DeskAnswer,
     Pending,
+    SeqOfBody,
     TableOrMap,
     VerdictGiven,
     as_json,
@@ -41,7 +42,7 @@ class ReviewAsk(Ask):
     change: str = Field(max_length=100, pattern=PLAIN, description="id of a change on the desk")
     verdict: Literal["accepted", "held", "rejected"]
     comment: str = Field(default="", max_length=300, pattern=PLAIN)
-    after: int | None = Field(default=None, ge=0, le=MOST_SEQ, description="the verdict that it had when you looked")
+    after: SeqOfBody | None = Field(default=None, description="the verdict that it had when you looked")
 
 
 @router.get(

@@ -15,7 +15,7 @@ import msgspec
 from fastapi import Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.core.types import MapvoteError
@@ -78,6 +78,16 @@ Metres = Annotated[float, Query(description="in the map's frame", json_schema_ex
 """A range that is declared only, as that of days: the store's own refusal says more than FastAPI's."""
 
 
+def _whole(value: object) -> object:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+VersionOfBody = Annotated[int, Field(ge=LEAST, le=MOST), BeforeValidator(_whole)]
+"""A version in a body. JSON has numbers only: 1.0 is an integer, too."""
+SeqOfBody = Annotated[int, Field(ge=0, le=MOST_SEQ), BeforeValidator(_whole)]
+"""As :data:`VersionOfBody`, of an event."""
+
+
 class Ask(BaseModel):
     """A body; members that it does not name are refused, and so are values of another JSON type."""
 
@@ -92,7 +102,7 @@ class PublishAsk(Ask):
 
     dry_run: bool = False
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
-    parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
+    parent: VersionOfBody | None = Field(default=None, description="only if this is still the newest version")
     reason: Reason = ""
 
 
@@ -145,7 +155,7 @@ class RevokeAsk(Ask):
 class RollbackAsk(Ask):
     """The version to go back to."""
 
-    to: int = Field(ge=LEAST, le=MOST)
+    to: VersionOfBody
     reason: Reason = ""
 
 

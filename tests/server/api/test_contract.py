@@ -84,6 +84,12 @@ def test_a_number_that_no_version_can_have_is_422_wherever_it_stands(client: Tes
     assert client.post("/v1/rollback", json={"to": int(number)}).status_code == 422
 
 
+def test_a_whole_number_may_have_a_fraction_of_zero_as_json_has_one_kind_of_number(client: TestClient) -> None:
+    assert client.post("/v1/rollback", json={"to": 7.0}).status_code == 404
+    assert client.post("/v1/publish", json={"parent": 1.0, "dry_run": True}).status_code == 200
+    assert client.post("/v1/rollback", json={"to": 1.5}).status_code == 422
+
+
 @pytest.mark.parametrize("path", ["keys", "keys/rotate", "keys/revoke"])
 @pytest.mark.parametrize("name", ["", "../x", "a b", "a" * 65, ".a"])
 def test_a_name_that_cannot_be_one_is_422_by_its_pattern(client: TestClient, path: str, name: str) -> None:
