@@ -46,7 +46,7 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 <link rel="stylesheet" href="viewer/pages.css"></head>
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
-_STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
+_STYLE_LINK = b'<link rel="stylesheet" href="viewer/pages.css">'
 _PRELOADED = b'<link rel="modulepreload" href="viewer/%s">'
 _OF_A_FILE = "standalone.js", "bundle.js"
 """Modules of a page that lies in a file of its own."""
@@ -187,5 +187,5 @@ def _index() -> bytes:
 def _page(request: Request, text: bytes) -> Response:
     """A page, with a warning at its end if the server needs no key."""
     if request.state.key is None:
-        text = text.replace(b"</head>", _STYLE + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
+        text = text.replace(b"</head>", _STYLE_LINK + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
     return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache"})
