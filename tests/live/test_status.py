@@ -165,7 +165,7 @@ def test_a_reader_that_takes_nothing_does_not_end_the_drive(caplog: pytest.LogCa
 
     ros = RosStatus(SimpleNamespace(publish=lambda *_, **__: SimpleNamespace(send=refused)), "car")  # type: ignore[arg-type]
     fixed = [Fixed(10**9, np.eye(4), np.zeros((6, 6), np.float32))] * 2
-    live = SimpleNamespace(fixes=deque(fixed), T_base_lidar=np.eye(4))
+    live = SimpleNamespace(fixes=deque(fixed), T_base_upright=np.eye(4))
     ros.poses(live, SimpleNamespace(map_frame="map"))  # type: ignore[arg-type]
     assert not live.fixes
     assert caplog.messages == ["DDS refuses a message"]

@@ -17,6 +17,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
+from mapvote.core.mount import Mount
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Drive, MapvoteError, PosePrior, Scan
@@ -27,7 +28,7 @@ from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.formats.drives.fixes import FIX_RULES, Fixes
 from mapvote.live.log_lines import Repeated
 from mapvote.live.outbox import Outbox
-from mapvote.live.priors import Priors, pose_in
+from mapvote.live.priors import Priors, pose_in, turned_by
 from mapvote.live.road_map import Maps
 from mapvote.live.thinning import THINNING, Thinning
 from mapvote.vehicle import ClosedStretch, Cuts, RoadDriven, Vehicle, stretch_name
@@ -201,6 +202,8 @@ class LiveDrive:
         end."""
         self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
         self.T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
+        self.mount: Mount | None = None
+        """The mount by which scans are turned upright; None: they are as measured."""
         self._place: F64 | None = None
         """(3,) where the last scan was that has a place, map metres."""
         self._is_lost = False
@@ -238,6 +241,11 @@ class LiveDrive:
     def drive_id(self) -> str:
         """Identifier of the open ballot."""
         return stretch_name(self.name, self.number)
+
+    @property
+    def T_base_upright(self) -> F64:
+        """(4, 4) T_base_lidar of the axes in which scans are given."""
+        return self.T_base_lidar if self.mount is None else np.asarray(self.T_base_lidar @ self.mount.C.T)
 
     @property
     def place(self) -> F64 | None:
@@ -476,7 +484,8 @@ class LiveDrive:
             self._release()
 
     def _prior(self, time_ns: int) -> F64 | PosePrior | None:
-        return self._priors.at(time_ns, self.T_base_lidar)
+        # The mount last, as in a recorded drive: equal to the last bit.
+        return turned_by(self._priors.at(time_ns, self.T_base_lidar), self.mount)
 
 
 def _sure_pose(prior: F64 | PosePrior | None) -> F64 | None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapvote.core.mount import Mount
 from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError, PosePrior
 from mapvote.formats.drives.fixes import Fixes, prior_at
@@ -86,3 +87,12 @@ class Priors:
 def pose_in(prior: F64 | PosePrior | None) -> F64 | None:
     """T_map_lidar (4, 4) of a prior, with or without its own standard deviations."""
     return prior.T_map_lidar if isinstance(prior, PosePrior) else prior
+
+
+def turned_by(prior: F64 | PosePrior | None, mount: Mount | None) -> F64 | PosePrior | None:
+    """A prior of scans that are turned upright by ``mount``, as :meth:`mapvote.core.mount.Mount.turned` has it."""
+    if prior is None or mount is None:
+        return prior
+    if isinstance(prior, PosePrior):
+        return replace(prior, T_map_lidar=prior.T_map_lidar @ mount.C.T)
+    return np.asarray(prior @ mount.C.T)

@@ -198,16 +198,18 @@ def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -
     def make_vehicle(point_map: PointMap) -> Vehicle:
         return Vehicle(plan.vehicle, sensor, point_map, plan.settings)
 
-    return LiveDrive(
+    live = LiveDrive(
         make_vehicle,
         maps,
         outbox,
         name=plan.name,
         cuts=plan.cuts,
         with_poses=topics.chosen.odometry is not None,
-        T_base_lidar=None if plan.T_base_lidar is None else _upright(plan.T_base_lidar, topics),
+        T_base_lidar=plan.T_base_lidar,
         first=FirstSeconds(topics.sensor_told) if plan.checked else None,
     )
+    live.mount = topics.mount
+    return live
 
 
 def _mounted(live: LiveDrive, topics: Subscriptions, plan: Plan) -> bool:
@@ -220,13 +222,8 @@ def _mounted(live: LiveDrive, topics: Subscriptions, plan: Plan) -> bool:
         return True
     T = topics.T_base_lidar()
     if T is not None:
-        live.T_base_lidar = _upright(T, topics)
+        live.T_base_lidar = T
     return T is not None
-
-
-def _upright(T_base_lidar: F64, topics: Subscriptions) -> F64:
-    """T_base_lidar (4, 4) of a LiDAR in the axes in which scans are given."""
-    return T_base_lidar if topics.mount is None else np.asarray(T_base_lidar @ topics.mount.C.T)
 
 
 class Needs:

@@ -245,7 +245,7 @@ class RosStatus:
         while live.fixes:
             fixed = live.fixes.popleft()
             message = blank_message(POSE, header=header_of(fixed.stamp_ns, topics.map_frame or "map"))
-            message.pose.pose = pose_of(fixed.T_map_lidar @ inverse(live.T_base_lidar))
+            message.pose.pose = pose_of(fixed.T_map_lidar @ inverse(live.T_base_upright))
             message.pose.covariance = fixed.covariance.astype(np.float64).ravel()
             self._send(self._poses, to_cdr(POSE, message))
 
