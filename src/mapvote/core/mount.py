@@ -111,10 +111,13 @@ def mount_of_drive(drive: Drive) -> Mount | None:
 
 
 def _rotations(step_deg: int) -> F64:
-    """(n, 3, 3) rotations by roll, pitch and yaw in steps about each axis, and their inverses."""
+    """(n, 3, 3) rotations by roll, pitch and yaw in steps about each axis, and their inverses. Quarter turns are exact:
+    they round nothing, in whatever order matrices are multiplied."""
     angles = np.radians(np.arange(0, 360, step_deg)).tolist()
     poses = [from_xyz_rpy(0.0, 0.0, 0.0, *rpy) for rpy in product(angles, repeat=3)]
     rotations = np.array(poses)[:, :3, :3]
+    whole = np.round(rotations)
+    rotations = np.where(np.abs(rotations - whole) < 1e-9, whole, rotations)
     return np.concatenate([rotations, rotations.swapaxes(1, 2)])
 
 

@@ -21,5 +21,5 @@ def upright(drive: Drive) -> tuple[Drive, Mount | None]:
     mount = mount.in_steps()
     turned = mount.turned(drive)
     measured = drive.sensor_told.startswith("measured")
-    middle = turned.read_scan(len(turned) // 2).by_lidar()[0][1]
-    return replace(turned, sensor=sensor_upright(drive.sensor, measured, middle, mount.lean_deg)), mount
+    first = turned.read_scan(0).by_lidar()[0][1]  # as a live drive measures it
+    return replace(turned, sensor=sensor_upright(drive.sensor, measured, first, mount.lean_deg)), mount
