@@ -33,6 +33,15 @@ def chained(T: F64) -> F64:
     return np.array(out)
 
 
+def rows_later(T: F64, scans: int) -> F64:
+    """The rows of other scans, so many later; beyond the ends the vehicle goes on as it drives there."""
+    if scans < 0:
+        return rows_later(T[::-1], -scans)[::-1]
+    step = T[0] @ inverse(T[1])
+    before = [np.linalg.matrix_power(step, k) @ T[0] for k in range(scans, 0, -1)]
+    return np.concatenate([np.array(before).reshape(-1, 4, 4), T])[: len(T)]
+
+
 def without(r: Recording, numbers: Iterable[int]) -> Recording:
     """The drive with these scans left out by --scans."""
     left_out = set(numbers)
@@ -64,6 +73,8 @@ ADVICE: list[tuple[str, str, Callable[[re.Match[str], re.Match[str]], Mend]]] = 
      lambda w, m: points(turned(pitch=float(w[1])))),
     (r"", r"turn the points back by the prior's rotation", lambda w, m: lambda r: replace(
         r, scans=[np.column_stack([s[:, :3] @ T[:3, :3], s[:, 3:]]) for s, T in zip(r.scans, r.T, strict=True)])),
+    (r"", r"give poses without rotation", lambda w, m: rotations(lambda R: np.broadcast_to(np.eye(3), R.shape))),
+    (r"", rf"shift its rows by {NUMBER} scans", lambda w, m: poses(lambda T: rows_later(T, int(m[1])))),
     (rf"divide x, y, z by {NUMBER}", r"", lambda w, m: points(lambda p: p / float(w[1]))),
     (rf"multiply x, y, z by {NUMBER}", r"", lambda w, m: points(lambda p: p * float(w[1]))),
     (rf"positions are {NUMBER} times", r"multiply the points by that", lambda w, m: points(lambda p: p * float(w[1]))),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -72,6 +72,14 @@ class MapFitRule:
     """Surroundings of the drive that are used, metres: the range of its scans, and then some."""
     fewest: int = 1000
     """Points of a map around a drive, at least."""
+    least_mps: float = 2.0
+    """Mean speed of a drive from which on a shift may be one of time, metres per second."""
+    straight: float = 0.9
+    """Least share of the way driven that lies between its ends, of a drive whose shift may be one of time."""
+    beside: float = 0.25
+    """Greatest part of such a shift across the road, as a share of that along it."""
+    least_rows: int = 2
+    """Rows that a shift of time is at least."""
 
 
 MAP_FIT_RULE = MapFitRule()
@@ -424,10 +432,46 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
         return Finding("note", what + more)
     parts = ", ".join(words for words, _, _ in surely)
     what = f"the map is {parts} against the prior, at the middle of the drive ({places} places)"
+    along = _as_time(d, drive) if any(words is shift for words, _, _ in surely) else None
+    if along is not None:
+        what += f"; that lies along the road: or the prior's rows are {abs(along.late_s):.1f} s {along.word}"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
     if any(words is scale for words, _, _ in surely):
         mend = f"if the map is right, multiply their points by {d.scale:.4f}; else the map's by {1.0 / d.scale:.4f}"
+    if along is not None:
+        mend += f"; or shift its rows by {along.scans} scans"
     return Finding("error" if any(by > error for _, by, error in surely) else "warning", what, mend)
+
+
+class _Along(NamedTuple):
+    """A shift along the road, as the time in which the vehicle drives it."""
+
+    late_s: float
+    """By how much the prior is late; negative: early."""
+    scans: int
+    """How many rows later the rows of the scans stand."""
+
+    @property
+    def word(self) -> str:
+        return "late" if self.late_s > 0.0 else "early"
+
+
+def _as_time(d: Similarity, drive: Drive, rules: MapFitRule = MAP_FIT_RULE) -> _Along | None:
+    """The shift of a prior that drives straight ahead, as a time; None if it does not lie along its way."""
+    T, stamps_ns = drive.T_map_lidar_prior, drive.stamps_ns
+    if T is None or len(T) < 3:
+        return None
+    way = T[-1, :2, 3] - T[0, :2, 3]
+    way_m, driven_s = float(np.linalg.norm(way)), 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
+    driven_m = float(np.linalg.norm(np.diff(T[:, :2, 3], axis=0), axis=1).sum())
+    ahead_m = float(d.offset_m[:2] @ way) / max(way_m, 1e-6)
+    beside_m = abs(float(d.offset_m[0] * way[1] - d.offset_m[1] * way[0])) / max(way_m, 1e-6)
+    slow = way_m < rules.least_mps * driven_s
+    if slow or way_m < rules.straight * driven_m or beside_m > rules.beside * abs(ahead_m):
+        return None
+    late_s = ahead_m / (way_m / driven_s)
+    rows = round(-late_s / (driven_s / (len(T) - 1)))
+    return _Along(late_s, rows) if abs(rows) >= rules.least_rows else None
 
 
 def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:

@@ -178,7 +178,8 @@ READINGS = (
     ),
     *(reading for yaw_deg in (90, -90, 180) for reading in _quarter_turns(yaw_deg)),
     Reading(
-        "the scans are turned into the map's axes already, about the sensor",
+        "the scans are turned into the map's axes already, about the sensor (on a road along x: or the prior's "
+        "rotations do not belong to its positions)",
         "turn the points back by the prior's rotation, or give poses without rotation",
         lambda T: _headed(T, np.zeros(len(T))),
         told_by="scans",
