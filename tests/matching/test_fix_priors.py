@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +13,8 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, PosePrior
-from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at
+from mapvote.doctor.scans import _check_track
+from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at, priors_at
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.matching.global_search import Bound, GlobalSearch
 from mapvote.vehicle import Vehicle
@@ -69,6 +71,16 @@ def test_a_bound_keeps_the_search_within_it() -> None:
     elsewhere = search(scan, Bound(30.0, 0.0, 5.0))  # houses of a street are alike
     assert elsewhere is None or np.linalg.norm(elsewhere[:2, 3] - [30.0, 0.0]) < 5.0
     assert search(scan, Bound(500.0, 0.0, 20.0)) is None
+
+
+def test_the_doctor_does_not_complain_of_the_steps_from_fix_to_fix() -> None:
+    poses = path(SCANS)
+    drive = drive_along(poses, 1)
+    told = priors_at(fixes_along(poses, 10, 2.0), drive.stamps_ns, np.eye(4))
+    assert told is not None
+    by_fixes = replace(drive, T_map_lidar_prior=told[0], prior_sigmas=told[1])
+    assert list(_check_track(by_fixes, told[0])) == []
+    assert any("jumps" in finding.what for finding in _check_track(replace(by_fixes, prior_sigmas=None), told[0]))
 
 
 def test_a_planar_prior_says_nothing_of_height_roll_and_pitch() -> None:
