@@ -81,6 +81,8 @@ VERBS = {
     "merge my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
     "demo --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
+    "affected changes.geojson lanelet2_map.osm": "import mapvote.formats.geo.lanelet2 as m; m.read_lanelets = wait",
+    "show car_1.ballot --map my_map --mcap new": "import mapvote.formats as m; m.read_map = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "send car_1.ballot --to http://localhost:9": "import mapvote.live.depot as m; m.send_all = wait",
     "export http://localhost:9 new --follow": "import mapvote.client as m; m.MapClient.manifest = wait",
@@ -96,6 +98,7 @@ def test_every_verb_is_interrupted_by_a_test() -> None:
     assert interrupted == set(get_command(app).commands)  # type: ignore[attr-defined]
 
 
+READ = ("my_map", "MY_DRIVE", "car_1.ballot", "city.pcd", "STORE", "changes.geojson", "lanelet2_map.osm")
 FAST = ("vote", "publish")
 """The others go the same way; each takes a process of its own."""
 
@@ -105,7 +108,7 @@ FAST = ("vote", "publish")
 )
 def test_ctrl_c_in_the_middle_of_a_verb_ends_it_with_one_line(line: str, desk: Desk) -> None:
     words = line.split()
-    here = desk(*(w for w in words if w in ("my_map", "MY_DRIVE", "car_1.ballot", "city.pcd", "STORE")))
+    here = desk(*(w for w in words if w in READ))
     done = interrupt(slowed(words, VERBS[line]), here, (here / "ready").exists)
     assert stopped_by_a_line(done)
     left = {p.name for p in here.iterdir()} - {"ready", "STORE-wal", "STORE-shm", *(w for w in words if w != "new")}

@@ -46,7 +46,7 @@ NOT_RUN = {
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
 }
-SLOW = r"^mapvote (demo|simulate|evaluate|warmup|build|diff|vote session\.pcd)\b"
+SLOW = r"^mapvote (demo|simulate|evaluate|warmup|build|diff|merge|vote session\.pcd)\b"
 STANDS_FOR = {"VERSION": "1"}
 """Placeholders that no file can be called by."""
 

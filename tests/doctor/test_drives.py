@@ -91,6 +91,7 @@ MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (0, 270, 0), (45, 45, 45), (0, 
 """Roll, pitch and yaw of the points, degrees."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rpy_deg", MOUNTS)
 def test_a_mount_that_prior_and_points_agree_on_is_sound(
     tmp_path: Path, sound: Recording, rpy_deg: tuple[float, float, float]

@@ -396,6 +396,7 @@ def falls(remains_of: Mapping[TileIndex, Remains]) -> dict[TileIndex, Fallen]:
     return fell
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.03, 0.08, 0.2]), st.sampled_from([0.0003, 0.002, 0.01]))
 def test_random_groups_across_borders_fall_as_labels_say(seed: int, share: float, gone: float) -> None:

@@ -176,6 +176,7 @@ def test_colours_share_one_scale(tmp_path: Path, colours: NDArray[Any], right: l
     assert [int(las[name][0]) for name in fields] == right
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 2**31), st.sampled_from([".las", ".laz"]), st.sampled_from(["week", "adjusted standard"]))
 def test_flags_and_the_kind_of_times_survive_every_way(tmp_path: Path, seed: int, suffix: str, times: str) -> None:
