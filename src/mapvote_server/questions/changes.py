@@ -28,7 +28,7 @@ from mapvote.shapes.geojson import to_geojson
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import seen, sound_votes
 from mapvote_server.store.integrity import hurt_or_mended_since
-from mapvote_server.store.queries import load_tile, newest_seq, records_of, tiles_of, tiles_that_differ, version_of
+from mapvote_server.store.queries import load_tile, newest_seq, records_of, tile_of, tiles_that_differ, version_of
 from mapvote_server.store.retention import cleared_since
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import StoredVote
@@ -201,12 +201,11 @@ def tiles_at(store: Store, version: int) -> Tiles:
     """Tiles of one version by their index, each loaded once. NotFound if there is no such version."""
     with store.database.reading() as connection:
         version_of(connection, version)
-        hashes = tiles_of(connection, version)
 
     @cache
     def load(index: TileIndex) -> Tile:
         with store.database.reading() as connection:
-            return load_tile(connection, store.lattice.tile(index), hashes.get(index))
+            return load_tile(connection, store.lattice.tile(index), tile_of(connection, version, index))
 
     return load
 

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import chain
 from threading import Lock
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
@@ -99,20 +100,20 @@ class _AllCompared:
         self._sums: dict[str, Compared] = {}
         self._tiles: Counter[str] = Counter()
         self._opposed: dict[int, Sequence[Compared]] = {}
+        """Contradictions of each tile, without what the sums have."""
         self.standings: list[VehicleStanding] | None = None
         """Standings that follow from all tiles; None: not asked since one came or went."""
 
     def entries(self) -> list[Compared]:
         """The comparisons that represent all: one a vehicle with its sums, and those with contradictions."""
-        opposed = [replace(entry, cells=0, inside=0) for entries in self._opposed.values() for entry in entries]
-        return [*self._sums.values(), *opposed]
+        return [*self._sums.values(), *chain.from_iterable(self._opposed.values())]
 
     def _come(self, compared: Sequence[Compared]) -> None:
         self.standings = None
         for entry in compared:
             self._tiles[entry.vehicle] += 1
             self._add(entry, 1)
-        opposed = [entry for entry in compared if entry.contradicts]
+        opposed = [replace(entry, cells=0, inside=0) for entry in compared if entry.contradicts]
         if opposed:
             self._opposed[id(compared)] = opposed
 
