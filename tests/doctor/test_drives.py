@@ -22,6 +22,7 @@ from mapvote.core.types import F64, Drive, Scan
 from mapvote.doctor.diagnosis import diagnose, examine_drive
 from mapvote.doctor.map_fit import MapEvidence, check_on_map, in_another_unit, peak_of
 from mapvote.doctor.maps import examine_points
+from mapvote.doctor.reading_on_map import ReadOnMap, confirmed
 from mapvote.doctor.scans import NO_PRIOR
 from mapvote.formats.drives.scan_folder import write_poses
 from mapvote.formats.maps.cloud import Cloud
@@ -71,9 +72,8 @@ def test_a_healthy_drive_is_sound(tmp_path: Path, sound: Recording) -> None:
 STRAIGHT = ["inverse poses", "rows in reverse order", "points facing backwards", "y of positions negated"]
 
 
-@pytest.mark.parametrize(
-    "kind", [k if k == "inverse poses" else pytest.param(k, marks=pytest.mark.slow) for k in STRAIGHT]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", STRAIGHT)
 def test_what_a_straight_drive_leaves_open_its_map_decides(tmp_path: Path, kind: str) -> None:
     """The map lies about the middle of the drive: a prior that is read otherwise lays scans elsewhere."""
     T = np.array([geometry.from_xyz_rpy(0.8 * (k - N // 3), 3.0, 1.8) for k in range(N)])
@@ -85,6 +85,17 @@ def test_what_a_straight_drive_leaves_open_its_map_decides(tmp_path: Path, kind:
     assert re.search(named, errors[0])
     assert "scans checked fit the map" in errors[0]
     assert "; or " not in errors[0]
+
+
+def test_a_map_confirms_a_reading_that_fits_alone_or_where_it_has_the_scans() -> None:
+    def lies(fit: int, total: float, off_m: float) -> ReadOnMap:
+        return ReadOnMap(fit, 6, total, off_m)
+
+    nowhere, here, beside = lies(0, 0.4, np.inf), lies(6, 6.2, 0.1), lies(6, 6.2, 9.0)
+    assert confirmed([nowhere, beside, nowhere], 0.5) == 1, "alone, though the prior's frame is off"
+    assert confirmed([beside, here], 0.5) == 1, "the next street looks alike"
+    assert confirmed([here, here], 0.5) is None
+    assert confirmed([lies(3, 3.0, 0.1), nowhere], 0.5) is None, "too few scans fit"
 
 
 MOUNTS = [(180, 0, 0), (90, 0, 45), (0, 135, 0), (0, 270, 0), (45, 45, 45), (0, 0, 90), (20, 100, 200)]

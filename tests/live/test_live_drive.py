@@ -137,7 +137,7 @@ def test_scans_are_shed_evenly_and_the_oldest_and_newest_stay() -> None:
     assert list(waiting) == list(range(0, 91, 10))
 
 
-@pytest.mark.parametrize("checked", [True, False])
+@pytest.mark.parametrize("checked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_no_ballot_leaves_of_a_road_on_which_the_vehicle_did_not_know_where_it_was(
     tmp_path: Path, checked: bool
 ) -> None:

@@ -91,9 +91,9 @@ def test_the_map_has_one_point_a_voxel_on_the_streets_surfaces_and_none_where_it
     assert known > 1000
 
 
-@pytest.mark.parametrize("with_prior", [True, False])
+@pytest.mark.parametrize("with_prior", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_sensor_that_hangs_upside_down_makes_the_map_of_one_that_stands(with_prior: bool) -> None:
-    poses = path(8, -15.0)
+    poses = path(5, -15.0)
     standing = drive_along(poses, 6, poses if with_prior else None, sigma_m=0.02, sigma_deg=0.05)
     over = from_xyz_rpy(0.0, 0.0, 0.0, roll=np.pi)
     elevations_deg = tuple(-e for e in reversed(standing.sensor.elevations_deg))

@@ -69,7 +69,7 @@ def decided_by_map(
             continue
         readings = finding.readings if finding.severity == "error" else (AS_IT_IS, *finding.readings)
         on_map = [_fit_under(reading, drive, T, point_map, progress) for reading in readings]
-        best = _confirmed(on_map, drive.prior_sigma_m)
+        best = confirmed(on_map, drive.prior_sigma_m)
         if best is None or readings[best] is AS_IT_IS:
             continue
         reading, its = readings[best], on_map[best]
@@ -108,7 +108,7 @@ def _mirrored(drive: Drive) -> Callable[[int], Scan]:
     return read
 
 
-def _confirmed(on_map: Sequence[ReadOnMap], sigma_m: float, rules: ReadingRules = RULES) -> int | None:
+def confirmed(on_map: Sequence[ReadOnMap], sigma_m: float, rules: ReadingRules = RULES) -> int | None:
     """Which reading the map confirms before all others; None if none. The next street may look alike: of readings under
     which the scans fit as well, one counts that has them where the prior's error ``sigma_m`` allows."""
     most = max(one.total for one in on_map)
