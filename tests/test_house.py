@@ -33,7 +33,7 @@ MOST_MODULE_NAMES = 1020
 MOST_LOOSE_NUMBERS = 140
 """Numbers among them: those that kernels read, sizes of formats, bits and codes."""
 MOST_NAMES_WITH_SEVERAL_VALUES = 4
-MOST_PACKED_SHARE = 0.085
+MOST_PACKED_SHARE = 0.01
 """Share of assignments that pack several statements into one line."""
 MOST_ODD_SENTENCES = 8
 """Sentences of docstrings that begin with Of, What or As: their subject is missing or a clause."""

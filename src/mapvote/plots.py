@@ -160,7 +160,8 @@ def draw_diagnosis(
     figure, axes = new_figure(11.0, 11.5, rows=2, cols=2)
     # The drive as it was read and as it was mended; a few of its scans.
     ground = None if point_map is None else _thinned(all_points(point_map), sizes.points_of_the_map)
-    drive, mended = diagnosis.drive, diagnosis.T_mended
+    drive = diagnosis.drive
+    mended = diagnosis.T_mended
     read = None if drive is None else drive.T_map_lidar_prior
     scans = {} if drive is None else _some_scans(drive, sizes)
     # Left as read, right as mended: the whole above, a part of it from near below.

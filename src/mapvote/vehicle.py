@@ -74,7 +74,9 @@ class Vehicle:
         prior_sigma_m: float = 1.0,
         prior_sigma_deg: float = 1.0,
     ) -> None:
-        self.name, self.point_map, self.drive_id = name, point_map, drive_id
+        self.name = name
+        self.point_map = point_map
+        self.drive_id = drive_id
         self.settings = settings or Settings()
         self._rule = rule_named(self.settings.voting.method)
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
@@ -203,7 +205,9 @@ class RoadDriven:
     """The road of the ballot that is open, by its localised scans: each is read once, when it is done."""
 
     def __init__(self, cuts: Cuts) -> None:
-        self._cuts, self._read, self._length_m = cuts, 0, 0.0
+        self._cuts = cuts
+        self._read = 0
+        self._length_m = 0.0
         self._moved = False
         """Whether the vehicle has left the place where it began."""
         self._last_ns = self._moved_ns = 0
@@ -213,12 +217,15 @@ class RoadDriven:
 
     def is_full(self, report: DriveReport, done: int) -> bool:
         """Whether the ballot of the first ``done`` scans of ``report`` is to be closed now."""
-        lost, cuts = set(report.lost) if done > self._read else set(), self._cuts
+        lost = set(report.lost) if done > self._read else set()
+        cuts = self._cuts
         for i in range(self._read, done):
-            self._last_ns, position = report.stamps_ns[i], report.T_map_lidar[i][:3, 3]
+            self._last_ns = report.stamps_ns[i]
+            position = report.T_map_lidar[i][:3, 3]
             if i not in lost and (self._place is None or np.linalg.norm(position - self._place) > cuts.stop_m):
                 self._moved = self._place is not None
-                self._place, self._moved_ns = position, self._last_ns
+                self._place = position
+                self._moved_ns = self._last_ns
             if i not in lost and self._last is not None:
                 self._length_m += float(np.linalg.norm(position - self._last))
             self._last = None if i in lost else position
@@ -248,7 +255,9 @@ def write_ballot(
             f"{vehicle}: none of {report.scans} scans could be localised in map {point_map.map_id}; "
             "is the drive on this map, and its prior in the map's frame?"
         )
-    points, two_stage, names = new_points.by_tile(), settings.voting.two_stage, new_points.names
+    points = new_points.by_tile()
+    two_stage = settings.voting.two_stage
+    names = new_points.names
     tiles = [_ballot_tile(point_map, tile, votes, points(tile), names, two_stage) for tile, votes in votes_of_tiles]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
@@ -306,7 +315,8 @@ def offered(
     corner, and their k attributes (m,) by ``names``."""
     if not len(points):
         return np.empty((0, 3), dtype=np.float32), {}
-    window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
+    window = point_map.lattice.tile(tile)
+    mapped = point_map.tiles.get(tile)
     known = mapped is not None and mapped.has_ground
     base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
     return points_in(window, points, new, base, names)

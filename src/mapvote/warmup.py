@@ -60,7 +60,8 @@ def warm_vehicle(settings: Settings) -> None:
 
 def warm_up() -> Iterator[tuple[str, float]]:
     """(what was compiled, CPU seconds that it took), step by step. With everything in the cache it takes seconds."""
-    old, new = _street(demolished=False), _street(demolished=True)
+    old = _street(demolished=False)
+    new = _street(demolished=True)
     settings = Settings()
     built: list[PointMap] = []
     ballots: list[Ballot] = []
@@ -120,7 +121,8 @@ def _go_far(drive: Drive) -> None:
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     for columns in _FIELDS_OF_TABLES:
         spinning_time_s(xyz_view("warmup", _table(np.zeros((2, 3), np.float32), columns)), drive.sensor.rate_hz)
-    tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
+    tiles = PackedTiles(Lattice(), 1)
+    far = 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
     tiles.leave(Grid(Lattice(), far, far, 1, 1))
     tiles.near((0, 0))

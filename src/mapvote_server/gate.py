@@ -222,7 +222,8 @@ def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F6
 def _prior_twist(drive: Drive, i: int) -> F64:
     """(6,) motion per second in the lidar frame around scan i, from the prior poses."""
     assert drive.T_map_lidar_prior is not None
-    first, last = max(i - 1, 0), min(i + 1, len(drive) - 1)
+    first = max(i - 1, 0)
+    last = min(i + 1, len(drive) - 1)
     seconds = 1e-9 * float(drive.stamps_ns[last] - drive.stamps_ns[first])
     if first == last or seconds <= 0:
         return np.zeros(6)

@@ -317,7 +317,8 @@ def explain(
         answer = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
     print(f"cell {answer['row']}, {answer['col']}: {answer['thing'] or 'empty'}")
     for decision in answer["decisions"]:
-        edit, trimmed = decision.get("edit"), ""
+        edit = decision.get("edit")
+        trimmed = ""
         if edit is not None:
             went = "deleted" if edit["state"] == "changed_empty" else "added"
             trimmed = f"; points {went} by {edit['votes']} of {edit['votes'] + edit['against']} vehicles"
@@ -363,7 +364,8 @@ def coverage(
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
     for feature in found["features"][:_MOST_STRETCHES]:
-        about, line = feature["properties"], feature["geometry"]["coordinates"]
+        about = feature["properties"]
+        line = feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
         counts = (str(about[what]) for what in ("cells", "built", "gone"))
         rows.append((f"{about['row']},{about['col']}", f"{about['heading_deg']}°", *ends, *counts))

@@ -39,7 +39,8 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
             )
         map_id = server.ask_json("GET", "/v1/map")["map_id"]
         for about in versions:
-            number, parent = about["number"], about["parent"] if about["parent"] in numbers else None
+            number = about["number"]
+            parent = about["parent"] if about["parent"] in numbers else None
             if number not in numbers or (folder / name_of_item(number) / f"{name_of_item(number)}.json").is_file():
                 continue
             (folder / name_of_item(number)).mkdir(parents=True, exist_ok=True)
@@ -62,7 +63,8 @@ def _write(folder: Path, point_map: PointMap, about: Mapping[str, Any], *, has_c
     home.mkdir(parents=True, exist_ok=True)
     with waiting(f"writing version {about['number']}"):
         export_map(point_map, home / CLOUD_ASSET)
-        corners, frame = box_of(home, point_map), frame_of(point_map.georeference)
+        corners = box_of(home, point_map)
+        frame = frame_of(point_map.georeference)
         created = about["created"]
         version = MapVersion(about["number"], created, about["parent"], point_map.n_points, corners, frame, has_changes)
         write_item(folder, version)

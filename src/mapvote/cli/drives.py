@@ -213,7 +213,8 @@ def vote(
                 file=sys.stderr,
             )
         if is_cloud(drive_path):
-            ballot, report = _ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
+            ballot = _ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory)
+            report = None
         else:
             drive = open_drive_on(point_map, drive_path, vehicle=vehicle, as_live=True, **drive_options)
             if name is not None:
@@ -384,7 +385,8 @@ def diff(
     from mapvote.shapes.geojson import as_csv
 
     with waiting(f"reading {path_a} and {path_b}"):
-        map_a, map_b = read_map(path_a), read_map(path_b)
+        map_a = read_map(path_a)
+        map_b = read_map(path_b)
     with waiting("registering B to A"):
         map_b, registered = brought_into(map_a, map_b, unbend=unbend)
     with waiting("comparing"):

@@ -71,7 +71,8 @@ def info(
             return
         found["published"] = utc(found.pop("published_ns"))
         shown = [(key, f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
-        title, rows = "store", [(key.replace("_", " "), value) for key, value in shown]
+        title = "store"
+        rows = [(key.replace("_", " "), value) for key, value in shown]
     else:
         with waiting(f"reading {path}"):
             title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic)
@@ -455,7 +456,8 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
     if rows:
         headings = "vehicles", "changed-occupied cells", "changed-empty cells", "points added", "points deleted"
         print_table(("tile", *headings), rows)
-    added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
+    added = sum(d.added for d in decisions.values())
+    deleted = sum(d.deleted for d in decisions.values())
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
     copies = Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
     for (vehicle, heard), tiles in sorted(copies.items()):

@@ -214,7 +214,9 @@ def drive(
     names = ros_names(namespace, [*(remap or []), *frames])
     sim_time = sim_time_of(parameter or [])
     voice = Voice(lambda text: print(text, flush=True))
-    model, network, stopped = None if sensor is None else read_sensor(sensor, "--sensor"), Network(domain), [False]
+    model = None if sensor is None else read_sensor(sensor, "--sensor")
+    network = Network(domain)
+    stopped = [False]
     heartbeat = Heartbeat()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.append(True))
@@ -295,7 +297,8 @@ def _result(live: LiveDrive | None) -> str:
 
     if live is None:
         return "no cloud came"
-    c, latencies_s = live.counts, live.latencies_s
+    c = live.counts
+    latencies_s = live.latencies_s
     latency = ", ".join(f"{s:.2f} s" for s in np.quantile(latencies_s, (0.5, 0.99))) if latencies_s else "none"
     return (
         f"{c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "

@@ -17,7 +17,8 @@ def warmup() -> None:
     """
     with waiting("loading"):
         from mapvote.warmup import warm_up
-    steps, total = warm_up(), 0.0
+    steps = warm_up()
+    total = 0.0
     while True:
         with waiting("compiling"):
             step = next(steps, None)

@@ -67,19 +67,22 @@ class Connection:
     ) -> httpx2.Response:
         """One request, repeated with growing, scattered pauses, or those that the server names, while the trouble may
         pass. Unreachable if it does not, Refused (with the server's reason) for 4xx."""
-        trouble, wait_s = "", 0.0
+        trouble = ""
+        wait_s = 0.0
         for attempt in range(self._attempts):
             if attempt:
                 self._sleep(max(0.25 * 2**attempt * random.uniform(0.5, 1.5), wait_s))
             try:
                 answer = self._http.request(method, path, content=content, json=json, headers=dict(headers or {}))
             except httpx2.TransportError as error:
-                trouble, wait_s = str(error) or type(error).__name__, 0.0
+                trouble = str(error) or type(error).__name__
+                wait_s = 0.0
                 continue
             except (httpx2.InvalidURL, httpx2.UnsupportedProtocol) as error:
                 raise MapvoteError(f"{self.url}: is no address of a server ({error})") from error
             if answer.status_code in _PASSING:
-                trouble, wait_s = detail_of(answer), _asked_to_wait_s(answer)
+                trouble = detail_of(answer)
+                wait_s = _asked_to_wait_s(answer)
                 if wait_s > self._longest_wait_s:
                     raise Unreachable(f"{self.url}: {trouble}; ask again in {wait_s:.0f} s")
                 continue

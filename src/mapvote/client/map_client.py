@@ -63,7 +63,8 @@ class MapClient:
     ) -> None:
         self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
         self._url = url
-        self._planes, self._spool = home / "planes", _Spool(home, url)
+        self._planes = home / "planes"
+        self._spool = _Spool(home, url)
         self._kept_manifest = _server_folder(home, url) / "manifest.json"
         self._cache_bytes = cache_bytes
         self._kept_points = kept_points

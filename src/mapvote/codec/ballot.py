@@ -330,7 +330,8 @@ def unpack_points(data: bytes) -> F32:
 def _enter_planes(points: F32, voxel: I64, planes: U8) -> None:
     """Fill ``planes`` (9, m) from points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps
     in a voxel. ``voxel`` (3,): scratch."""
-    last_cell, last_layer = np.int64(0), np.int64(0)
+    last_cell = np.int64(0)
+    last_layer = np.int64(0)
     for i in range(len(points)):
         for axis in range(3):
             place = np.float64(points[i, axis]) / CELL_SIZE
@@ -343,13 +344,16 @@ def _enter_planes(points: F32, voxel: I64, planes: U8) -> None:
             planes[k, i] = ((cell - last_cell) >> (8 * k)) & 0xFF
         for k in range(4):
             planes[2 + k, i] = ((voxel[2] - last_layer) >> (8 * k)) & 0xFF
-        last_cell, last_layer = cell, voxel[2]
+        last_cell = cell
+        last_layer = voxel[2]
 
 
 @kernel
 def _placed(planes: U8, points: F32) -> bool:
     """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
-    cell, layer, sound = np.int64(0), np.int64(0), True
+    cell = np.int64(0)
+    layer = np.int64(0)
+    sound = True
     for i in range(len(points)):
         cell = (cell + np.int64(planes[0, i]) + (np.int64(planes[1, i]) << 8)) & (CELLS - 1)
         way = np.int64(0)
@@ -367,7 +371,9 @@ def _all_inside(points: F32, side: np.float32) -> bool:
     """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
     sound = True
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
     return sound
 
@@ -378,7 +384,8 @@ def _most_in_a_cell(points: F32, counts: I64) -> int:
     scratch, zeros."""
     most = 0
     for i in range(len(points)):
-        row, col = int(points[i, 1] / CELL_SIZE), int(points[i, 0] / CELL_SIZE)
+        row = int(points[i, 1] / CELL_SIZE)
+        col = int(points[i, 0] / CELL_SIZE)
         cell = min(row, TILE_CELLS - 1) * TILE_CELLS + min(col, TILE_CELLS - 1)
         counts[cell] += 1
         most = max(most, counts[cell])

@@ -159,7 +159,8 @@ def unpack_sparse(data: bytes, what: str) -> Words:
     """The words that are not 0. MapvoteError if damaged; ``what`` names the plane in messages, e.g. "gone"."""
     raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
     n, left = divmod(len(raw), _WAY + _WORD)
-    cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    cells = np.empty(n, dtype=np.intp)
+    words = np.empty(n, dtype=np.uint64)
     if left or not _ascending(raw, cells, words):
         raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
     return Words(cells, words)
@@ -168,14 +169,17 @@ def unpack_sparse(data: bytes, what: str) -> Words:
 @kernel
 def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
     """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
-    n, cell, sound = len(cells), np.int64(0), True
+    n = len(cells)
+    cell = np.int64(0)
+    sound = True
     for i in range(n):
         way = np.int64(raw[i]) | (np.int64(raw[n + i]) << 8)
         cell += way
         word = np.uint64(0)
         for k in range(_WORD):
             word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
-        cells[i], words[i] = cell, word
+        cells[i] = cell
+        words[i] = word
         sound &= (way > 0 or i == 0) and word != 0
     return bool(sound and cell < CELLS)
 
@@ -192,7 +196,8 @@ def union(marked: Sequence[Words]) -> Words:
         return some[0] if some else Words.none()
     cells = np.concatenate([mine.cells for mine in some])
     order = np.argsort(cells, kind="stable")
-    cells, words = cells[order], np.concatenate([mine.words for mine in some])[order]
+    cells = cells[order]
+    words = np.concatenate([mine.words for mine in some])[order]
     first = np.flatnonzero(np.append(True, cells[1:] != cells[:-1]))
     return Words(cells[first], np.bitwise_or.reduceat(words, first))
 

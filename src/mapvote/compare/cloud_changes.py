@@ -158,7 +158,8 @@ def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
         if tile is None:
             continue
         common = tile.window.intersection(window)
-        into, cut = common.slices_in(window), common.slices_in(tile.window)
+        into = common.slices_in(window)
+        cut = common.slices_in(tile.window)
         has_rays[into] = tile.free is not None and tile.free.any()
         scans[into] = _mean_scans(tile)[cut]
         own[into] = (np.bincount(tile.cells[~tile.columns[1]], minlength=CELLS) > 0).reshape(tile.window.shape)[cut]
@@ -192,7 +193,8 @@ def compare_cells(
     MapvoteError if they do not overlap, or if one of them has no ground.
     """
     window = reduce(Grid.union, (map_a.lattice.tile(tile) for tile in sorted({*map_a.tiles, *map_b.tiles})))
-    a, b = planes_of(map_a, window), planes_of(map_b, window)
+    a = planes_of(map_a, window)
+    b = planes_of(map_b, window)
     for name, one in (("A", map_a), ("B", map_b)):
         if not has_open_ground(one):
             raise MapvoteError(
@@ -261,7 +263,8 @@ def _explained(
             fits[here] = KDTree(others).query(at, distance_upper_bound=explained_m)[0] < explained_m
         # The share of them in each cell.
         rows, cols, _ = window.indices_of(points)
-        total, explained = np.zeros(window.shape), np.zeros(window.shape)
+        total = np.zeros(window.shape)
+        explained = np.zeros(window.shape)
         np.add.at(total, (rows, cols), 1.0)
         np.add.at(explained, (rows[fits], cols[fits]), 1.0)
         out |= (total > 0) & (explained >= 0.5 * total)
@@ -289,7 +292,8 @@ def _objects(
     compared: CellComparison, kind: Kind, has: Literal["a", "b"], min_m2: float, numbers: CloudComparison
 ) -> list[CloudChange]:
     """The objects of one kind that one cloud has."""
-    a, b = compared.a, compared.b
+    a = compared.a
+    b = compared.b
     owner, other, side = (a, b, compared.only_a) if has == "a" else (b, a, compared.only_b)
     cells = side.not_seen if kind == "not seen" else side.changed
     rows, cols = (indices.astype(np.int64) for indices in np.nonzero(cells))
@@ -310,7 +314,8 @@ def _objects(
         area_m2 = len(of_object) * CELL_SIZE**2
         if area_m2 < min_m2 - 1e-9:
             continue
-        r, c = rows[of_object], cols[of_object]
+        r = rows[of_object]
+        c = cols[of_object]
         voxels = int(np.bitwise_count(owner.words[r, c]).sum())
         needed = min(numbers.voxels + numbers.voxels_a_cell * len(of_object), numbers.voxels_enough)
         if kind != "not seen" and voxels < needed:

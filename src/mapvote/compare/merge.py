@@ -75,7 +75,8 @@ def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MERGING.most_a
     if not 2 <= len(maps) <= _MOST_MAPS:
         raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
     clouds = [all_points(one) for one in maps]
-    pairs, reasons = {}, {}
+    pairs = {}
+    reasons = {}
     for i, j in combinations(range(len(maps)), 2):
         try:
             pairs[i, j] = register_maps(maps[i], maps[j])
@@ -200,7 +201,8 @@ def _joint_fields(
     voxel. SCANS is the sum over all maps; 0 if one of the points is not counted."""
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     order = np.argsort(keys)
-    sources, scans = np.zeros(len(points), dtype=np.uint64), np.zeros(len(points), dtype=np.int64)
+    sources = np.zeros(len(points), dtype=np.uint64)
+    scans = np.zeros(len(points), dtype=np.int64)
     uncounted = np.zeros(len(points), dtype=np.bool_)
     for k, (one, cloud) in enumerate(zip(maps, moved, strict=True)):
         wanted = voxel_keys(cloud, lattice.x0, lattice.y0)
@@ -225,7 +227,8 @@ def _without_strays(merged: PointMap, maps: Sequence[PointMap], T: F64) -> Point
     ]
     if not driven:
         return merged
-    points, scans = all_points(merged), all_fields(merged)[SCANS].astype(np.int32)
+    points = all_points(merged)
+    scans = all_fields(merged)[SCANS].astype(np.int32)
     indices = sorted(merged.tiles)
     standing = np.concatenate([merged.tiles[index].columns[1] for index in indices])
     counted = np.flatnonzero(standing & (scans > 0))

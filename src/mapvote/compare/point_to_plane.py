@@ -97,14 +97,16 @@ def refine_on_planes(
     moved = np.eye(4)
     for round_ in range(numbers.rounds):
         # The nearest point of a, for every point of b.
-        here, normal = transform(moved, start), normal_start @ moved[:3, :3].T
+        here = transform(moved, start)
+        normal = normal_start @ moved[:3, :3].T
         reach_m = numbers.reaches_m[min(round_, len(numbers.reaches_m) - 1)]
         distance, index = surface_a.tree.query(here + origin, distance_upper_bound=reach_m)
         near = np.isfinite(distance)
         if near.sum() < numbers.least:
             return T_a_b
         # One step of Gauss and Newton over the distances along the normals.
-        here, normal = here[near], normal[near]
+        here = here[near]
+        normal = normal[near]
         off_m = ((surface_a.points[index[near]] - origin - here) * normal).sum(axis=1)
         weight = flatness[near] / (1.0 + (off_m / numbers.scale_m) ** 2) / numbers.sigma_m**2
         J = np.column_stack([normal, np.cross(here, normal)])

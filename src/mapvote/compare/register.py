@@ -143,10 +143,18 @@ def register_patches(
     """Every patch of b that overlaps a, registered from T_a_b. MapvoteError if none overlaps.
 
     ``paths``: (n, 3) each, from where a or b was measured, in a's frame by T_a_b."""
-    thin_a, thin_b = _thinned(points_a, numbers.thin_m), _thinned(points_b, numbers.thin_m)
-    tree_a, tree_b = KDTree(thin_a[:, :2]), KDTree(thin_b[:, :2])
+    thin_a = _thinned(points_a, numbers.thin_m)
+    thin_b = _thinned(points_b, numbers.thin_m)
+    tree_a = KDTree(thin_a[:, :2])
+    tree_b = KDTree(thin_b[:, :2])
     path_trees = [KDTree(path) for path in paths]
-    centres, poses, covariances, inliers, compared, levers_m, kept = [], [], [], [], [], [], []
+    centres = []
+    poses = []
+    covariances = []
+    inliers = []
+    compared = []
+    levers_m = []
+    kept = []
     T = T_a_b
     corners = np.unique(np.floor(thin_b[:, :2] / numbers.step_m).astype(np.int64), axis=0)
     for corner in corners:
@@ -163,7 +171,8 @@ def register_patches(
             continue
         # Where the patch fits best by itself.
         guess = np.eye(4)
-        guess[:3, :3], guess[:3, 3] = T[:3, :3], at
+        guess[:3, :3] = T[:3, :3]
+        guess[:3, 3] = at
         fit = _ndt(near, at, numbers).refine(clouds, guess)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1]))
         centres.append(centre)
@@ -378,11 +387,13 @@ class Registered:
 
     def told(self) -> list[str]:
         """The registration in sentences."""
-        T, middle = self.T_a_b, self.fit.middle
+        T = self.T_a_b
+        middle = self.fit.middle
         yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
         dx, dy, dz = np.round(middle - transform(inverse(T), middle[None])[0], 3) + 0.0
-        agree, compared = int(self.fit.agree.sum()), int(self.patches.compared.sum())
+        agree = int(self.fit.agree.sum())
+        compared = int(self.patches.compared.sum())
         lines = [
             f"in the middle of the overlap (A's x {middle[0]:.1f}, y {middle[1]:.1f}, z {middle[2]:.1f}) B is moved by "
             f"x {dx:.3f}, y {dy:.3f}, z {dz:.3f} m, turned by {round(yaw, 3) + 0.0:.3f} deg, tilted by {tilt:.3f} deg "
@@ -432,7 +443,8 @@ def register_maps(
     ``unbend``: move bent parts patch by patch, if that makes them fit. MapvoteError, with figures, where the place is
     ambiguous or nothing fits.
     """
-    points_a, points_b = all_points(map_a), all_points(map_b)
+    points_a = all_points(map_a)
+    points_b = all_points(map_b)
     # A place that is clearly ahead of all others.
     placed = place_without_prior(points_a, points_b)
     if placed.lead < COARSE_SEARCH.min_lead:
@@ -452,7 +464,8 @@ def register_maps(
         )
     fit = replace(fit, T_a_b=_on_surfaces(points_a, points_b, patches, fit))
     # Bent parts patch by patch, on request.
-    moved, why = None, ""
+    moved = None
+    why = ""
     if unbend and fit.bent.any():
         moved, why = _unbend(points_a, points_b, patches, fit, paths)
     rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
@@ -523,7 +536,8 @@ def brought_into(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> t
 
 
 def _is_in_place(registered: Registered, points: F64) -> bool:
-    T, numbers = registered.T_a_b, registered.patches.numbers
+    T = registered.T_a_b
+    numbers = registered.patches.numbers
     middle = np.median(points, axis=0)
     shift_m = np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)
     return bool(shift_m < numbers.in_place_m and np.degrees(rotation_angle(T)) < numbers.in_place_deg)

@@ -91,7 +91,8 @@ def vote_of_session(
         trajectory = np.concatenate(cloud.driven)
     compared = compare_cells(point_map, session_map, registered)
     changes = differences(compared)
-    driven, free = None, np.zeros_like(compared.b.words)
+    driven = None
+    free = np.zeros_like(compared.b.words)
     if trajectory is not None:
         driven = transform(registered.T_a_b, trajectory)
         free = _free_words(with_free_space(session_map, driven), compared.window)
@@ -107,9 +108,11 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
     """The session as a drive: its "scans" are the patches that were compared, those that do not agree are lost. With a
     trajectory they are its positions."""
     shown = registered.patches.compared
-    poses, lost = registered.patches.T_a_patch[shown], np.flatnonzero(~registered.fit.agree[shown]).tolist()
+    poses = registered.patches.T_a_patch[shown]
+    lost = np.flatnonzero(~registered.fit.agree[shown]).tolist()
     if driven is not None:
-        poses, lost = poses_at(driven), []
+        poses = poses_at(driven)
+        lost = []
     sigmas_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
     return DriveReport([end_ns] * len(poses), lost, sigmas_m, list(poses), priors=[None] * len(poses))
 
@@ -119,7 +122,8 @@ def _votes(
 ) -> Iterator[tuple[TileIndex, TileVotes]]:
     """Tile by tile; ``session_free`` (rows, cols): column words of the session's free space over the window of the
     comparison. Only where a part of the session lies that one motion registers to the map."""
-    own, other = compared.a, compared.b
+    own = compared.a
+    other = compared.b
     x, y = compared.window.centres()
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     covered = registered.compared(xy).reshape(compared.window.shape) & ~compared.left_out
@@ -130,7 +134,8 @@ def _votes(
     states[other.own_ground & ~other.stands & ~own.stands] = CellState.UNCHANGED_EMPTY
     states[own.words & near != 0] = CellState.UNCHANGED_OCCUPIED
     # Cells of the changes.
-    gone, new = np.zeros_like(own.words), np.zeros_like(own.words)
+    gone = np.zeros_like(own.words)
+    new = np.zeros_like(own.words)
     for change in changes:
         if change.kind == "gone":
             gone[change.cells] = _hanging_together(own.words[change.cells]) & ~near[change.cells]
@@ -214,7 +219,8 @@ def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float,
     away = points - origin
     away = away[(np.abs(away[:, :2]) < numbers.range_m).all(axis=1)]
     reach = np.linalg.norm(away, axis=1)
-    away, reach = away[reach > 1.0], reach[reach > 1.0]
+    away = away[reach > 1.0]
+    reach = reach[reach > 1.0]
     col = np.floor((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / numbers.bin_rad).astype(np.int64) % 360
     row = np.floor((np.arcsin(away[:, 2] / reach) + np.pi / 2) / numbers.bin_rad).astype(np.int64)
     image = np.full((181, 360), np.inf)

@@ -66,7 +66,8 @@ def mark_obstacles(words: U64, points: F32, cells: I64, ground_z: F32, base: I32
     """Enter the points (n, 3) that are obstacles into the column ``words`` (cells,), by their flat ``cells`` (n,) and
     the rule of :func:`column_bits`; ``ground_z``, ``base`` (cells,)."""
     for i in range(len(cells)):
-        cell, z = cells[i], np.float64(points[i, 2])
+        cell = cells[i]
+        z = np.float64(points[i, 2])
         if height_above(z, ground_z[cell], base[cell]) >= GROUND_MARGIN_M:
             words[cell] |= np.uint64(1) << np.uint64(column_bit(z, base[cell]))
 
@@ -77,7 +78,8 @@ def fill_columns(
 ) -> None:
     """Enter points (cell indices inside the window, z in map metres) that are obstacles into the planes, in place."""
     for i in range(len(z)):
-        r, c = rows[i], cols[i]
+        r = rows[i]
+        c = cols[i]
         if r < 0 or c < 0 or r >= words.shape[0] or c >= words.shape[1]:
             continue
         if height_above(z[i], ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
@@ -90,7 +92,8 @@ def fill_columns(
 
 def rebased(words: U64, layers: I32) -> U64:
     """(...) columns seen from bases ``layers`` (...) lower: where > 0 bits move up, and what passes bit 63 is gone."""
-    up, down = np.clip(layers, 0, 63).astype(np.uint64), np.clip(-layers, 0, 63).astype(np.uint64)
+    up = np.clip(layers, 0, 63).astype(np.uint64)
+    down = np.clip(-layers, 0, 63).astype(np.uint64)
     return np.where(np.abs(layers) < 64, words << up >> down, np.uint64(0))
 
 

@@ -48,7 +48,8 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
     except metadata.PackageNotFoundError:
         return None
     for requirement in requirements:
-        package, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"](\w+)['\"]", requirement)
+        package = re.match(r"[\w.-]+", requirement)
+        extra = re.search(r"extra == ['\"](\w+)['\"]", requirement)
         if package is None or extra is None or extra[1] in ("all", "dev"):  # which hold what the others hold
             continue
         if re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():

@@ -30,7 +30,9 @@ def transform(T_a_b: F64, points_b: NDArray[np.floating]) -> F64:
 @kernel
 def _transform(T: F64, points: NDArray[np.floating], out: F64) -> None:
     for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        x = np.float64(points[i, 0])
+        y = np.float64(points[i, 1])
+        z = np.float64(points[i, 2])
         for k in range(3):
             out[i, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
 
@@ -44,9 +46,13 @@ def rows_from(points: F64, origin: F64) -> NDArray[np.float32]:
 
 @kernel
 def _rows_from(points: F64, origin: F64, rows: NDArray[np.float32]) -> None:
-    x, y, z = rows[0], rows[1], rows[2]
+    x = rows[0]
+    y = rows[1]
+    z = rows[2]
     for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
-        x[i], y[i], z[i] = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        x[i] = points[i, 0] - origin[0]
+        y[i] = points[i, 1] - origin[1]
+        z[i] = points[i, 2] - origin[2]
 
 
 def inverse(T_a_b: F64) -> F64:
@@ -66,20 +72,21 @@ def hat(v: ArrayLike) -> F64:
 def exp(xi: ArrayLike) -> F64:
     """SE(3) exponential of a (6,) tangent vector (Barfoot 8.33)."""
     xi = np.asarray(xi, dtype=np.float64)
-    rho, phi = xi[:3], xi[3:]
+    rho = xi[:3]
+    phi = xi[3:]
     angle = float(np.linalg.norm(phi))
     W = hat(phi)
     if angle < 1e-8:
-        R, V = np.eye(3) + W + 0.5 * W @ W, np.eye(3) + 0.5 * W
+        R = np.eye(3) + W + 0.5 * W @ W
+        V = np.eye(3) + 0.5 * W
     else:
-        s, half_chord = (
-            np.sin(angle) / angle,
-            2.0 * (np.sin(0.5 * angle) / angle) ** 2,
-        )  # 1 - cos cancels at small angles
+        s = np.sin(angle) / angle
+        half_chord = 2.0 * (np.sin(0.5 * angle) / angle) ** 2  # 1 - cos cancels at small angles
         R = np.eye(3) + s * W + half_chord * W @ W
         V = np.eye(3) + half_chord * W + ((1 - s) / angle**2) * W @ W
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, V @ rho
+    T[:3, :3] = R
+    T[:3, 3] = V @ rho
     return T
 
 
@@ -113,7 +120,12 @@ def interpolate(T_0: F64, T_1: F64, alpha: float) -> F64:
 
 def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> F64:
     """Metres and radians; R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    cr = np.cos(roll)
+    sr = np.sin(roll)
+    cp = np.cos(pitch)
+    sp = np.sin(pitch)
+    cy = np.cos(yaw)
+    sy = np.sin(yaw)
     T = np.eye(4)
     T[:3, :3] = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -128,7 +140,8 @@ def poses_at(positions: ArrayLike, rotations: ArrayLike | None = None) -> F64:
     """(n, 4, 4) of positions (n, 3), turned by rotations (n, 3, 3), or by nothing."""
     positions = np.asarray(positions, dtype=np.float64)
     T = np.tile(np.eye(4), (len(positions), 1, 1))
-    T[:, :3, 3], T[:, :3, :3] = positions, np.eye(3) if rotations is None else rotations
+    T[:, :3, 3] = positions
+    T[:, :3, :3] = np.eye(3) if rotations is None else rotations
     return T
 
 
@@ -167,8 +180,10 @@ def hats(v: F64) -> F64:
 
 def exps(xi: F64) -> F64:
     """(n, 4, 4) SE(3) exponentials of tangent vectors (n, 6), translation first, metres and radians."""
-    rho, phi = xi[:, :3], xi[:, 3:]
-    angle, W = np.linalg.norm(phi, axis=1), hats(phi)
+    rho = xi[:, :3]
+    phi = xi[:, 3:]
+    angle = np.linalg.norm(phi, axis=1)
+    W = hats(phi)
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
     s = np.where(small, 1.0, np.sin(safe) / safe)
@@ -248,16 +263,27 @@ def azimuth(y: np.float32, x: np.float32) -> np.float32:
     every machine.
     """
     t = _ZERO if y == _ZERO else abs(y / x)  # at the origin itself too
-    first, second, third, fourth = t < _B0, t < _B1, t < _B2, t < _B3
+    first = t < _B0
+    second = t < _B1
+    third = t < _B2
+    fourth = t < _B3
     # arctan t = h + l + arctan u, u = top / under. Nested choices would be branches again.
-    top, under = _TWO * t - _ONE if second else t - _ONE, _TWO + t if second else t + _ONE
-    top_, under_ = t - _MIDDLE if fourth else -_ONE, _ONE + _MIDDLE * t if fourth else t
-    top, under = top if third else top_, under if third else under_
-    top, under = t if first else top, _ONE if first else under
-    h, l = _H0 if second else _H1, _L0 if second else _L1  # noqa: E741
-    h_, l_ = _H2 if fourth else _H3, _L2 if fourth else _L3
-    h, l = h if third else h_, l if third else l_  # noqa: E741
-    h, l = _ZERO if first else h, _ZERO if first else l  # noqa: E741
+    top = _TWO * t - _ONE if second else t - _ONE
+    under = _TWO + t if second else t + _ONE
+    top_ = t - _MIDDLE if fourth else -_ONE
+    under_ = _ONE + _MIDDLE * t if fourth else t
+    top = top if third else top_
+    under = under if third else under_
+    top = t if first else top
+    under = _ONE if first else under
+    h = _H0 if second else _H1
+    l = _L0 if second else _L1  # noqa: E741
+    h_ = _H2 if fourth else _H3
+    l_ = _L2 if fourth else _L3
+    h = h if third else h_
+    l = l if third else l_  # noqa: E741
+    h = _ZERO if first else h
+    l = _ZERO if first else l  # noqa: E741
     u = top / under
     z = u * u
     w = z * z
@@ -275,7 +301,8 @@ def azimuth(y: np.float32, x: np.float32) -> np.float32:
 def turn(x: np.float32, y: np.float32) -> np.float32:
     """Azimuth of (x, y) in [0, 1] turns, within 1e-5 rad (Abramowitz and Stegun 4.4.49), in float32 and without a
     branch, so that a loop over points vectorises: it sorts rays, it measures nothing. 0 for (0, 0)."""
-    ax, ay = abs(x), abs(y)
+    ax = abs(x)
+    ay = abs(y)
     q = min(ax, ay) / max(max(ax, ay), np.float32(1e-30))
     s = q * q
     a = np.float32(-0.0851330) + s * np.float32(0.0208351)

@@ -115,7 +115,8 @@ class Grid:
         """The common window; rows or cols are 0 where they do not overlap. Raises ValueError on different lattices."""
         if self.lattice != other.lattice:
             raise ValueError(f"grids of different lattices: {self.lattice} and {other.lattice}")
-        row0, col0 = max(self.row0, other.row0), max(self.col0, other.col0)
+        row0 = max(self.row0, other.row0)
+        col0 = max(self.col0, other.col0)
         rows = max(0, min(self.row0 + self.rows, other.row0 + other.rows) - row0)
         cols = max(0, min(self.col0 + self.cols, other.col0 + other.cols) - col0)
         return Grid(self.lattice, row0, col0, rows, cols)
@@ -124,14 +125,16 @@ class Grid:
         """The smallest window that holds both."""
         if self.lattice != other.lattice:
             raise ValueError(f"grids of different lattices: {self.lattice} and {other.lattice}")
-        row0, col0 = min(self.row0, other.row0), min(self.col0, other.col0)
+        row0 = min(self.row0, other.row0)
+        col0 = min(self.col0, other.col0)
         row1 = max(self.row0 + self.rows, other.row0 + other.rows)
         col1 = max(self.col0 + self.cols, other.col0 + other.cols)
         return Grid(self.lattice, row0, col0, row1 - row0, col1 - col0)
 
     def slices_in(self, outer: Grid) -> tuple[slice, slice]:
         """Where this window lies in arrays of ``outer``. Raises ValueError if it is not wholly inside."""
-        row, col = self.row0 - outer.row0, self.col0 - outer.col0
+        row = self.row0 - outer.row0
+        col = self.col0 - outer.col0
         if row < 0 or col < 0 or row + self.rows > outer.rows or col + self.cols > outer.cols:
             raise ValueError(f"{self} is not inside {outer}")
         return slice(row, row + self.rows), slice(col, col + self.cols)

@@ -134,7 +134,8 @@ def lay_ground(
     for k, tile in enumerate(tiles):
         if tile in road:
             cells, z = _lowest_of_each(*road[tile])
-            ground[k * CELLS + cells], gap[k * CELLS + cells] = z, SEED
+            ground[k * CELLS + cells] = z
+            gap[k * CELLS + cells] = SEED
     if road:
         grow(start, heights, neighbours, ground, gap)
     least = numbers.min_agreeing_off_road if road else numbers.min_agreeing
@@ -160,7 +161,8 @@ def _populated(n_points: Mapping[TileIndex, int], numbers: GroundLaying) -> list
 def _by_cell(points: Iterable[Heights], tiles: int) -> tuple[I32 | I64, F32]:
     """(start (cells + 1,), heights (n,)): flat cell c has the points heights[start[c]:start[c + 1]], lowest first."""
     start: I32 | I64 = np.zeros(tiles * CELLS + 1, dtype=np.int32)
-    heights, n = np.empty(0, dtype=np.float32), 0
+    heights = np.empty(0, dtype=np.float32)
+    n = 0
     for k, (cells, z) in enumerate(points):
         if n + len(z) > np.iinfo(start.dtype).max:
             start = start.astype(np.int64)
@@ -196,7 +198,8 @@ def _sow(
 
     Arguments as :func:`grow`. Seeds do not count as known ground here: no plane below changes on the way.
     """
-    around_cells, grade = numbers.around_cells, numbers.grade
+    around_cells = numbers.around_cells
+    grade = numbers.grade
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)
     near = slice(TILE_CELLS - around_cells, 2 * TILE_CELLS + around_cells)
     thirds = [slice(k * TILE_CELLS, (k + 1) * TILE_CELLS) for k in range(3)]
@@ -222,7 +225,8 @@ def _sow(
         if not np.isfinite(low(tile)).any():
             return nothing
         around = np.block([[low(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
-        out, window = np.empty_like(nothing), np.ascontiguousarray(around[near, near])
+        out = np.empty_like(nothing)
+        window = np.ascontiguousarray(around[near, near])
         _support(window, around_cells, grade * CELL_SIZE, numbers.agreeing, least, out)
         return out
 
@@ -238,7 +242,8 @@ def _sow(
             lower_envelope(envelope, grade * CELL_SIZE, grade * CELL_SIZE * np.sqrt(2.0))
             lies = np.isfinite(supported(k)) & (supported(k) <= envelope[thirds[1], thirds[1]] + 0.1)
             cells = k * CELLS + np.flatnonzero(lies)
-            ground[cells], gap[cells] = heights[start[cells]], SEED
+            ground[cells] = heights[start[cells]]
+            gap[cells] = SEED
 
 
 @kernel
@@ -257,7 +262,8 @@ def _support(low: F32, reach: int, grade: float, share: float, least: int, out: 
             out[r - reach, c - reach] = np.inf
             if not np.isfinite(low[r, c]):
                 continue
-            known, agree = 0, 0
+            known = 0
+            agree = 0
             for i in range(r - reach, r + reach + 1):
                 for j in range(c - reach, c + reach + 1):
                     if np.isfinite(low[i, j]):
@@ -274,7 +280,8 @@ def _support(low: F32, reach: int, grade: float, share: float, least: int, out: 
 @inlined
 def _cell_at(tile: int, row: int, col: int, neighbours: I32) -> int:
     """Flat cell of (row, col) counted from a tile's corner; -1 if it lies in a tile that the map does not have."""
-    down, right = row // TILE_CELLS, col // TILE_CELLS
+    down = row // TILE_CELLS
+    right = col // TILE_CELLS
     other = neighbours[tile, down + 1, right + 1]
     return -1 if other < 0 else other * CELLS + (row - down * TILE_CELLS) * TILE_CELLS + col - right * TILE_CELLS
 
@@ -297,7 +304,9 @@ def _placed(cell: int) -> tuple[int, int, int]:
 def _bounds(cell: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, float, float]:
     """(lowest, steeply lowest, highest) height of a point of this cell that continues the measured ground near by."""
     tile, row, col = _placed(cell)
-    low, steep, high = -np.inf, -np.inf, np.inf
+    low = -np.inf
+    steep = -np.inf
+    high = np.inf
     within = _is_within(row, col, _NEAR_CELLS)
     for i in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
         for j in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
@@ -319,7 +328,8 @@ def _like(
     Only points count that have no other within ``clear`` metres above them.
     """
     tile, row, col = _placed(cell)
-    found, within = 0, _is_within(row, col, 2)
+    found = 0
+    within = _is_within(row, col, 2)
     for i in range(-2, 3):
         for j in range(-2, 3):
             other = cell + i * TILE_CELLS + j if within else _cell_at(tile, row + i, col + j, neighbours)
@@ -345,9 +355,12 @@ def _continued(
     near = np.isfinite(low)
     agreed = near and low <= high  # else what was measured lies on both sides of a kerb
     if not agreed:
-        low, high = expected - _NOISE_M - _CLIMB * GAP_STEP_M * width, expected + _NOISE_M + _CLIMB * GAP_STEP_M * width
+        low = expected - _NOISE_M - _CLIMB * GAP_STEP_M * width
+        high = expected + _NOISE_M + _CLIMB * GAP_STEP_M * width
         steep = low
-    best, falls, rises = np.nan, np.nan, np.nan
+    best = np.nan
+    falls = np.nan
+    rises = np.nan
     for k in range(start[cell], start[cell + 1]):
         z = heights[k]
         if low <= z <= high and not abs(best - expected) <= abs(z - expected):
@@ -358,11 +371,19 @@ def _continued(
             rises = z
     if agreed and abs(best - expected) <= _NOISE_M:
         return best
-    grade, below, clear, least = _CLIMB, np.inf, 0.0, _BROAD if near else _BEYOND_GAP
+    grade = _CLIMB
+    below = np.inf
+    clear = 0.0
+    least = _BROAD if near else _BEYOND_GAP
     if not np.isfinite(best):
-        best, clear, least = rises, _OPEN_M, _BROAD
+        best = rises
+        clear = _OPEN_M
+        least = _BROAD
         if np.isfinite(falls):
-            best, grade, below, clear = falls, _FALL, low, 0.0
+            best = falls
+            grade = _FALL
+            below = low
+            clear = 0.0
     if not np.isfinite(best):
         return np.nan
     alike = _like(cell, best, grade, below, clear, start, heights, neighbours)
@@ -387,9 +408,11 @@ def _enter(
     """The ground comes to a cell: as it was measured there, else at the height ``z``, ``width`` from what was."""
     measured = _continued(cell, z, width, start, heights, ground, gap, neighbours)
     if np.isfinite(measured):
-        ground[cell], gap[cell] = measured, 0
+        ground[cell] = measured
+        gap[cell] = 0
     else:
-        ground[cell], gap[cell] = z, width
+        ground[cell] = z
+        gap[cell] = width
 
 
 def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
@@ -405,7 +428,8 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
     waits = np.full(len(gap), UNREACHED, np.uint8)
     waits[seeds] = 0
     queue = tuple(np.empty(1024, kind) for kind in (np.int64, np.float32, np.int32))
-    ends, state = np.full((2, WIDEST + 4), -1, np.int32), np.array([0, -1, 0, 0], dtype=np.int64)
+    ends = np.full((2, WIDEST + 4), -1, np.int32)
+    state = np.array([0, -1, 0, 0], dtype=np.int64)
     _enter_seeds(seeds, start, heights, neighbours, ground, gap)
     while not _grow(start, heights, neighbours, ground, gap, waits, *queue, ends, state):
         queue = tuple(np.concatenate([part, np.empty_like(part)]) for part in queue)  # it was full
@@ -428,11 +452,18 @@ def _grow(
     last entry of each gap's width. ``waits`` (cells,): the narrowest gap over which each cell waits: who comes over as
     wide a one finds it entered. ``state`` (4,): entries, first spare one, cells looked at, width; for the next call.
     """
-    first, last = ends[0], ends[1]
-    n, spare, looked_at, width = state[0], state[1], state[2], state[3]
+    first = ends[0]
+    last = ends[1]
+    n = state[0]
+    spare = state[1]
+    looked_at = state[2]
+    width = state[3]
     while width <= WIDEST:
         if n + 8 > len(cells):
-            state[0], state[1], state[2], state[3] = n, spare, looked_at, width
+            state[0] = n
+            state[1] = spare
+            state[2] = looked_at
+            state[3] = width
             return False
         if looked_at < len(gap):
             cell = looked_at
@@ -446,7 +477,8 @@ def _grow(
                 continue
             first[width] = following[entry]
             cell = cells[entry]
-            following[entry], spare = spare, entry
+            following[entry] = spare
+            spare = entry
             if gap[cell] <= width:
                 continue
             _enter(cell, expected[entry], width, start, heights, neighbours, ground, gap)
@@ -461,11 +493,13 @@ def _grow(
                     continue
                 waits[other] = farther
                 if spare >= 0:
-                    free, spare = spare, following[spare]
+                    free = spare
+                    spare = following[spare]
                 else:
                     free = n
                     n += 1
-                cells[free], expected[free] = other, ground[cell]
+                cells[free] = other
+                expected[free] = ground[cell]
                 _append(first, first, last, following, farther, free)
                 width = min(width, farther)
     return True
@@ -499,7 +533,9 @@ def _raise_at_kerbs(
         if gap[cell] > 0:
             continue
         z = ground[cell]
-        here, there, raised = 0, 0, 0.0
+        here = 0
+        there = 0
+        raised = 0.0
         for k in range(start[cell], start[cell + 1]):
             if abs(heights[k] - z) <= _NOISE_M:
                 here += 1
@@ -510,7 +546,8 @@ def _raise_at_kerbs(
             continue
         tile, row, col = _placed(cell)
         within = _is_within(row, col, 1)
-        above, level = 0, 0.0
+        above = 0
+        level = 0.0
         for i in range(-1, 2):
             for j in range(-1, 2):
                 other = cell + i * TILE_CELLS + j if within else _cell_at(tile, row + i, col + j, neighbours)
@@ -531,7 +568,8 @@ def _level(cells: I64, neighbours: I32, ground: F32, out: F32) -> None:
         cell = cells[k]
         tile, row, col = _placed(cell)
         within = _is_within(row, col, 1)
-        known, total = 0, 0.0
+        known = 0
+        total = 0.0
         for i in range(-1, 2):
             for j in range(-1, 2):
                 other = cell + i * TILE_CELLS + j if within else _cell_at(tile, row + i, col + j, neighbours)

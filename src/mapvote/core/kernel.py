@@ -86,7 +86,8 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
 
     def __init__(self, function: FunctionType, path: str, name: str, file_stamp: object) -> None:
         super().__init__(path, name, file_stamp)
-        self._function, self._file_stamp = function, file_stamp
+        self._function = function
+        self._file_stamp = file_stamp
 
     def _load_index(self) -> dict[Any, str]:
         # Only at a call: what a kernel calls may be declared after it.
@@ -117,7 +118,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 def _compiled_into(function: FunctionType, seen: set[FunctionType]) -> Iterator[str | bytes]:
     """The code and the constants of a kernel and of all kernels that it calls, equal in every process."""
     seen.add(function)
-    code, names = function.__code__, inspect.getclosurevars(function)
+    code = function.__code__
+    names = inspect.getclosurevars(function)
     yield repr((code.co_code, code.co_consts, code.co_names, code.co_varnames))
     for name, value in sorted({**names.globals, **names.nonlocals}.items()):
         called = getattr(value, "py_func", None)

@@ -62,7 +62,8 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         self.kept_points = kept_points
         self._alive: weakref.WeakValueDictionary[TileIndex, Tile] = weakref.WeakValueDictionary()
         self._kept: OrderedDict[TileIndex, Tile] = OrderedDict()
-        self._held, self._lock = 0, RLock()
+        self._held = 0
+        self._lock = RLock()
 
     def add(self, index: TileIndex, points: int) -> None:
         """One more tile can be had from here on."""
@@ -206,7 +207,8 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     for start in range(0, len(points_map), MAP_SIZES.block_points):
         piece = slice(start, start + MAP_SIZES.block_points)
         rows, cols = lattice.cells_of(points_map[piece])
-        tiles[piece, 0], tiles[piece, 1] = rows // TILE_CELLS, cols // TILE_CELLS
+        tiles[piece, 0] = rows // TILE_CELLS
+        tiles[piece, 1] = cols // TILE_CELLS
     number = _numbered(tiles)
     order = np.argsort(number, kind="stable")
     seams = np.flatnonzero(np.diff(number[order])) + 1
@@ -218,7 +220,8 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
 def _numbered(tiles: I32) -> NDArray[np.integer]:
     """(n,) a number for each of the tiles (n, 2), ascending as they do; of two bytes if these are enough, for numpy
     sorts such ten times as fast."""
-    low, high = tiles.min(axis=0).astype(np.int64), tiles.max(axis=0).astype(np.int64)
+    low = tiles.min(axis=0).astype(np.int64)
+    high = tiles.max(axis=0).astype(np.int64)
     rows, cols = (high - low + 1).tolist()
     kind = np.uint16 if rows * cols <= 1 << 16 else np.int64
     return ((tiles[:, 0] - low[0]) * cols + (tiles[:, 1] - low[1])).astype(kind)
@@ -294,7 +297,8 @@ def has_open_ground(point_map: PointMap, min_share: float = 0.2) -> bool:
     cut out the feet of walls are taken for ground, but hardly anything else: 12 % of the cells of a foreign campus map
     without ground look open, 49 % and more of clouds with it. A map larger than memory is judged by its largest tiles.
     """
-    ground, any_point = 0, 0
+    ground = 0
+    any_point = 0
     tiles = point_map.tiles
     for tile in map(tiles.__getitem__, tiles.largest(9) if isinstance(tiles, LazyTiles) else tiles):
         held, stands = (np.zeros(tile.window.rows * tile.window.cols, dtype=np.bool_) for _ in range(2))

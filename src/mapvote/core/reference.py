@@ -82,7 +82,8 @@ class LocalMap:
     """
 
     def __init__(self, point_map: PointMap, window_m: float) -> None:
-        self.point_map, self.window_m = point_map, window_m
+        self.point_map = point_map
+        self.window_m = window_m
         self.outer: Reference | None = None
         """The planes made last; windows are views into them."""
         self._middle: TileIndex | None = None
@@ -93,10 +94,13 @@ class LocalMap:
         """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
         lattice = self.point_map.lattice
         window = window_around(lattice, origin_map[0], origin_map[1], self.window_m)
-        row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
+        row = window.row0 + window.rows // 2
+        col = window.col0 + window.cols // 2
         middle = row // TILE_CELLS, col // TILE_CELLS
         if self.outer is None or window.intersection(self.outer.grid) != window:
-            self.outer, self._middle, self._next = _finished(self._ahead(middle, window)), middle, None
+            self.outer = _finished(self._ahead(middle, window))
+            self._middle = middle
+            self._next = None
         elif middle != self._middle:
             ahead = self._ahead(middle, window)
             done = next(ahead)

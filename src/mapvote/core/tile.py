@@ -179,7 +179,8 @@ class Tile:
         check_array(points, "Tile.points", (None, 3), np.float32)
         fields = {}
         for name, column in self.fields.items():
-            row, new = point_fields().get(name), np.zeros(len(points), dtype=column.dtype)
+            row = point_fields().get(name)
+            new = np.zeros(len(points), dtype=column.dtype)
             if row is not None:
                 values = sent[name] if sent and name in sent else row.unknown(len(points))
                 new = row.in_map(values, column)
@@ -214,12 +215,15 @@ class Tile:
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""
-        ground, base = self.ground_z.reshape(-1)[self.cells], self.base.reshape(-1)[self.cells]
+        ground = self.ground_z.reshape(-1)[self.cells]
+        base = self.base.reshape(-1)[self.cells]
         return column_bits(self.points[:, 2].astype(np.float64), ground, base)
 
     @cached_property
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
-        words, ground_z, base = np.zeros(CELLS, dtype=np.uint64), self.ground_z.reshape(-1), self.base.reshape(-1)
+        words = np.zeros(CELLS, dtype=np.uint64)
+        ground_z = self.ground_z.reshape(-1)
+        base = self.base.reshape(-1)
         mark_obstacles(words, read_only(self.points), read_only(self.cells), read_only(ground_z), read_only(base))
         return words.reshape(self.window.shape)

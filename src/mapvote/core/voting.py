@@ -79,14 +79,21 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
 
 @kernel
 def _decide_cells(tally: I32, backers: I32, abstain: bool, min_votes: int, states: U8) -> None:
-    uos, ues, cos, ces, uns = tally[0], tally[1], tally[2], tally[3], tally[4]
+    uos = tally[0]
+    ues = tally[1]
+    cos = tally[2]
+    ces = tally[3]
+    uns = tally[4]
     for c in range(len(states)):  # most cells have no vote, or only votes for empty: tested in vectors
-        empty, more = ues[c], uos[c] | cos[c] | ces[c] | uns[c]
+        empty = ues[c]
+        more = uos[c] | cos[c] | ces[c] | uns[c]
         s = _UE if empty != 0 else NO_VOTE
         states[c] = _UNDECIDED_YET if more != 0 else s
     for c in range(len(states)):
         if states[c] == _UNDECIDED_YET:
-            uo, ue, co = np.int64(uos[c]), np.int64(ues[c]), np.int64(cos[c])
+            uo = np.int64(uos[c])
+            ue = np.int64(ues[c])
+            co = np.int64(cos[c])
             s = verdict(uo, ue, co, np.int64(ces[c]), np.int64(uns[c]), abstain)
             states[c] = _UN if s in (_CO, _CE) and backers[s, c] < min_votes else s
 
@@ -124,7 +131,8 @@ def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
 
     Votes are counted in bytes first, as many voters as a byte can count; of few that is the tally.
     """
-    shape, silent = (N_STATES, cells), read_only(np.full(cells, NO_VOTE, dtype=np.uint8))
+    shape = (N_STATES, cells)
+    silent = read_only(np.full(cells, NO_VOTE, dtype=np.uint8))
     tally = np.zeros(shape, dtype=_TALLIES.get(np.min_scalar_type(VOTE_UNIT * len(voters)), np.int32))
     for start in range(0, len(voters), _BYTE_MAX):
         counts = tally if tally.dtype == np.uint8 else np.zeros(shape, dtype=np.uint8)
@@ -145,9 +153,13 @@ def count_states(one: U8, two: U8, three: U8, four: U8, counts: U8) -> None:
     at a time would wait for the counts."""
     for start in range(0, len(one), _CACHED_CELLS):
         here = slice(start, start + _CACHED_CELLS)
-        a, b, c, d = one[here], two[here], three[here], four[here]
+        a = one[here]
+        b = two[here]
+        c = three[here]
+        d = four[here]
         for state in range(N_STATES):
-            own, count = np.uint8(state), counts[state, here]
+            own = np.uint8(state)
+            count = counts[state, here]
             for i in range(len(count)):
                 n = count[i]
                 n += a[i] == own
@@ -162,7 +174,11 @@ def add_tally(votes: U16, abstain: bool, tally: I32, backers: I32) -> None:
     """Add one voter's tally ``votes`` (5, cells) to ``tally`` (5, cells), and one to ``backers`` (5, cells) for the
     class that its own votes decide: who counted a class now and then does not stand behind it."""
     for c in range(votes.shape[1]):
-        uo, ue, co, ce, un = votes[0, c], votes[1, c], votes[2, c], votes[3, c], votes[4, c]
+        uo = votes[0, c]
+        ue = votes[1, c]
+        co = votes[2, c]
+        ce = votes[3, c]
+        un = votes[4, c]
         state = verdict(np.int64(uo), np.int64(ue), np.int64(co), np.int64(ce), np.int64(un), abstain)
         if state != NO_VOTE:
             backers[state, c] += 1

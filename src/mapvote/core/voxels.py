@@ -29,7 +29,9 @@ def packed_key(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
 @inlined
 def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
     """The key of the voxel of side ``size`` that holds (x, y, z)."""
-    ix, iy, iz = np.floor(x / size), np.floor(y / size), np.floor(z / size)
+    ix = np.floor(x / size)
+    iy = np.floor(y / size)
+    iz = np.floor(z / size)
     return packed_key(np.int64(ix) + _OFFSET, np.int64(iy) + _OFFSET, np.int64(iz) + _OFFSET)
 
 
@@ -62,7 +64,9 @@ def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
         if table[slot] == 0:
             if 2 * m >= len(table):
                 return -1
-            table[slot], place[slot], first[m] = keys[i], m, i
+            table[slot] = keys[i]
+            place[slot] = m
+            first[m] = i
             m += 1
         of[i] = place[slot]
     return m
@@ -70,7 +74,8 @@ def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
 
 def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
     """(``of`` (n,), ``first`` (m,)) of :func:`_group`, by a table of ``slots`` (2^k) or more: 16,384 fit a cache."""
-    of, first = np.empty(len(keys), dtype=np.int32), np.empty(len(keys), dtype=np.int64)
+    of = np.empty(len(keys), dtype=np.int32)
+    first = np.empty(len(keys), dtype=np.int64)
     while True:
         m = _group(keys, np.zeros(slots, dtype=np.int64), np.empty(slots, dtype=np.int32), of, first)
         if m >= 0:
@@ -88,7 +93,8 @@ def _first(keys: I64, table: I64, first: I64) -> int:
         if table[slot] == 0:
             if 2 * m >= len(table):
                 return -1
-            table[slot], first[m] = keys[i], i
+            table[slot] = keys[i]
+            first[m] = i
             m += 1
     return m
 
@@ -109,7 +115,8 @@ def found_among(rows: F32 | F64, others: F32 | F64) -> Bool:
     Rows are numbered word by word: equal numbers, equal words so far.
     """
     words = np.concatenate([others, rows]).view(np.uint32)
-    number, slots = np.zeros(len(words), dtype=np.int64), 1 << (2 * len(words)).bit_length()
+    number = np.zeros(len(words), dtype=np.int64)
+    slots = 1 << (2 * len(words)).bit_length()
     for word in words.T:
         number = grouped(((number << 32) | word) + 1, slots)[0].astype(np.int64)
     known = np.zeros(len(words), dtype=np.bool_)
@@ -123,7 +130,8 @@ def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int
     for j in range(len(keys)):
         slot = slot_of(keys[j], table_keys)
         if table_keys[slot] == 0:
-            table_keys[slot], table_rows[slot] = keys[j], n
+            table_keys[slot] = keys[j]
+            table_rows[slot] = n
             n += 1
         rows[j] = table_rows[slot]
     return n
@@ -140,7 +148,9 @@ def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
         k = rows[of_point[i]]
         # Moments are taken from the first point: large world coordinates would eat the digits.
         if sums[k, 0] == 0.0:
-            sums[k, 4], sums[k, 5], sums[k, 6] = points[i, 0], points[i, 1], points[i, 2]
+            sums[k, 4] = points[i, 0]
+            sums[k, 5] = points[i, 1]
+            sums[k, 6] = points[i, 2]
         sums[k, 0] += 1.0
         sums[k, 1] += points[i, 0] - sums[k, 4]
         sums[k, 2] += points[i, 1] - sums[k, 5]
@@ -204,7 +214,9 @@ def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> in
     reach = float(_OFFSET) * size
     beyond = -1
     for i in range(len(points)):
-        x, y, z = points[i, 0] - x0, points[i, 1] - y0, points[i, 2]
+        x = points[i, 0] - x0
+        y = points[i, 1] - y0
+        z = points[i, 2]
         if not (abs(x) < reach and abs(y) < reach and abs(z) < reach) and beyond < 0:
             beyond = i
         keys[i] = voxel_key(x, y, z, size)
@@ -235,11 +247,14 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 @kernel
 def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) -> None:
     """The key (m,) of every ``every``-th of the points (n, 3), in voxels of side ``size``."""
-    scale, middle, step = 1.0 / size, float(_OFFSET), np.uint64(every)
+    scale = 1.0 / size
+    middle = float(_OFFSET)
+    step = np.uint64(every)
     for j in range(np.uint64(0), np.uint64(len(keys))):  # int32 vectorises, and holds what is within reach
         i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
-        ix, iy = np.int32(points[i, 0] * scale + middle), np.int32(points[i, 1] * scale + middle)
+        ix = np.int32(points[i, 0] * scale + middle)
+        iy = np.int32(points[i, 1] * scale + middle)
         keys[j] = packed_key(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
 
 

@@ -83,7 +83,8 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
 
 def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding]:
     """Which topics may serve as prior, whether they span the scans, and how far the LiDAR sits from what they track."""
-    clouds, poses = list(bag.topics(*CLOUDS)), list(bag.topics(*POSES, *GNSS))
+    clouds = list(bag.topics(*CLOUDS))
+    poses = list(bag.topics(*POSES, *GNSS))
     if not clouds:
         return
     if not poses:
@@ -92,7 +93,9 @@ def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding
     if options.prior is None:
         what = f"no prior is chosen, but there are poses: {', '.join(poses)}"
         yield Finding("warning", what, f"--prior {poses[0]}")
-    lidar, scans, edges = frame_id(bag, clouds[0]), orders[clouds[0]].stamps_ns, static_frames(bag)
+    lidar = frame_id(bag, clouds[0])
+    scans = orders[clouds[0]].stamps_ns
+    edges = static_frames(bag)
     for topic in poses:
         stamps = orders[topic].stamps_ns
         outside = float(((scans < stamps.min()) | (scans > stamps.max())).mean()) if len(stamps) and len(scans) else 0.0

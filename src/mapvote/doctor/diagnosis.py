@@ -195,7 +195,8 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     except MapvoteError as error:
         yield Finding("error", str(error), "cast it again from the drive, or copy it again")
         return
-    changed, determined = int(counts[list(_CHANGED)].sum()), int(counts[list(_DETERMINED)].sum())
+    changed = int(counts[list(_CHANGED)].sum())
+    determined = int(counts[list(_DETERMINED)].sum())
     if not ballot.tiles:
         what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
         yield Finding("error", what, "see mapvote doctor DRIVE --map MAP")
@@ -210,7 +211,8 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     if ballot.median_sigma_m > BALLOT_CHECK.sigma_m:
         what = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
         yield Finding("warning", what, "cells are 0.3 m: such votes blur")
-    misfit_m, sigma_m = ballot.prior_misfit_m, ballot.prior_sigma_m
+    misfit_m = ballot.prior_misfit_m
+    sigma_m = ballot.prior_sigma_m
     if misfit_m is not None and sigma_m is not None and misfit_m > max(3.0 * sigma_m, 0.5):
         what = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
         yield Finding("warning", what, "measure the offset: mapvote doctor DRIVE --map MAP")

@@ -254,7 +254,8 @@ class DriveEvidence:
     @cached_property
     def _starts(self) -> I64:
         """First scans of runs spread evenly over the drive, half of them where the prior turns most."""
-        n, span = len(self.readable), RUN_RULE.scans + 2 * RUN_RULE.most_step
+        n = len(self.readable)
+        span = RUN_RULE.scans + 2 * RUN_RULE.most_step
         if n <= span:
             return np.zeros(1, dtype=np.int64)
         even = np.linspace(0, n - span, min(RUN_RULE.runs, max(1, n // RUN_RULE.scans))).astype(np.int64)
@@ -287,8 +288,11 @@ class DriveEvidence:
         """The run of at most ``scans`` scans that begins at readable scan ``start``."""
         ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=RUN_RULE.half_window_m))
         ndt_map.enter(_near(self._points(self.readable[start])))
-        indices, poses, fits = [start], [np.eye(4)], [1.0]
-        i, step = start, 1
+        indices = [start]
+        poses = [np.eye(4)]
+        fits = [1.0]
+        i = start
+        step = 1
         while len(indices) < scans and i + step < len(self.readable):
             i += step
             clouds = thin_for_levels(_near(self._points(self.readable[i])))
@@ -337,7 +341,8 @@ def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 1e-3] / length[length > 1e-3, None]
     depth = -np.einsum("ij,ij->i", normals, a[length > 1e-3])
-    normals, depth = normals * np.sign(depth)[:, None], np.abs(depth)  # towards the sensor
+    normals = normals * np.sign(depth)[:, None]
+    depth = np.abs(depth)  # towards the sensor
     for normal, d in zip(normals, depth, strict=True):
         axis = int(np.argmax(np.abs(normal)))
         if not ROAD_PLANE.depth_m[0] <= d <= ROAD_PLANE.depth_m[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
@@ -434,7 +439,8 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     """Does the road lie below the sensor, as deep as a vehicle is high, and level by the prior?"""
     if len(e.readable) <= 2:
         return
-    road, T = e.road, e.T
+    road = e.road
+    T = e.T
     if road.up == "-z":
         what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
         mend = "negate y and z of every point (or only z, if right and left are right already)"
@@ -465,7 +471,8 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     normal = np.mean([T[i, :3, :3] @ road.normal for i in e.some], axis=0)
     tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
     if tilt_deg > 4.0:
-        pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
+        pitch = np.degrees(np.arcsin(-road.normal[0]))
+        roll = np.degrees(np.arcsin(road.normal[1]))
         what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg"
         mend = f"turn the points by {roll:.1f} deg about x and {pitch:.1f} deg about y, which levels the road in them, "
         mend += "or put the sensor's tilt into the prior's rotations; on a hill all is well"
@@ -474,7 +481,8 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
 
 def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
     """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
-    stamps_ns, times = drive.stamps_ns, source_of_times(drive.path)
+    stamps_ns = drive.stamps_ns
+    times = source_of_times(drive.path)
     broken = [run for run in runs if run.usual_fit < RUN_RULE.least_fit]
     leaps = np.concatenate([~_agree_with_time(run, stamps_ns) for run in runs])
     speed = [run.length_m / (1e-9 * float(np.diff(stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]

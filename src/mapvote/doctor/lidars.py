@@ -121,7 +121,8 @@ def _measured(
         found = [one.refine(cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
         off = np.median([log(inverse(T) @ T_found) for T_found in found], axis=0)
         spread = np.median([np.abs(log(inverse(T) @ T_found) - off) for T_found in found], axis=0)
-        off_m, off_deg = float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:])))
+        off_m = float(np.linalg.norm(off[:3]))
+        off_deg = float(np.degrees(np.linalg.norm(off[3:])))
         steady = np.linalg.norm(spread[:3]) < 0.3 * off_m or np.degrees(np.linalg.norm(spread[3:])) < 0.3 * off_deg
         if steady and (off_m > rules.off_m or off_deg > rules.off_deg):
             what = f"by its points {topics[k + 1]} sits {off_m:.2f} m and {off_deg:.1f} deg off its stated place"

@@ -67,7 +67,9 @@ class LocalisedDrive:
     @classmethod
     def of(cls, drive: Drive, T_map_lidar: Sequence[F64] | F64, sure: Bool) -> LocalisedDrive:
         """Findings on a recorded ``drive`` whose scans were localised at poses (n, 4, 4), where ``sure`` (n,)."""
-        prior, sigma_m, sigma_deg = drive.T_map_lidar_prior, drive.prior_sigma_m, drive.prior_sigma_deg
+        prior = drive.T_map_lidar_prior
+        sigma_m = drive.prior_sigma_m
+        sigma_deg = drive.prior_sigma_deg
         if prior is not None and drive.prior_sigmas is not None:  # fixes, which know no attitude
             fixed = np.isfinite(drive.prior_sigmas[:, 0])
             prior = np.where(fixed[:, None, None], prior, np.nan)
@@ -149,7 +151,8 @@ def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRu
             told = np.isfinite(drive.T_prior).all(axis=(1, 2))
             believed[told] = drive.T_prior[told, :3, 3]
         on_map = np.isfinite(point_map.ground_under(believed)) | drive.sure
-    scans, sure = int(on_map.sum()), int(drive.sure.sum())
+    scans = int(on_map.sum())
+    sure = int(drive.sure.sum())
     if scans >= rules.least_scans and sure < rules.least_share * scans:
         what = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
         yield Finding("error", what, f"is it the map of this street? {_PLACE_MEND}")
@@ -177,7 +180,8 @@ def _ways(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[
     marks = np.searchsorted(driven_m, np.arange(0.0, driven_m[-1], piece))
     if len(marks) < 3:
         return
-    a, b = found[marks[:-1]], found[marks[1:]]
+    a = found[marks[:-1]]
+    b = found[marks[1:]]
     came_m = np.linalg.norm(drive.T_map_lidar[b, :3, 3] - drive.T_map_lidar[a, :3, 3], axis=1)
     believed_m = np.linalg.norm(drive.T_prior[b, :3, 3] - drive.T_prior[a, :3, 3], axis=1)
     slack_m = rules.way_share * np.maximum(came_m, believed_m) + 4.0 * drive.sigma_m

@@ -271,7 +271,8 @@ def _middle(point_map: PointMap) -> F64:
 
 def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointMap | None:
     """Its points around the drive, ``scale`` times as large about ``centre``; None if there are hardly any."""
-    low, high = T[:, :2, 3].min(axis=0) - MAP_FIT_RULE.around_m, T[:, :2, 3].max(axis=0) + MAP_FIT_RULE.around_m
+    low = T[:, :2, 3].min(axis=0) - MAP_FIT_RULE.around_m
+    high = T[:, :2, 3].max(axis=0) + MAP_FIT_RULE.around_m
     parts = []
     for tile in point_map.tiles.values():
         points = centre + scale * (tile.points_map - centre)
@@ -316,7 +317,8 @@ def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
 
 def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], judge: Judge) -> Place:
     """From the guesses themselves, and from the best of a grid of 6 m and 3 deg around them if none of them fits."""
-    clouds, few = thin_for_levels(points), solid_sample(points, LEVELS[-1].points_m)
+    clouds = thin_for_levels(points)
+    few = solid_sample(points, LEVELS[-1].points_m)
     best = Place(i, guesses[0], 0.0, 0.0)
     for guess in guesses:
         ndt_map = around(guess[:3, 3])
@@ -363,7 +365,8 @@ def _outside(T: F64, point_map: PointMap) -> Iterator[Finding]:
     )
     share = float((outside_m == 0).mean())
     if share == 0:
-        a, b = low.min(axis=0), low.max(axis=0) + side
+        a = low.min(axis=0)
+        b = low.max(axis=0) + side
         what = (
             f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
             f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
@@ -395,7 +398,9 @@ def _where_not(places: Sequence[Place], good: Sequence[Place]) -> Iterator[Findi
 
 def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     """The difference between prior and map, with its error."""
-    off_m, sigma_m, sigma_deg = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m, drive.prior_sigma_deg
+    off_m = float(np.linalg.norm(d.offset_m))
+    sigma_m = drive.prior_sigma_m
+    sigma_deg = drive.prior_sigma_deg
     yaw_deg = float(np.degrees(np.arctan2(d.rotation[1, 0], d.rotation[0, 0])))
     tilt_deg = float(np.degrees(np.arccos(np.clip(d.rotation[2, 2], -1.0, 1.0))))
     x, y, z = d.offset_m
@@ -458,11 +463,13 @@ class _Along(NamedTuple):
 
 def _as_time(d: Similarity, drive: Drive, rules: MapFitRule = MAP_FIT_RULE) -> _Along | None:
     """The shift of a prior that drives straight ahead, as a time; None if it does not lie along its way."""
-    T, stamps_ns = drive.T_map_lidar_prior, drive.stamps_ns
+    T = drive.T_map_lidar_prior
+    stamps_ns = drive.stamps_ns
     if T is None or len(T) < 3:
         return None
     way = T[-1, :2, 3] - T[0, :2, 3]
-    way_m, driven_s = float(np.linalg.norm(way)), 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
+    way_m = float(np.linalg.norm(way))
+    driven_s = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
     driven_m = float(np.linalg.norm(np.diff(T[:, :2, 3], axis=0), axis=1).sum())
     ahead_m = float(d.offset_m[:2] @ way) / max(way_m, 1e-6)
     beside_m = abs(float(d.offset_m[0] * way[1] - d.offset_m[1] * way[0])) / max(way_m, 1e-6)

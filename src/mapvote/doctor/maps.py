@@ -160,7 +160,8 @@ def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
 
 def _every(pieces: Pieces, step: int) -> F64:
     """(m, 3) every ``step``-th point."""
-    parts, skip = [], 0
+    parts = []
+    skip = 0
     for points in pieces():
         parts.append(points[skip::step].astype(np.float64))
         skip = (skip - len(points)) % step
@@ -168,7 +169,9 @@ def _every(pieces: Pieces, step: int) -> F64:
 
 
 def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> Iterator[Finding]:
-    wide, strays, far_m = high - low, 0, 0.0
+    wide = high - low
+    strays = 0
+    far_m = 0.0
     for points in pieces():
         outside = np.zeros(len(points), np.bool_)
         for axis in range(3):  # three columns are read faster than rows of three
@@ -185,16 +188,19 @@ def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> Iterator[Finding]:
 def spacing(pieces: Pieces, some: F64) -> F64:
     """(m,) distance of points to their nearest neighbour, of all points around one place, the middle of ``some``."""
     centre = np.median(some[:: max(1, len(some) // 1000)], axis=0)
-    near, away = np.empty((0, 3)), np.empty(0)
+    near = np.empty((0, 3))
+    away = np.empty(0)
     for points in pieces():
         distance = np.maximum(np.abs(points[:, 0] - centre[0]), np.abs(points[:, 1] - centre[1]))
         close = distance <= (away.max() if len(away) == MAP_CHECK.neighbour_points else np.inf)
         if not close.any():
             continue
-        near, away = np.concatenate([near, points[close]]), np.concatenate([away, distance[close]])
+        near = np.concatenate([near, points[close]])
+        away = np.concatenate([away, distance[close]])
         if len(near) > MAP_CHECK.neighbour_points:
             chosen = np.sort(np.argpartition(away, MAP_CHECK.neighbour_points - 1)[: MAP_CHECK.neighbour_points])
-            near, away = near[chosen], away[chosen]
+            near = near[chosen]
+            away = away[chosen]
     axis = int(np.argmax(np.ptp(near, axis=0)))
     order = np.argsort(near[:, axis])
     place = np.empty(len(order), np.int64)
@@ -210,18 +216,22 @@ def _to_nearest(points: F64, axis: int, which: I64, out: F64) -> None:
     """Into ``out`` (m,) the distance from the points ``which`` (m,) to the nearest other one of the points (n, 3),
     which ascend along ``axis``. A tree would import half of scipy, which takes longer than all of this check."""
     for w in range(len(which)):
-        i, best = which[w], np.inf
+        i = which[w]
+        best = np.inf
         for way in (-1, 1):
             j = i + way
             while 0 <= j < len(points) and (points[j, axis] - points[i, axis]) ** 2 < best:
-                x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+                x = points[j, 0] - points[i, 0]
+                y = points[j, 1] - points[i, 1]
+                z = points[j, 2] - points[i, 2]
                 best = min(best, x * x + y * y + z * z)
                 j += way
         out[w] = np.sqrt(best)
 
 
 def _units(wide: F64, apart: F64) -> Iterator[Finding]:
-    apart_m, mend = float(np.median(apart)), "give the points in metres"
+    apart_m = float(np.median(apart))
+    mend = "give the points in metres"
     if wide.max() < 5.0:
         what = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
         yield Finding("error", what, mend)
@@ -277,7 +287,9 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
     """The same of points as a file has them, of which no map has been made yet. MapvoteError if their coordinates
     cannot be made metres."""
     finite = on_earth(cloud.points)
-    n, bad, found = len(finite), int((~finite).sum()), []
+    n = len(finite)
+    bad = int((~finite).sum())
+    found = []
     if bad:
         what = f"{bad} of {n} points are not finite"
         mend = "export the file again; of a LAS the header's scales and offsets may be broken"
@@ -393,7 +405,8 @@ def _missing_tiles(point_map: PointMap) -> Iterator[Finding]:
 
 def _frame(point_map: PointMap) -> Finding:
     frame = frame_of(point_map.georeference)
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
     for points in tile_by_tile(point_map)():
         low = np.minimum(low, points.min(axis=0, initial=np.inf))
         high = np.maximum(high, points.max(axis=0, initial=-np.inf))
@@ -410,7 +423,8 @@ def _lean(standing: F64) -> Iterator[Finding]:
     if len(sides) < 3 * LEAN_CHECK.alike:
         return
     # An object along (a, b, 1) has sides n with n_x a + n_y b = -n_z: Cauchy's robust least squares.
-    A, b = sides[:, :2], -sides[:, 2]
+    A = sides[:, :2]
+    b = -sides[:, 2]
     lean: F64 = np.zeros(2)
     for _ in range(20):
         off = A @ lean - b
@@ -423,7 +437,8 @@ def _lean(standing: F64) -> Iterator[Finding]:
     sigma_deg = float(np.degrees(spread * np.sqrt(LEAN_CHECK.alike * along @ np.linalg.inv(normal) @ along)))
     by_deg = float(np.degrees(np.arctan(by)))
     if by_deg > max(LEAN_CHECK.lean_deg, LEAN_CHECK.lean_sigmas * sigma_deg):
-        pitch, roll = np.degrees(np.arctan(lean[0])), np.degrees(np.arctan(-lean[1]))
+        pitch = np.degrees(np.arctan(lean[0]))
+        roll = np.degrees(np.arctan(-lean[1]))
         what = f"walls and poles lean by {by_deg:.1f} deg (+-{sigma_deg:.1f}): the map is tilted"
         mend = f"level it: turn its points back by pitch {pitch:.1f} deg (about y) and roll {roll:.1f} deg (about x)"
         yield Finding("warning", what, mend)

@@ -67,7 +67,9 @@ def _moved(of_positions: Callable[[F64], F64]) -> Rule:
 
 def _headed(T: F64, yaw: F64) -> F64:
     """The same positions, level, with these headings (n,)."""
-    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    zero = np.zeros(len(yaw))
     rotations = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]])
     return poses_at(T[:, :3, 3], rotations.transpose(2, 0, 1))
 
@@ -82,7 +84,8 @@ def _course(T: F64) -> F64:
     p = T[:, :2, 3]
     step = np.median(np.linalg.norm(np.diff(p, axis=0), axis=1)) if len(p) > 1 else 0.0
     k = int(np.clip(np.ceil(1.5 / max(float(step), 0.01)), 1, max(1, len(p) // 4)))
-    last, first = np.minimum(np.arange(len(p)) + k, len(p) - 1), np.maximum(np.arange(len(p)) - k, 0)
+    last = np.minimum(np.arange(len(p)) + k, len(p) - 1)
+    first = np.maximum(np.arange(len(p)) - k, 0)
     way = p[last] - p[first]
     return np.asarray(np.arctan2(way[:, 1], way[:, 0]))
 
@@ -108,7 +111,8 @@ def _from_degrees(first: int) -> Rule:
     """Positions as longitude and latitude in degrees; ``first``: column of the longitude."""
 
     def metres(p: F64) -> F64:
-        longitude, latitude = p[:, first], p[:, 1 - first]
+        longitude = p[:, first]
+        latitude = p[:, 1 - first]
         east = longitude * PRIOR_CHECK.degree_m * np.cos(np.radians(np.clip(latitude[0], -89, 89)))
         return np.column_stack([east, latitude * PRIOR_CHECK.degree_m, p[:, 2]])
 
@@ -250,7 +254,8 @@ def _residuals(T: F64, runs: Sequence[Run]) -> F64:
     out = []
     for run in runs:
         for k in (len(run.indices) // 2, len(run.indices) - 1):
-            believed, seen = inverse(T[run.indices[0]]) @ T[run.indices[k]], run.T_first_lidar[k]
+            believed = inverse(T[run.indices[0]]) @ T[run.indices[k]]
+            seen = run.T_first_lidar[k]
             apart = inverse(seen) @ believed
             if np.linalg.det(apart[:3, :3]) < 0:
                 out.append(np.array([*apart[:3, 3], np.pi, np.pi, np.pi]))
@@ -373,9 +378,12 @@ def fit_similarity(
     both sets are turned against each other; this needs a drive that moves.
     """
     Rotation = scipy.spatial.transform.Rotation
-    middle, there = T_from[:, :3, 3].mean(axis=0), T_to[:, :3, 3].mean(axis=0)
-    p, q = T_from[:, :3, 3] - middle, T_to[:, :3, 3] - there
-    R_from, R_to = Rotation.from_matrix(T_from[:, :3, :3]), Rotation.from_matrix(T_to[:, :3, :3])
+    middle = T_from[:, :3, 3].mean(axis=0)
+    there = T_to[:, :3, 3].mean(axis=0)
+    p = T_from[:, :3, 3] - middle
+    q = T_to[:, :3, 3] - there
+    R_from = Rotation.from_matrix(T_from[:, :3, :3])
+    R_to = Rotation.from_matrix(T_to[:, :3, :3])
 
     def moved(x: F64) -> F64:
         return np.asarray(np.exp(x[6]) * Rotation.from_rotvec(x[3:6]).apply(p) + x[:3] - q)
@@ -389,7 +397,8 @@ def fit_similarity(
         return np.concatenate([(moved(x) / position_m).ravel(), rotations.ravel(), [known]])
 
     start = np.zeros(9 if own_turn else 7)
-    start[3:6], start[6] = (R_to * R_from.inv()).mean().as_rotvec(), np.log(scale[0])
+    start[3:6] = (R_to * R_from.inv()).mean().as_rotvec()
+    start[6] = np.log(scale[0])
     found = scipy.optimize.least_squares(off, start, loss="soft_l1", f_scale=2.0, max_nfev=100)
     x = found.x
     spread = max(1.0, 1.4826 * float(np.median(np.abs(found.fun))))

@@ -113,7 +113,8 @@ def check_attitude(e: DriveEvidence) -> Iterator[Finding]:
 
 def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     """(findings, the poses (n, 4, 4) mended as far as is known), of poses T (n, 4, 4)."""
-    drive, runs = e.drive, e.runs
+    drive = e.drive
+    runs = e.runs
     length_m = float(np.median([run.length_m for run in runs]))
     prior_m = float(np.median([np.linalg.norm(T[r.indices[-1], :3, 3] - T[r.indices[0], :3, 3]) for r in runs]))
     if length_m < 1.0 and prior_m < 1.0:
@@ -148,13 +149,15 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
         return [first, behind], other.reading.poses(one.reading.poses(T))
     group = _like_the_best(best, fits, length_m, runs)
     named = replace(_named(group, as_it_is, best, length_m), readings=_for_a_map(group, fits, as_it_is, T))
-    found, mended = [named], best.reading.poses(T)
+    found = [named]
+    mended = best.reading.poses(T)
     right_handed = bool(np.linalg.det(mended[0, :3, :3]) > 0)
     if len(group) == 1 and right_handed and best.median > 0.1 + 0.02 * length_m:  # another fault may hide behind it
         more, twice_mended = compare(e, mended)
         errors = [f for f in more if f.severity == "error"]
         more = [replace(f, what=f"and once that is mended: {f.what}", readings=()) for f in errors]
-        found, mended = found + more, twice_mended if more else mended
+        found = found + more
+        mended = twice_mended if more else mended
     return found, mended
 
 
@@ -263,7 +266,8 @@ def _reading_of(number: Number, T: F64, runs: Sequence[Run], road: Road) -> Read
     if number.kind == "pitch":
         side = "scans" if road.tilt_deg > 0.5 * abs(value) else "prior"
         return Reading(what, mend, number.poses, side, angle=True)
-    forward, drift = _forward_deg(runs), drift_angle_deg(T)
+    forward = _forward_deg(runs)
+    drift = drift_angle_deg(T)
     if abs(forward) > max(0.5 * abs(value), 2.0 * abs(drift)):
         back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
         what = f"the scans {back}are turned by {forward:.1f} deg about z (+-{number.sigma:.1f})"
@@ -283,7 +287,8 @@ def _scale_words(m: Number, road: Road) -> tuple[str, str]:
     """Which side has the wrong scale shows by the sensor's height over the road."""
     low, high = PRIOR_FIT_RULE.height_m
     size = f"{m.value:.3f} times (+-{m.sigma:.3f})" if 0.1 < m.value < 10 else f"{m.value:.3g} times"
-    usual, other = low <= road.depth_m <= high, low <= road.depth_m * m.value <= high
+    usual = low <= road.depth_m <= high
+    other = low <= road.depth_m * m.value <= high
     unit = _unit_near(m)
     if road.is_there and other and not usual:
         what = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
@@ -314,7 +319,8 @@ def _nothing_fits(as_it_is: _Fit, runs: Sequence[Run], length_m: float, prior_m:
     fits = as_it_is.misfit < 0.1 + 0.1 * length_m
     if fits.mean() >= 0.25:
         bad = [run for run, good in zip(runs, fits, strict=True) if not good]
-        first, last = bad[0].indices[0], bad[-1].indices[-1]
+        first = bad[0].indices[0]
+        last = bad[-1].indices[-1]
         what = f"the prior fits the scans in {fits.sum()} of {len(fits)} places only; it does not between scans "
         mend = "did it stand still, jump or change its frame there? Leave that part out"
         return Finding("error", f"{what}{first} and {last}", mend)
@@ -328,7 +334,9 @@ def _nothing_fits(as_it_is: _Fit, runs: Sequence[Run], length_m: float, prior_m:
 def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Finding]:
     """Findings on poses T (n, 4, 4) with small errors: scale, turn and pitch by the chain, the shift in time by the
     runs as well. A deviation below four standard errors cannot be decided: a note."""
-    chain, stamps_ns, sigma_m = e.chain.unbroken(), e.drive.stamps_ns, e.drive.prior_sigma_m
+    chain = e.chain.unbroken()
+    stamps_ns = e.drive.stamps_ns
+    sigma_m = e.drive.prior_sigma_m
     if len(chain.indices) < len(e.chain.indices):  # though the runs fit by themselves
         before, scan = e.chain.indices[len(chain.indices) - 1 : len(chain.indices) + 1]
         what = f"between scans {before} and {scan} the sensor is elsewhere at once: they do not fit each other"
@@ -364,7 +372,8 @@ def fit_to_chain(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> ChainFit | N
     if len(seen) < 5:
         return None
     away = seen[:, :3, 3] - seen[:, :3, 3].mean(axis=0)
-    reach_m, extent_m = float(np.sqrt((away**2).sum(axis=1).mean())), float(np.linalg.norm(np.ptp(away, axis=0)))
+    reach_m = float(np.sqrt((away**2).sum(axis=1).mean()))
+    extent_m = float(np.linalg.norm(np.ptp(away, axis=0)))
     if reach_m < 1.0:
         return None
     fit = fit_similarity(
@@ -414,7 +423,9 @@ def _places(as_it_is: _Fit, runs: Sequence[Run], prior_sigma_m: float) -> Iterat
     bad = as_it_is.misfit > 4.0 * usual + 1.0
     if bad.any():
         worst = int(np.argmax(as_it_is.misfit))
-        first, last, most_m = runs[worst].indices[0], runs[worst].indices[-1], float(as_it_is.misfit[worst])
+        first = runs[worst].indices[0]
+        last = runs[worst].indices[-1]
+        most_m = float(as_it_is.misfit[worst])
         what = (
             f"between scans {first} and {last} the prior is {most_m:.1f} m off the scans' motion, "
             f"elsewhere {usual:.1f} m ({bad.sum()} of {len(runs)} places)"

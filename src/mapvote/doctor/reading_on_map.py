@@ -72,7 +72,8 @@ def decided_by_map(
         best = confirmed(on_map, drive.prior_sigma_m)
         if best is None or readings[best] is AS_IT_IS:
             continue
-        reading, its = readings[best], on_map[best]
+        reading = readings[best]
+        its = on_map[best]
         what = (
             f"{reading.name}: so {its.fit} of {its.scans} scans checked fit the map, {its.off_m:.1f} m from the prior"
         )

@@ -192,7 +192,8 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
     n = len(xyz)
     share = 1.0 / max(n, 1)
     level = xyz if R is None else xyz @ R.T
-    distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(level[:, 1], level[:, 0])
+    distance = np.sqrt((xyz**2).sum(axis=1))
+    azimuth = np.arctan2(level[:, 1], level[:, 0])
     seen = np.cumsum(
         np.bincount(
             np.minimum(distance / SCAN_CHECK.bin_m, SCAN_CHECK.range_bins - 1.0).astype(np.int64),
@@ -208,8 +209,10 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
         off = xyz[whole] / quantum
         rounded.append((np.abs(off - np.round(off)) < 1e-3).all(axis=1).sum() / max(n, 1))
     row = np.zeros(1, dtype=_LOOK)[0]
-    row["index"], row["count"] = index, len(points)
-    row["low"], row["high"] = xyz.min(axis=0, initial=np.inf), xyz.max(axis=0, initial=-np.inf)
+    row["index"] = index
+    row["count"] = len(points)
+    row["low"] = xyz.min(axis=0, initial=np.inf)
+    row["high"] = xyz.max(axis=0, initial=-np.inf)
     row["mean"] = xyz.sum(axis=0) * share
     row["range_m"] = [(np.searchsorted(seen, part * n) + 0.5) * SCAN_CHECK.bin_m for part in (0.1, 0.5, 0.99)]
     row["sectors"] = np.bincount(sectors, minlength=SCAN_CHECK.sectors) * share
@@ -236,7 +239,8 @@ def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
 
 def _in_map_frame(T: F64, looks: Looks) -> bool:
     """Whether the points lie around the prior, or move along with it: then they are in the map's frame already."""
-    position, mean = T[looks["index"], :3, 3], looks["mean"]
+    position = T[looks["index"], :3, 3]
+    mean = looks["mean"]
     away_m = float(np.median(np.linalg.norm(position, axis=1)))
     off_m = float(np.median(np.linalg.norm(mean - position, axis=1)))
     if away_m > SCAN_CHECK.far_m and off_m < 0.5 * away_m:
@@ -244,7 +248,8 @@ def _in_map_frame(T: F64, looks: Looks) -> bool:
     p = position[:, :2]
     if len(p) < 5 or np.linalg.norm(p.max(axis=0) - p.min(axis=0)) < 8.0:
         return False
-    spread, centre = p - p.mean(axis=0), mean[:, :2] - mean[:, :2].mean(axis=0)
+    spread = p - p.mean(axis=0)
+    centre = mean[:, :2] - mean[:, :2].mean(axis=0)
     slope = float((spread * centre).sum() / (spread**2).sum())
     off = np.linalg.norm(centre - spread, axis=1)
     return 0.8 < slope < 1.2 and float(np.median(off)) < 0.4 * float(np.median(np.linalg.norm(spread, axis=1)))
@@ -257,7 +262,8 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
     step_s = np.diff(drive.stamps_ns) * 1e-9
     median_s = float(np.median(step_s))
     for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
-        large, small = median_s > 5.0, median_s < 0.01
+        large = median_s > 5.0
+        small = median_s < 0.01
         if (large and 0.02 <= median_s / factor <= 2.0) or (small and 0.02 <= median_s * factor <= 2.0):
             wrong = f"are {unit}, not seconds" if large else f"were divided by {factor:g}"
             what = f"scans are {median_s:g} s apart: the times {wrong}"
@@ -269,7 +275,8 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
         times = source_of_times(drive.path)
         mend = f"if scans were left out, all is well; else {times} or rate_hz (--rate, drive.toml) are wrong"
         yield Finding("warning", what, mend)
-    holes, longest = int((step_s > 1.8 * median_s).sum()), int(np.argmax(step_s))
+    holes = int((step_s > 1.8 * median_s).sum())
+    longest = int(np.argmax(step_s))
     if holes:
         what = f"{holes} holes in the times, the longest {step_s[longest]:.2f} s after scan {longest}"
         grave: Severity = "warning" if step_s[longest] > 5.0 * median_s else "note"
@@ -283,7 +290,8 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
 def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
     """Jumps of the prior, rows that stand still, rounding."""
     steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-    way_m, usual_m = float(steps_m.sum()), float(np.median(steps_m))
+    way_m = float(steps_m.sum())
+    usual_m = float(np.median(steps_m))
     if way_m < 0.5:
         what = f"the prior does not move ({way_m:.2f} m in {len(T)} scans)"
         yield Finding("warning", what, "if the vehicle did, the file is not its trajectory; else all is well")
@@ -385,7 +393,8 @@ def _refused(drive: Drive, looks: Looks) -> Iterator[Finding]:
         return
     i, why = min(looks.refused.items())
     others = f" (and {len(looks.refused) - 1} more of {len(drive)} scans)" if len(looks.refused) > 1 else ""
-    T, mend = drive.T_map_lidar_prior, ""
+    T = drive.T_map_lidar_prior
+    mend = ""
     if "not finite or beyond" in why and T is not None and np.linalg.norm(T[i, :3, 3]) > 2000.0:
         mend = "are the points in the map's frame already? Then take them back: p_lidar = inverse(T_map_lidar) p"
     yield Finding("error", why + others, mend)
@@ -416,7 +425,8 @@ def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
         what = f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
         yield Finding("error", what, "name all columns in their order: --columns x,y,z,intensity,ring")
         return
-    unit, spread = np.median(looks["unit"], axis=0), np.median(looks["high"] - looks["low"], axis=0)
+    unit = np.median(looks["unit"], axis=0)
+    spread = np.median(looks["high"] - looks["low"], axis=0)
     for axis, name in enumerate("xyz"):
         if spread[axis] == 0.0:
             what = f"{name} is {looks['low'][0, axis] + 0.0:g} in every point: the scans are flat"
@@ -464,7 +474,8 @@ def _units(looks: Looks) -> Iterator[Finding]:
 
 
 def _counts(drive: Drive, looks: Looks) -> Iterator[Finding]:
-    count, sensor = looks["count"], drive.sensor
+    count = looks["count"]
+    sensor = drive.sensor
     around = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(count, 4, mode="edge"), 9), axis=1)
     cut = np.flatnonzero(count < SCAN_CHECK.cut_share * around)
     if len(cut):

@@ -64,7 +64,8 @@ def _share_above(some: F64, ground: F64) -> float | None:
         return None
     low = np.minimum(some[:, :2].min(axis=0), ground[:, :2].min(axis=0))
     width = int(np.ceil((max(some[:, 1].max(), ground[:, 1].max()) - low[1]) / RULE.column_m)) + 1
-    at_ground, at_points = _columns(ground[:, :2] - low, width), _columns(some[:, :2] - low, width)
+    at_ground = _columns(ground[:, :2] - low, width)
+    at_points = _columns(some[:, :2] - low, width)
     # The middle height of the ground of each column that has some.
     order = np.lexsort((ground[:, 2], at_ground))
     keys, starts, counts = np.unique(at_ground[order], return_index=True, return_counts=True)
@@ -110,7 +111,8 @@ def _sheet_shares(points: F64, axis: int) -> tuple[float, float]:
     order = np.argsort(points[:, axis])
     key = key[order]  # short numbers are sorted without comparing them
     columns = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
-    key, height = key[columns], points[order[columns], axis]
+    key = key[columns]
+    height = points[order[columns], axis]
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     counts = np.diff(np.append(starts, len(key)))
     ends = starts + counts - 1

@@ -190,7 +190,8 @@ def export_map(
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
         raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
-    stated, corners = frame_of(point_map.georeference), box_of(path, point_map)
+    stated = frame_of(point_map.georeference)
+    corners = box_of(path, point_map)
     if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
         wanted: MapFrame | None = autoware_frame(stated, corners, projector)
         if crs is not None:
@@ -223,7 +224,9 @@ def _check_degrees(path: Path, frame: MapFrame, corners: F64, writer: MapWriter,
 
 def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) -> CloudPieces:
     """A map's points in a frame that Autoware supports: ``projector``'s, else the one that ``folder`` has already."""
-    stated, corners, chosen = frame_of(point_map.georeference), box_of(folder, point_map), folder / PROJECTOR
+    stated = frame_of(point_map.georeference)
+    corners = box_of(folder, point_map)
+    chosen = folder / PROJECTOR
     wanted = projector or (str(chosen) if chosen.is_file() and not stated.is_local else None)
     frame, convert = settle_out(str(folder), stated, autoware_frame(stated, corners, wanted), corners)
     return _pieces(point_map, frame, convert)

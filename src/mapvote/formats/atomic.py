@@ -63,7 +63,8 @@ def whole_folder(path: Path | str, *, sign: str) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not (path.is_dir() and ((path / sign).is_file() or not any(path.iterdir()))):
         raise MapvoteError(f"{path}: exists and has no {sign}, so it is not replaced; remove it or choose another path")
-    partial, old = _hidden(path, "partial"), _hidden(path, "old")
+    partial = _hidden(path, "partial")
+    old = _hidden(path, "old")
     try:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)

@@ -54,7 +54,10 @@ def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterat
 
 
 def _map(point_map: PointMap) -> Rows:
-    low, high, known, learned = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
+    known = 0.0
+    learned = 0
     fields: dict[str, str] = {}
     for tile in point_map.tiles.values():
         low = np.minimum(low, tile.points_map.min(axis=0, initial=np.inf))

@@ -45,7 +45,8 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
     ``drives``: those that count, two-stage, each by itself; ``tally`` (256, 256, 5) of them, in VOTE_UNITs.
     """
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, CELLS)
-    flat, out = states.reshape(-1), states.copy()
+    flat = states.reshape(-1)
+    out = states.copy()
     for before, after in ((_UO, _CE), (_UE, _CO)):
         cells = np.flatnonzero(planes[after] > quorum * VOTE_UNIT)
         cells = cells[(flat[cells] == before) | (flat[cells] == _UN)]
@@ -80,7 +81,9 @@ def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, las
         for i in range(len(whose)):
             if said[i, cell] != NO_VOTE:
                 last[whose[i]] = i
-        oldest_after, newest_before, other = np.iinfo(np.int64).max, np.iinfo(np.int64).min, False
+        oldest_after = np.iinfo(np.int64).max
+        newest_before = np.iinfo(np.int64).min
+        other = False
         for i in range(len(last)):
             word = last[i]
             if word >= 0 and said[word, cell] == after:
@@ -184,7 +187,8 @@ def remembered(
     went = went[memory.at(went)[1] > 0]
     if not len(came) and not len(went):
         return memory
-    of_new, of_gone = memory.at(came), memory.at(went)
+    of_new = memory.at(came)
+    of_gone = memory.at(went)
     risen = states.reshape(-1)[came] == _CO
     first_s = _first_s(votes, came, _CO)
     if past is not None and risen.any():
@@ -195,7 +199,8 @@ def remembered(
     stays += 1
     stayed_s += np.maximum(_first_s(votes, went, _CE), came_s) - came_s
     came_s[:] = 0
-    cells, values = np.concatenate([came, went]), np.concatenate([of_new, of_gone], axis=1)
+    cells = np.concatenate([came, went])
+    values = np.concatenate([of_new, of_gone], axis=1)
     order = np.argsort(cells)
     return memory.but(cells[order], values[:, order])
 
@@ -203,7 +208,8 @@ def remembered(
 def emptied_and_filled(before: U64, after: U64) -> tuple[I64, I64]:
     """Indices of the words (n,) that are zero only after, and only before."""
     changed = np.flatnonzero(before != after)
-    emptied, filled = after[changed] == 0, before[changed] == 0
+    emptied = after[changed] == 0
+    filled = before[changed] == 0
     return changed[emptied], changed[filled]
 
 

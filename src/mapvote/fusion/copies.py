@@ -154,7 +154,8 @@ def point_marks(drive: TileVote, least: int) -> U64:
     places = ((steps[:, 1] % PLACES) * PLACES + steps[:, 0] % PLACES) + PLACES * PLACES * steps[:, 2]
     order = np.lexsort((places, cells))
     above = np.flatnonzero(np.diff(cells[order]) == 0)
-    lower, upper = places[order[above]].astype(np.uint64), places[order[above + 1]].astype(np.uint64)
+    lower = places[order[above]].astype(np.uint64)
+    upper = places[order[above + 1]].astype(np.uint64)
     return _enough(np.unique(lower << np.uint64(32) | (upper & np.uint64(0xFFFFFFFF))), least)
 
 
@@ -177,7 +178,8 @@ def _enough(marks: U64, least: int) -> U64:
 def _patterns(cells: NDArray[np.intp], words: U64, marks: U64) -> int:
     """Into ``marks`` (n,), returning how many: a number for the words (n,) of each cell that is not alone, and of those
     to its east and north, unless all three are equal. ``cells``: flat, ascending."""
-    found, north = 0, 0
+    found = 0
+    north = 0
     for i in range(len(cells) - 1):
         while north < len(cells) - 1 and cells[north] < cells[i] + TILE_CELLS:
             north += 1
@@ -202,7 +204,9 @@ def find_shared(marks: U64, first: I64, whose: I64, share: float, alike: Bool) -
             smaller = min(first[i + 1] - first[i], first[k + 1] - first[k])
             if whose[i] == whose[k] or alike[i, k] or smaller == 0:
                 continue
-            a, b, both = first[i], first[k], 0
+            a = first[i]
+            b = first[k]
+            both = 0
             while a < first[i + 1] and b < first[k + 1]:
                 if marks[a] == marks[b]:
                     both += 1
@@ -294,7 +298,8 @@ def _look(masks: U64) -> tuple[I64, U64]:
     shifted, and (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is
     not."""
     looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), np.uint64)
-    moved, east = np.empty(len(masks), np.int64), np.empty_like(looked[0])
+    moved = np.empty(len(masks), np.int64)
+    east = np.empty_like(looked[0])
     _look_at(masks, looked, moved, east)
     return moved, looked
 
@@ -306,13 +311,17 @@ def _look_at(masks: U64, looked: U64, moved: I64, east: U64) -> None:
         for n in range(looked.shape[1]):
             row = 1 + _APART * n
             for w in range(4):
-                some, every = np.uint64(0), ~np.uint64(0)
+                some = np.uint64(0)
+                every = ~np.uint64(0)
                 for r in range(row - 1, row + 2):
-                    here, west = masks[i, r, w], _moved_east(masks[i, r], w, 1)
+                    here = masks[i, r, w]
+                    west = _moved_east(masks[i, r], w, 1)
                     right = (here >> np.uint64(1)) | (masks[i, r, w + 1] << np.uint64(63) if w < 3 else np.uint64(0))
                     some |= here | west | right
                     every &= here & west & right
-                looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w] = masks[i, row, w], some, every
+                looked[i, n, 0, w] = masks[i, row, w]
+                looked[i, n, 1, w] = some
+                looked[i, n, 2, w] = every
             for plane in range(3):
                 for w in range(4):
                     east[n, plane, w] = _moved_east(looked[i, n, plane], w, _APART)

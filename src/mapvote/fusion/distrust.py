@@ -37,7 +37,8 @@ def contradictors(
     if settings.max_contradiction >= 1.0:
         return np.zeros(len(votes), dtype=np.bool_)
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
-    others, most = others_say(planes[:, _ASKED_CELLS], quorum), settings.max_contradiction
+    others = others_say(planes[:, _ASKED_CELLS], quorum)
+    most = settings.max_contradiction
     own = (vote.states.reshape(-1)[_ASKED_CELLS] for vote in votes if vote.states is not None)
     return np.array([contradicts(one, others, most) for one in own], dtype=np.bool_)
 
@@ -62,7 +63,8 @@ def deniers(
 
 def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
     """(n,) in how many cells each vote no longer counts because the map is now as voted: built on, or empty."""
-    found, holds = np.zeros(len(votes), dtype=np.int64), tile.obstacle_words.reshape(-1)
+    found = np.zeros(len(votes), dtype=np.int64)
+    holds = tile.obstacle_words.reshape(-1)
     for i, vote in enumerate(votes):
         if vote.unrestricted is not None and vote.states is not None:
             sent = vote.unrestricted.reshape(-1)
@@ -79,7 +81,9 @@ def contradicts(own: U8, others: U8, most: float) -> bool:
     It is judged only if a majority of the others, and at least the quorum, agree on most cells that so many of them
     determined.
     """
-    asked, agreed, opposed = 0, 0, 0
+    asked = 0
+    agreed = 0
+    opposed = 0
     for i in range(len(others)):
         said = others[i, own[i] & 7]
         asked += said & 1

@@ -41,7 +41,8 @@ class EditVotes:
     @classmethod
     def none(cls) -> EditVotes:
         """Every edit follows the states."""
-        cells, votes = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
+        cells = np.empty(0, dtype=np.int64)
+        votes = np.empty(0, dtype=np.int32)
         return cls(cells, np.empty(0, dtype=np.uint8), votes, votes)
 
     def and_of(self, other: EditVotes) -> EditVotes:
@@ -59,8 +60,10 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     deletes the whole column.
     """
     gone = _deleted(gone, tile)
-    ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
-    flat, dropped = gone.reshape(-1), np.zeros(len(tile.points), dtype=np.bool_)
+    ground = tile.ground_z.reshape(-1)
+    base = tile.base.reshape(-1)
+    flat = gone.reshape(-1)
+    dropped = np.zeros(len(tile.points), dtype=np.bool_)
     asked = np.flatnonzero((flat != 0)[tile.cells])
     cells = tile.cells[asked]
     bit, obstacle = column_bits(tile.points[asked, 2].astype(np.float64), ground[cells], base[cells])
@@ -84,7 +87,8 @@ def add_points(tile: Tile, points: F32, fields: Fields, cells: I64, voters: I32,
     asked[cells] = True
     mapped = np.flatnonzero(asked[tile.cells])
     taken = np.isin(voxels, _voxels(tile.cells[mapped], tile.points[mapped]))
-    chosen, seen = np.empty(len(voxels), np.int64), np.full(int(voters.max()) + 1, -1, dtype=np.int64)
+    chosen = np.empty(len(voxels), np.int64)
+    seen = np.full(int(voters.max()) + 1, -1, dtype=np.int64)
     numbers = as_numbers(fields, len(points))
     n = _represent(points, numbers, voxels, voters, taken, order, min_votes, seen, chosen)
     chosen = chosen[:n]
@@ -113,7 +117,9 @@ def _represent(
     sum of whole micrometres.
     """
     n = len(voxels)
-    found, low, start = 0, 0, 0
+    found = 0
+    low = 0
+    start = 0
     while start < n:
         voxel = voxels[order[start]]
         stop = start + 1
@@ -138,19 +144,25 @@ def _represent(
 @inlined
 def _nearest_to_mean(points: F32, numbers: U64, order: I64, start: int, stop: int) -> int:
     """The representative of the points ``order[start:stop]``, see :func:`_represent`."""
-    x, y, z = np.int64(0), np.int64(0), np.int64(0)  # micrometres
+    x = np.int64(0)
+    y = np.int64(0)
+    z = np.int64(0)  # micrometres
     for k in range(start, stop):
         x += np.int64(np.rint(np.float64(points[order[k], 0]) * 1e6))
         y += np.int64(np.rint(np.float64(points[order[k], 1]) * 1e6))
         z += np.int64(np.rint(np.float64(points[order[k], 2]) * 1e6))
     of = 1e6 * (stop - start)
-    best, nearest = order[start], np.inf
+    best = order[start]
+    nearest = np.inf
     for k in range(start, stop):
         i = order[k]
-        dx, dy, dz = points[i, 0] - x / of, points[i, 1] - y / of, points[i, 2] - z / of
+        dx = points[i, 0] - x / of
+        dy = points[i, 1] - y / of
+        dz = points[i, 2] - z / of
         distance = dx * dx + dy * dy + dz * dz
         if distance < nearest or (distance == nearest and _before(points, numbers, i, best)):
-            best, nearest = i, distance
+            best = i
+            nearest = distance
     return best
 
 
@@ -173,7 +185,8 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
     see :func:`_remnants`.
     """
     # The voxels that leave the cells decided changed-empty.
-    gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
+    gone = None
+    emptied = Words.whole(states == int(CellState.CHANGED_EMPTY))
     if len(emptied.cells):
         reached = nothing_reached(quorum, len(emptied.cells))
         for vote in votes:

@@ -211,7 +211,8 @@ def deletions(tile: Tile, decided: Decision) -> tuple[U64 | None, EditVotes]:
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int, gone: U64 | None) -> tuple[Tile, int, int]:
     """(the tile as decided without the voxels ``gone`` (256, 256), points added, points deleted)."""
-    edited, deleted = tile, 0
+    edited = tile
+    deleted = 0
     if gone is not None:
         edited, deleted = delete_points(edited, gone)
     added = 0
@@ -283,7 +284,8 @@ def hear(
     ``silenced``, those excluded before; but never below two. Vehicles that send tallies are not judged: their weights
     differ. ``tile``: as it is now, see :func:`deniers`.
     """
-    heard, quorum = list(votes), max(settings.min_votes - silenced, min(settings.min_votes, 2))
+    heard = list(votes)
+    quorum = max(settings.min_votes - silenced, min(settings.min_votes, 2))
     states, tally = count(heard, rule, quorum)
     if quorum < 2 or any(vote.states is None for vote in heard):
         return heard, states, tally, quorum
@@ -320,7 +322,8 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:
     """Decided states (rows, cols) over the smallest window of whole tiles that holds them all; elsewhere NO_VOTE."""
-    rows, cols = [t[0] for t in decisions] or [0], [t[1] for t in decisions] or [0]
+    rows = [t[0] for t in decisions] or [0]
+    cols = [t[1] for t in decisions] or [0]
     grid = lattice.tile((min(rows), min(cols))).union(lattice.tile((max(rows), max(cols))))
     states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
     for index, decision in decisions.items():
@@ -356,7 +359,8 @@ def _other_points(a: Tile, b: Tile) -> Bool:
     missing = np.zeros(CELLS, dtype=np.uint8)
     (cells_a, words_a), (cells_b, words_b) = sides
     _out_of_step(cells_a, read_only(words_a), cells_b, read_only(words_b), missing)
-    differ, unsure = missing > 0, missing == 3
+    differ = missing > 0
+    unsure = missing == 3
     if unsure.any():
         differ[unsure] = _other_sequences(*(_of_cells(*side, unsure) for side in sides))[unsure]
     return np.asarray(differ)
@@ -394,7 +398,8 @@ def _of_cells(cells: I64, words: NDArray[np.uint32], among: Bool) -> tuple[I64, 
 def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np.uint32]]) -> Bool:
     """(65536,) which cells hold other points, or as many in another order; see :func:`_of_cells`."""
     other = np.bincount(a[0], minlength=CELLS) != np.bincount(b[0], minlength=CELLS)
-    same_a, same_b = ~other[a[0]], ~other[b[0]]
+    same_a = ~other[a[0]]
+    same_b = ~other[b[0]]
     other[a[0][same_a][(a[1][same_a] != b[1][same_b]).any(axis=1)]] = True
     return np.asarray(other)
 
@@ -426,7 +431,8 @@ def update_map(
             changed[index] = edited
 
     def remains_at(index: TileIndex) -> Remains:
-        tile, decided = point_map.tile(index), decisions.get(index)
+        tile = point_map.tile(index)
+        decided = decisions.get(index)
         if decided is None:
             return remains_without_votes(tile, gravity)
         return remains_of(tile, changed.get(index, tile), decided.edits, decided.waits, decided.fell, gravity)

@@ -198,7 +198,8 @@ def fall_across(
     """
     fallen: dict[TileIndex, Fallen] = {}
     for index in sorted(undecided):
-        sites, missing = {index: undecided[index]}, frozenset({index})
+        sites = {index: undecided[index]}
+        missing = frozenset({index})
         by_tile: dict[TileIndex, Fallen] = {}
         while missing:
             by_tile, missing = _fall_in(index, sites, gravity)
@@ -257,7 +258,8 @@ class _Window:
     @classmethod
     def of(cls, sites: Mapping[TileIndex, Remains]) -> _Window:
         """The smallest window that holds all ``sites``; what no site shows is not known."""
-        row0, col0 = min(row for row, _ in sites), min(col for _, col in sites)
+        row0 = min(row for row, _ in sites)
+        col0 = min(col for _, col in sites)
         known = np.zeros((max(row for row, _ in sites) - row0 + 1, max(col for _, col in sites) - col0 + 1), np.bool_)
         for row, col in sites:
             known[row - row0, col - col0] = True
@@ -344,12 +346,14 @@ def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iter
     if not len(rows):
         return
     # Objects among the deleted cells, each by row, then column.
-    labels, stack = np.zeros(window.deleted.shape, dtype=np.int32), np.empty(len(rows), dtype=np.int64)
+    labels = np.zeros(window.deleted.shape, dtype=np.int32)
+    stack = np.empty(len(rows), dtype=np.int64)
     _label_near(rows, cols, read_only(window.deleted), 2 * gravity.reach_cells + 1, labels, stack)
     number = labels[rows, cols]
     order = np.argsort(number, kind="stable")
     starts = np.flatnonzero(np.diff(number[order], prepend=0))
-    rows, cols = rows[order], cols[order]
+    rows = rows[order]
+    cols = cols[order]
     low, high = (np.stack([of.reduceat(part, starts) for part in (rows, cols)]) for of in (np.minimum, np.maximum))
     # Those of this tile that are large enough for an inside, and not too long.
     size = high - low + 1
@@ -418,10 +422,12 @@ def _label_near(rows: I64, cols: I64, deleted: U64, reach: int, labels: I32, sta
             continue
         count += 1
         labels[rows[k], cols[k]] = count
-        stack[0], n = rows[k] * width + cols[k], 1
+        stack[0] = rows[k] * width + cols[k]
+        n = 1
         while n > 0:
             n -= 1
-            r, c = stack[n] // width, stack[n] % width
+            r = stack[n] // width
+            c = stack[n] % width
             for a in range(max(r - reach, 0), min(r + reach + 1, height)):
                 for b in range(max(c - reach, 0), min(c + reach + 1, width)):
                     if deleted[a, b] and not labels[a, b]:
@@ -502,7 +508,8 @@ def _drop_touching(
                             touch, longest, 0, seen, stays, cells, words, asked,
                         )  # fmt: skip
                         for k in range(n):
-                            x, y = cells[k] // cols, cells[k] % cols
+                            x = cells[k] // cols
+                            y = cells[k] % cols
                             fallen[x, y] |= words[k]
                             beside[x, y] = min(beside[x, y], ((lattice_row + r) << 32) + lattice_col + c + _HALF)
 
@@ -521,7 +528,8 @@ def _drop_inside(
         for j in range(inside.shape[1]):
             if not inside[i, j]:
                 continue
-            a, b = row0 + i, col0 + j
+            a = row0 + i
+            b = col0 + j
             waiting = rest[a, b] & ~holds[a, b] & ~seen[a, b]
             while waiting:
                 start = waiting & (~waiting + np.uint64(1))
@@ -530,7 +538,8 @@ def _drop_inside(
                     longest, nearest, seen, stays, cells, words, asked,
                 )  # fmt: skip
                 for k in range(n):
-                    x, y = cells[k] // cols, cells[k] % cols
+                    x = cells[k] // cols
+                    y = cells[k] % cols
                     fallen[x, y] |= words[k]
                     beside[x, y] = min(beside[x, y], key)
                 waiting &= ~start & ~seen[a, b]
@@ -548,13 +557,24 @@ def _follow(
     ``seen`` either.
     """
     rows, cols = rest.shape
-    wide, confined = cols // TILE_CELLS + 2, inside.shape[0] > 0
-    low_row, high_row, low_col, high_col = row, row, col, col
+    wide = cols // TILE_CELLS + 2
+    confined = inside.shape[0] > 0
+    low_row = row
+    high_row = row
+    low_col = col
+    high_col = col
     seen[row, col] |= start
-    cells[0], words[0] = row * cols + col, start
-    done, n, wanted, held, leaves, begins = 0, 1, 0, False, False, False
+    cells[0] = row * cols + col
+    words[0] = start
+    done = 0
+    n = 1
+    wanted = 0
+    held = False
+    leaves = False
+    begins = False
     while done < n and not held and not leaves:
-        r, c = cells[done] // cols, cells[done] % cols
+        r = cells[done] // cols
+        c = cells[done] % cols
         if confined and not begins:
             lowest = 0
             while not words[done] >> np.uint64(lowest) & np.uint64(1):
@@ -563,7 +583,8 @@ def _follow(
             away = np.inf
             for k in range(len(body_rows)):
                 away = min(away, float((body_rows[k] - r) ** 2 + (body_cols[k] - c) ** 2))
-            farthest, top = (np.sqrt(away) + nearest) ** 2, _NOWHERE_HIGH
+            farthest = (np.sqrt(away) + nearest) ** 2
+            top = _NOWHERE_HIGH
             for k in range(len(body_rows)):
                 if (body_rows[k] - r) ** 2 + (body_cols[k] - c) ** 2 <= farthest:
                     top = max(top, body_tops[k])
@@ -578,17 +599,21 @@ def _follow(
                 held = held or near & (holds[a, b] | stays[a, b]) != 0
                 near &= ~seen[a, b]
                 if near:
-                    i, j = a - row0, b - col0
+                    i = a - row0
+                    j = b - col0
                     if confined and (
                         i < 0 or j < 0 or i >= inside.shape[0] or j >= inside.shape[1] or not inside[i, j]
                     ):
                         leaves = True
                         continue
                     seen[a, b] |= near
-                    cells[n], words[n] = a * cols + b, near
+                    cells[n] = a * cols + b
+                    words[n] = near
                     n += 1
-                    low_row, high_row = min(low_row, a), max(high_row, a)
-                    low_col, high_col = min(low_col, b), max(high_col, b)
+                    low_row = min(low_row, a)
+                    high_row = max(high_row, a)
+                    low_col = min(low_col, b)
+                    high_col = max(high_col, b)
         done += 1
         held = held or high_row - low_row >= longest or high_col - low_col >= longest
     if held:

@@ -130,7 +130,8 @@ def alike_beside(rows: I64, cols: I64, kinds: I64) -> I32:
     """(n,) how many of the eight cells around each of n different cells are among them and of the same kind."""
     if not len(rows):
         return np.zeros(0, dtype=np.int32)
-    high, wide = int(rows.min()), int(cols.min())
+    high = int(rows.min())
+    wide = int(cols.min())
     width = int(cols.max()) - wide + 3
     step = int(kinds.max()) + 1
     keys = ((rows - high + 1) * width + cols - wide + 1) * step + kinds
@@ -181,7 +182,8 @@ def standing_beside(states: U8, cells: I64) -> I64:
     Beyond the tile's border all is taken to be as just within.
     """
     stands = np.pad(states == int(CellState.UNCHANGED_OCCUPIED), 1, mode="edge")
-    rows, cols = cells // TILE_CELLS + 1, cells % TILE_CELLS + 1
+    rows = cells // TILE_CELLS + 1
+    cols = cells % TILE_CELLS + 1
     beside = [stands[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     return np.sum(beside, axis=0, dtype=np.int64)
 

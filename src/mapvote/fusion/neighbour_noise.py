@@ -90,7 +90,9 @@ def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
 
 def _going(tile: Tile, states: U8) -> F32:
     points, cells = (part[states[tile.cells] == int(CellState.CHANGED_EMPTY)] for part in (tile.points, tile.cells))
-    z, ground, base = points[:, 2].astype(np.float64), tile.ground_z.reshape(-1)[cells], tile.base.reshape(-1)[cells]
+    z = points[:, 2].astype(np.float64)
+    ground = tile.ground_z.reshape(-1)[cells]
+    base = tile.base.reshape(-1)[cells]
     return np.asarray(points[column_bits(z, ground, base)[1]])
 
 
@@ -100,11 +102,13 @@ def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:
     points = points[np.lexsort(points.T)]  # no sum may depend on the order of votes
     cells = flat_cells(window, points)
     order = np.argsort(cells, kind="stable")
-    points, cells = points[order], cells[order]
+    points = points[order]
+    cells = cells[order]
     count = np.bincount(cells, minlength=CELLS)
     asked = np.flatnonzero(_at_a_fuller_one(points, cells, count, changed)[cells])
     stands = _on_planes(points, asked, np.concatenate([[0], np.cumsum(count)]), cells)
-    own, to = cells[asked], flat_cells(window, stands.astype(np.float32))
+    own = cells[asked]
+    to = flat_cells(window, stands.astype(np.float32))
     away = np.bincount(own[(to != own) & changed[to] & (count[to] > count[own])], minlength=CELLS)
     return np.flatnonzero((away > 0) & (away >= (1.0 - NOISE_RULE.stay_share) * count))
 
@@ -113,7 +117,8 @@ def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool
     """(65536,) of which flat cells all points (m, 3) lie near one side, and across it lies a ``changed`` cell with more
     of them. ``cells`` (m,) of the points, ``count`` (65536,) how many each has."""
     found = np.zeros(CELLS, dtype=np.bool_)
-    filled, wide = np.flatnonzero(count), TILE_CELLS + 2
+    filled = np.flatnonzero(count)
+    wide = TILE_CELLS + 2
     held = np.pad(np.where(changed, count, 0).reshape(TILE_CELLS, TILE_CELLS), 1).reshape(-1)
     within = CELL_SIZE * (points[:, :2] / np.float32(CELL_SIZE) % 1.0)
     for axis, step in ((0, 1), (1, wide)):
@@ -129,7 +134,9 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
     """(k, 3) the points ``asked`` (k,), each moved onto the upright plane through those about it, where there
     is one and it is near."""
     about = points[asked].astype(np.float64)
-    n, mean, spread = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3)), np.zeros((len(asked), 3, 3))
+    n = np.zeros(len(asked), np.int64)
+    mean = np.zeros((len(asked), 3))
+    spread = np.zeros((len(asked), 3, 3))
     _moments(points, asked, first, cells, n, mean, spread)
     variance, axes = np.linalg.eigh(spread)
     normal = axes[:, :, 0]
@@ -153,7 +160,8 @@ def _moments(points: F32, asked: I64, first: I64, cells: I64, number: I64, mean:
         point = asked[k]
         row, col = divmod(cells[asked[k]], TILE_CELLS)
         for r in range(max(row - reach, 0), min(row + reach + 1, TILE_CELLS)):
-            left, right = max(col - reach, 0), min(col + reach, TILE_CELLS - 1)
+            left = max(col - reach, 0)
+            right = min(col + reach, TILE_CELLS - 1)
             for i in range(first[r * TILE_CELLS + left], first[r * TILE_CELLS + right + 1]):
                 x = np.float64(points[i, 0]) - np.float64(points[point, 0])
                 y = np.float64(points[i, 1]) - np.float64(points[point, 1])

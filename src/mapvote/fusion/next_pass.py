@@ -121,7 +121,8 @@ def stretches(window: Grid, witnesses: Sequence[Witness], quorum: int) -> list[S
         paths = [path for path in witness.paths_m if len(path) > 1]
         if not len(rows) or not paths:
             continue
-        at, heading = np.concatenate([path[:-1] for path in paths]), np.concatenate([np.diff(p, axis=0) for p in paths])
+        at = np.concatenate([path[:-1] for path in paths])
+        heading = np.concatenate([np.diff(p, axis=0) for p in paths])
         x, y = window.centres()
         nearest = scipy.spatial.cKDTree(at).query(np.column_stack([x[cols], y[rows]]))[1]
         sector = np.round(np.arctan2(*heading[nearest].T[::-1]) * SECTORS / (2 * np.pi)).astype(np.int64) % SECTORS

@@ -87,7 +87,8 @@ class TileVote(Planes):
     def mark_deleted(self, emptied: Words, reached: U64) -> None:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
         if self.states is not None and self.gone is not None:
-            own, said = self.states.reshape(-1), int(CellState.CHANGED_EMPTY)
+            own = self.states.reshape(-1)
+            said = int(CellState.CHANGED_EMPTY)
             mark_among(reached, self.gone.cells, self.gone.words, own, said, emptied.cells)
         else:
             deleted = self.deletes(emptied)
@@ -230,7 +231,8 @@ def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
 
 def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
     """The flat cells (65536,) in which each drive has a vote and no later one has; drives in the order of time."""
-    since, found = np.zeros(CELLS, dtype=np.bool_), []
+    since = np.zeros(CELLS, dtype=np.bool_)
+    found = []
     for mine in reversed(spoken):
         found.append(mine > since)
         since = since | mine
@@ -251,7 +253,8 @@ def _marked(drive: TileVote, mine: Bool) -> Words:
     if drive.gone is None:
         return drive.deletes(Words.whole(mine))
     marked = drive.gone.within(mine)
-    emptied, stands = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
+    emptied = CellState.CHANGED_EMPTY
+    stands = CellState.UNCHANGED_OCCUPIED
     return marked.at(drive.supports(emptied, marked.cells) | drive.supports(stands, marked.cells))
 
 

@@ -205,7 +205,9 @@ def path_message(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME) ->
     poses = []
     for at, height in zip(places.tolist(), ground_z.tolist(), strict=True):
         pose = blank_message(POSE, header=header)
-        pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = at[0], at[1], height
+        pose.pose.position.x = at[0]
+        pose.pose.position.y = at[1]
+        pose.pose.position.z = height
         pose.pose.orientation.w = 1.0
         poses.append(pose)
     return blank_message(BallotTopic.ROAD.kind, header=header, poses=poses)

@@ -92,7 +92,8 @@ class Network:
         for end in self._writers.read(10_000):
             if not end.sample_info.valid_data or end.sample_info.instance_state != _ALIVE:
                 continue  # a writer that has gone: its sample names nothing
-            topic, kind = end.topic_name.removeprefix("rt"), ros_type(end.type_name)
+            topic = end.topic_name.removeprefix("rt")
+            kind = ros_type(end.type_name)
             if end.topic_name.startswith("rt/") and kind and str(end.participant_key) != self._own:
                 found[topic, kind].append(end.qos)
         policy = self._core.Policy
@@ -196,8 +197,10 @@ class _Sample:
 
     def __init__(self, library: Any, handle: Any) -> None:
         """``handle``: an owned reference to a ``ddsi_serdata``; it is consumed."""
-        self._span, self._handle = _Span(), ctypes.c_void_p(handle)
-        self._at, self._give_back = ctypes.byref(self._span), library.ddsi_serdata_to_ser_unref
+        self._span = _Span()
+        self._handle = ctypes.c_void_p(handle)
+        self._at = ctypes.byref(self._span)
+        self._give_back = library.ddsi_serdata_to_ser_unref
         size = ctypes.c_size_t(library.ddsi_serdata_size(self._handle))
         library.ddsi_serdata_to_ser_ref(self._handle, ctypes.c_size_t(0), size, self._at)
         library.ddsi_serdata_unref(self._handle)  # the call before took a reference of its own
@@ -219,7 +222,8 @@ class Subscription:
     """
 
     def __init__(self, topic: str, reader: Any) -> None:
-        self._topic, self._reader = topic, reader
+        self._topic = topic
+        self._reader = reader
         internal = require("cyclonedds.internal", "ros2", "DDS")
         self._library = internal.DDS._dll_handle
         self._handles = (ctypes.c_void_p * DDS_DEPTHS.taken)()

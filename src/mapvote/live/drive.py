@@ -119,7 +119,8 @@ class FirstSeconds:
     def __init__(self, sensor_told: str) -> None:
         self._told = sensor_told
         self._kept: dict[int, Scan] = {}
-        self._stamps_ns, self._priors = list[int](), list[F64 | None]()
+        self._stamps_ns = list[int]()
+        self._priors = list[F64 | None]()
         self._looking: Looking | None = None
 
     def add(self, scan: Scan, T_map_lidar_prior: F64 | None, vehicle: Vehicle) -> bool:
@@ -285,7 +286,8 @@ class LiveDrive:
             self.counts.missing += max(0, round(step_ns / self._period_ns) - 1)
         if 0 < step_ns < LIVE_RULE.back_ns:
             self._period_ns = step_ns if not self._period_ns else min(step_ns, int(1.02 * self._period_ns))
-        self._odd_stamps, self._last_ns = 0, scan.stamp_ns
+        self._odd_stamps = 0
+        self._last_ns = scan.stamp_ns
         if self._thinning.admits(1e-9 * scan.sent_ns, len(self._waiting)):
             self._waiting.append(scan)
         else:
@@ -341,7 +343,9 @@ class LiveDrive:
     def first_findings(self) -> list[Finding]:
         """The findings of the first seconds. Ballots that waited for them leave, unless one is an error. Empty if it
         was asked before, or nothing was observed."""
-        first, self.first, self.checked_now = self.first, None, False
+        first = self.first
+        self.first = None
+        self.checked_now = False
         if first is None or self.vehicle is None:
             return []
         found = first.findings(self.vehicle, self.vehicle.point_map)
@@ -411,7 +415,8 @@ class LiveDrive:
             self._cut(vehicle, self._maps.current())
 
     def _cut(self, vehicle: Vehicle, newest: PointMap) -> None:
-        self._road, self._finished = RoadDriven(self._cuts), 0
+        self._road = RoadDriven(self._cuts)
+        self._finished = 0
         self._leave(vehicle.cut(stretch_name(self.name, self.number + 1), newest))
 
     def _position(self, prior: F64 | PosePrior | None) -> F64 | None:
@@ -432,7 +437,9 @@ class LiveDrive:
 
     def _count_votes(self, vehicle: Vehicle, *, ended: bool = False) -> None:
         """Latencies of the scans that are done, unless the drive has ended, and the tiles that they voted on."""
-        report, now_ns, now_s = vehicle.report, time.time_ns(), time.monotonic()
+        report = vehicle.report
+        now_ns = time.time_ns()
+        now_s = time.monotonic()
         lost = set(report.lost) if vehicle.done > self._finished else set()
         for i in range(self._finished, vehicle.done):
             stamp_ns, sent_ns = self._observed.popleft()

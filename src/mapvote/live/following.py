@@ -35,7 +35,10 @@ class Follower:
         self, lay: Callable[[], Change | None], every_s: float, ended: threading.Event, say: Callable[[str], object]
     ) -> None:
         """``lay`` lays the newest version; it gives None if nothing changed, and may raise."""
-        self._lay, self._every_s, self._ended, self._say = lay, every_s, ended, say
+        self._lay = lay
+        self._every_s = every_s
+        self._ended = ended
+        self._say = say
         self._repeated = Repeated(say)
         self.trouble = ""
         """Why the newest version is not in the folder; "" while it is."""

@@ -226,7 +226,8 @@ class LoaderService:
         return True
 
     def _offer(self) -> None:
-        network, loader = self._network, self._loader
+        network = self._network
+        loader = self._loader
         hashed = network.publish(HASH_TOPIC, HASH, transient_local=True, depth=1)
         table = network.publish(TABLE_TOPIC, TABLE, transient_local=True, depth=1)
         self._shown = [

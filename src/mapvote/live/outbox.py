@@ -85,7 +85,8 @@ class Journal:
 
 def records(path: Path) -> Iterator[Ballot]:
     """The whole records of a journal, in order; what follows the first that is cut off or damaged is left out."""
-    data, at = path.read_bytes(), 0
+    data = path.read_bytes()
+    at = 0
     while at + _RECORD.size <= len(data):
         length, crc = _RECORD.unpack_from(data, at)
         record = data[at + _RECORD.size : at + _RECORD.size + length]
@@ -100,7 +101,9 @@ def records(path: Path) -> Iterator[Ballot]:
 
 def ballot_of(path: Path) -> Ballot | None:
     """The ballot that a journal amounts to: of each tile its last record. None if there is no whole record."""
-    tiles, base, last = {}, {}, None
+    tiles = {}
+    base = {}
+    last = None
     for last in records(path):
         tiles.update({tile.tile: tile for tile in last.tiles})
         base.update(last.base)
@@ -146,7 +149,11 @@ class Outbox:
         sizes: OutboxSizes = OUTBOX_SIZES,
     ) -> None:
         """MapvoteError if another process drives as this vehicle."""
-        self.vehicle, self.report, self._client, self._folder, self._say = vehicle, OutboxReport(), client, folder, say
+        self.vehicle = vehicle
+        self.report = OutboxReport()
+        self._client = client
+        self._folder = folder
+        self._say = say
         self.sizes = sizes
         self._state = state / vehicle
         self._state.mkdir(parents=True, exist_ok=True)
@@ -167,7 +174,9 @@ class Outbox:
         self._failing = set[str]()
         """Kinds of work that the disk refused last."""
         self._broken: BaseException | None = None
-        self._to_send, self._ended, self._begun = threading.Event(), threading.Event(), False
+        self._to_send = threading.Event()
+        self._ended = threading.Event()
+        self._begun = False
         self._writer = threading.Thread(target=self._guarded, args=(self._write,), name="outbox", daemon=True)
         self._sender = threading.Thread(target=self._guarded, args=(self._send,), name="sender", daemon=True)
 

@@ -79,7 +79,8 @@ def play(path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0
     time.sleep(PLAY_WAITS.discovery_s)
     count = 0
     for _ in range(loops):
-        start, first = time.monotonic(), None
+        start = time.monotonic()
+        first = None
         for message in messages():
             first = message.time_ns if first is None else first
             time.sleep(max(0.0, start + 1e-9 * (message.time_ns - first) / rate - time.monotonic()))
@@ -151,8 +152,10 @@ def frames_message(stamp_ns: int, T_base_child: Mapping[str, F64]) -> bytes:
     """A TFMessage of frames on BASE_FRAME, by their names."""
     transforms = []
     for child, T in T_base_child.items():
-        pose, transform = pose_of(T), blank_message("geometry_msgs/msg/Transform")
-        transform.translation, transform.rotation = pose.position, pose.orientation
+        pose = pose_of(T)
+        transform = blank_message("geometry_msgs/msg/Transform")
+        transform.translation = pose.position
+        transform.rotation = pose.orientation
         header = header_of(stamp_ns, BASE_FRAME)
         transforms.append(
             blank_message(

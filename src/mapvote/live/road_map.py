@@ -97,11 +97,13 @@ class Version:
 
     def __init__(self, manifest: Manifest, client: MapClient, shared: weakref.WeakValueDictionary[str, Tile]) -> None:
         """``shared``: tiles of other versions by the hashes of their planes; those that stayed the same are shared."""
-        self._client, self._shared = client, shared
+        self._client = client
+        self._shared = shared
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
         self.planes = {tile_index(key): planes for key, planes in manifest.tiles.items()}
         self.tiles = LazyTiles(self._load, {})
-        georeference, number = manifest.georeference, manifest.version
+        georeference = manifest.georeference
+        number = manifest.version
         self.point_map = PointMap(manifest.map_id, lattice, self.tiles, georeference, version=number)
 
     def around(self, position: F64 | None, half_m: float) -> list[TileIndex]:
@@ -134,13 +136,17 @@ class RoadMap:
     def __init__(self, open_client: Callable[[], MapClient], *, poll_s: float = ROAD_MAP_REACH.poll_s) -> None:
         """``open_client`` opens a connection: each thread, and who reads tiles, has its own. MapvoteError if the server
         is away and no version of its map is kept here."""
-        self._reader, self._fetcher, self._listener = open_client(), open_client(), open_client()
+        self._reader = open_client()
+        self._fetcher = open_client()
+        self._listener = open_client()
         self._shared: weakref.WeakValueDictionary[str, Tile] = weakref.WeakValueDictionary()
         self._poll_s = poll_s
         self._position: F64 | None = None
         self._located = False
         """Whether it was asked for tiles at all."""
-        self._wake, self._refresh, self._ended = threading.Event(), threading.Event(), threading.Event()
+        self._wake = threading.Event()
+        self._refresh = threading.Event()
+        self._ended = threading.Event()
         self._asked_s = -np.inf
         self.events = False
         """Whether the server's events arrive."""
@@ -153,7 +159,8 @@ class RoadMap:
             if kept is None:
                 raise
             log.warning("%s. Version %d is kept here and used", error, kept.version)
-            manifest, self.away = kept, str(error)
+            manifest = kept
+            self.away = str(error)
         self._coming = self._current = self._used = self._version(manifest)
         works = ((self._fetch, self._fetcher), (self._listen, self._listener))
         self._threads = [threading.Thread(target=_closing, args=work, daemon=True) for work in works]
@@ -176,7 +183,8 @@ class RoadMap:
     def covers(self, position: F64 | None) -> bool:
         """See :class:`Maps`: of the version that was asked for last."""
         if position is None or has_moved(position, self._position):
-            self._position, self._located = position, True
+            self._position = position
+            self._located = True
             self._used.tiles.keep_only(self._used.around(position, ROAD_MAP_REACH.kept_m))
             self._wake.set()
         return not self._used.missing(position, ROAD_MAP_REACH.needed_m)
@@ -208,7 +216,8 @@ class RoadMap:
             except (MapvoteError, OSError) as error:
                 if not self.away:
                     log.warning("%s. The vehicle drives on the %d tiles that it has", error, self.tiles)
-                self.away, wait_s = str(error), ROAD_MAP_REACH.retry_s
+                self.away = str(error)
+                wait_s = ROAD_MAP_REACH.retry_s
             self._wake.wait(wait_s)
             self._wake.clear()
 

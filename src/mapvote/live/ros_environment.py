@@ -97,7 +97,8 @@ def _discovery(variables: Mapping[str, str]) -> str:
         raise MapvoteError(f"ROS_AUTOMATIC_DISCOVERY_RANGE={reach}: give {', '.join(_RANGES[:-1])} or {_RANGES[-1]}")
     peers = _peers(variables.get("ROS_STATIC_PEERS", ""))
     if only == "1":  # the older variable wins, and with it there are no static peers
-        reach, peers = "LOCALHOST", []
+        reach = "LOCALHOST"
+        peers = []
     if reach == "SYSTEM_DEFAULT":
         return ""
     multicast = "" if reach == "SUBNET" else "<General><AllowMulticast>false</AllowMulticast></General>"

@@ -185,7 +185,8 @@ def run(
             watcher(live, topics)
         if not stepped:
             topics.network.wait(LOOP_TIMES.loop_s)
-        poses, scans = topics.take_poses(), topics.take_scans()
+        poses = topics.take_poses()
+        scans = topics.take_scans()
     _check(live, topics)
     live.finish()
     return live

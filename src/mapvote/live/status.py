@@ -99,7 +99,8 @@ class Status:
 
     def troubles(self) -> list[tuple[int, str, str]]:
         """(level of diagnostic_msgs, subject, message) of each part of the drive."""
-        counts, silent = self.counts, self.silent_s > STATUS_TIMES.silent_s
+        counts = self.counts
+        silent = self.silent_s > STATUS_TIMES.silent_s
         arriving = f"{self.scans_hz:.1f} Hz, {counts.missing} never came"
         localised = f"{_percent(self.localised_share)} localised, sigma {_metres(self.sigma_m)}"
         spooled = f"{self.outbox.spooled} ballots in the spool"
@@ -123,7 +124,8 @@ class Status:
         colour = {_OK: "green", _WARN: "yellow", _ERROR: "red"}
         for level, about, message in self.troubles():
             table.add_row(f"[{colour[level]}]{about}", message)
-        counts, sent = self.counts, self.outbox.sent
+        counts = self.counts
+        sent = self.outbox.sent
         table.add_row("latency", f"{self.latency_s:.2f} s from stamp to vote")
         table.add_row("votes", f"{counts.localised} of {counts.scans} scans, {counts.unusable} unusable")
         table.add_row("map", f"{self.tiles} tiles here")
@@ -146,10 +148,12 @@ class StatusBoard:
     """Computes the status of a live drive, and calls each listener at its own interval."""
 
     def __init__(self, maps: Maps, outbox: Outbox) -> None:
-        self._maps, self._outbox = maps, outbox
+        self._maps = maps
+        self._outbox = outbox
         self._past: deque[tuple[float, int, int, int]] = deque()
         """(seconds, scans, localised, lost) of the last minute."""
-        self._last_cloud_s, self._clouds = time.monotonic(), 0
+        self._last_cloud_s = time.monotonic()
+        self._clouds = 0
         self._listeners: list[tuple[float, Listener]] = []
         self._due: list[float] = []
         self.status: Status | None = None
@@ -163,7 +167,8 @@ class StatusBoard:
         """Called by the scan loop, as often as it likes."""
         now = time.monotonic()
         if topics.clouds != self._clouds:
-            self._clouds, self._last_cloud_s = topics.clouds, now
+            self._clouds = topics.clouds
+            self._last_cloud_s = now
         due = [k for k, due_s in enumerate(self._due) if now >= due_s]
         if not due:
             return
@@ -180,14 +185,19 @@ class StatusBoard:
         while now - self._past[0][0] > STATUS_TIMES.minute_s:
             self._past.popleft()
         then, scans, localised, lost = self._past[0]
-        localised, lost = counts.localised - localised, counts.lost - lost
+        localised = counts.localised - localised
+        lost = counts.lost - lost
         sigmas = [] if live.vehicle is None else live.vehicle.report.sigmas_m[-STATUS_TIMES.recent :]
         recent = list(live.latencies_s)[-STATUS_TIMES.recent :]
         if isinstance(self._maps, RoadMap):
-            version, tiles, away = self._maps.version, self._maps.tiles, self._maps.away
+            version = self._maps.version
+            tiles = self._maps.tiles
+            away = self._maps.away
         else:
             own = self._maps.current()
-            version, tiles, away = own.version or 1, len(own.tiles), ""
+            version = own.version or 1
+            tiles = len(own.tiles)
+            away = ""
         return Status(
             replace(counts),
             replace(self._outbox.report),

@@ -325,7 +325,8 @@ class Subscriptions:
             model = replace(UNKNOWN_SENSOR, rate_hz=rate_hz)
             read = [self._scan_of(cloud, model) for cloud in firsts]
             found = estimate_sensor(read, rate_hz)
-            self.sensor, self.sensor_told = found.sensor, found.told
+            self.sensor = found.sensor
+            self.sensor_told = found.told
         return self.sensor is not None
 
     def waiting(self, clouds: list[Cloud]) -> WaitingScan:
@@ -333,7 +334,8 @@ class Subscriptions:
         return WaitingScan(min(c.stamp_ns for c in clouds), max(c.sent_ns for c in clouds), lambda: self._read(clouds))
 
     def _read(self, clouds: list[Cloud]) -> Scan:
-        mounts, sensor = self.mounts(), self.sensor
+        mounts = self.mounts()
+        sensor = self.sensor
         assert sensor is not None
         scans = []
         for cloud in clouds:

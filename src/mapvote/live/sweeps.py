@@ -69,7 +69,8 @@ class Sweeps:
     """Joins the clouds that several LiDARs measure within half a revolution to one scan."""
 
     def __init__(self, lidars: int) -> None:
-        self._lidars, self._reach_ns = lidars, 0.55e8
+        self._lidars = lidars
+        self._reach_ns = 0.55e8
         self._open: list[Cloud] = []
         self._firsts: deque[int] = deque(maxlen=20)
         """Stamps of the first LiDAR, which give its period."""
@@ -98,5 +99,6 @@ class Sweeps:
         return out
 
     def _closed(self) -> list[Cloud]:
-        closed, self._open = sorted(self._open, key=lambda c: c.lidar), []
+        closed = sorted(self._open, key=lambda c: c.lidar)
+        self._open = []
         return closed

@@ -86,7 +86,8 @@ def place_without_prior(points_a: F64, points_b: F64, numbers: CoarseSearch = CO
     """
     # Each cloud about its own middle: the coordinates of a country reach beyond what a key of a voxel holds.
     middle_a, middle_b = (np.floor(np.median(points, axis=0)) for points in (points_a, points_b))
-    points_a, local = points_a - middle_a, points_b - middle_b
+    points_a = points_a - middle_a
+    local = points_b - middle_b
     (cells_a, weight_a), (cells_b, weight_b) = _weights(points_a, numbers), _weights(local, numbers)
     if not len(cells_a) or not len(cells_b):
         raise MapvoteError("nothing stands in one of the clouds: two planes of ground cannot be registered")
@@ -113,7 +114,8 @@ def _weights(points: F64, numbers: CoarseSearch) -> tuple[I64, F64]:
     keys = voxel_keys(points * [1.0, 1.0, cell_m / numbers.layer_m], 0.0, 0.0, cell_m)
     columns, layers = np.unique(keys[first_of_each(keys)] >> 21, return_counts=True)
     tall = layers > numbers.low_layers
-    columns, layers = columns[tall], layers[tall]
+    columns = columns[tall]
+    layers = layers[tall]
     cells = np.column_stack([(columns >> 21) - (1 << 20), (columns & ((1 << 21) - 1)) - (1 << 20)])
     return cells, np.log2(layers.astype(np.float64))
 
@@ -139,10 +141,12 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
     # The best places of each heading.
     ranked: list[tuple[float, float, float, float]] = []
     for yaw in np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws):
-        c, s = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         col = np.floor((c * tall[:, 0] - s * tall[:, 1]) / cell_m).astype(np.int64)
         row = np.floor((s * tall[:, 0] + c * tall[:, 1]) / cell_m).astype(np.int64)
-        image, mask = np.zeros(shape), np.zeros(shape)
+        image = np.zeros(shape)
+        mask = np.zeros(shape)
         np.maximum.at(image, (row, col), tall[:, 2])
         mask[row, col] = 1.0
         met = fft.irfft2(spectrum * np.conj(fft.rfft2(image, shape)), shape)
@@ -156,7 +160,8 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
     ranked.sort(reverse=True)
     kept: list[tuple[float, float, float]] = []
     for _, col, row, yaw in ranked:
-        x, y = low[0] * cell_m + col * cell_m, low[1] * cell_m + row * cell_m
+        x = low[0] * cell_m + col * cell_m
+        y = low[1] * cell_m + row * cell_m
         apart = [
             np.hypot(x - u, y - v) > numbers.spread_cells * cell_m or np.cos(yaw - w) < np.cos(np.radians(4.0))
             for u, v, w in kept
@@ -173,14 +178,16 @@ def _heights(cloud: F64, numbers: CoarseSearch) -> Callable[[F64], float]:
     of_point = voxel_keys(cloud, 0.0, 0.0, numbers.cell_m) >> 21
     order = np.argsort(of_point, kind="stable")
     keys, first = np.unique(of_point[order], return_index=True)
-    start, heights = np.append(first, len(of_point)), cloud[order, 2]
+    start = np.append(first, len(of_point))
+    heights = cloud[order, 2]
 
     def height_over(points: F64) -> float:
         wanted = voxel_keys(points, 0.0, 0.0, numbers.cell_m) >> 21
         at = np.searchsorted(keys, wanted)
         at[at == len(keys)] = 0
         shared = keys[at] == wanted
-        at, z = at[shared], points[shared, 2]
+        at = at[shared]
+        z = points[shared, 2]
         if not len(at):
             return 0.0
         share = np.random.default_rng(0).random((8, len(at)))
@@ -244,7 +251,9 @@ class _Windows:
     """NDT of a around the pose of b, made once for each 20 m, and the part of b inside it."""
 
     def __init__(self, points_a: F64, local: F64, numbers: CoarseSearch) -> None:
-        self._a, self._b, self._window_m = points_a, local, numbers.window_m
+        self._a = points_a
+        self._b = local
+        self._window_m = numbers.window_m
         tall, _ = _weights(local, numbers)
         cells = np.floor(local[:, :2] / numbers.cell_m).astype(np.int64)
         self._stands = np.isin(cells @ [1 << 32, 1], tall @ [1 << 32, 1])
@@ -257,7 +266,8 @@ class _Windows:
             at = 20.0 * (np.array(key) + 0.5)
             near = self._a[(np.abs(self._a[:, :2] - at) < self._window_m).all(axis=1)]
             self._ndt[key] = build_ndt(near, np.array([*at, float(np.median(near[:, 2])) if len(near) else 0.0]))
-        ndt_map, there = self._ndt[key], transform(T, self._b)
+        ndt_map = self._ndt[key]
+        there = transform(T, self._b)
         inside = (np.abs(there[:, :2] - ndt_map.centre[:2]) < self._window_m - 2.0).all(axis=1)
         return ndt_map, thin_for_levels(self._b[inside & self._stands if standing else inside])
 

@@ -99,7 +99,8 @@ def laid_out(point_map: PointMap, numbers: GlobalSearchNumbers = GLOBAL_SEARCH) 
     cell_m = numbers.cell_m
     # The box of all tiles.
     windows = [tile.window for tile in point_map.tiles.values()]
-    x0, y0 = min(w.x0 for w in windows), min(w.y0 for w in windows)
+    x0 = min(w.x0 for w in windows)
+    y0 = min(w.y0 for w in windows)
     cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / cell_m))
     rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / cell_m))
     if rows * cols > numbers.max_cells:
@@ -107,7 +108,8 @@ def laid_out(point_map: PointMap, numbers: GlobalSearchNumbers = GLOBAL_SEARCH) 
             f"map {point_map.map_id} is {cols} m by {rows} m: too large to search; give the drive a prior (--prior)"
         )
     # Ground and layers of each tile.
-    words, ground_z = np.zeros((rows, cols), dtype=np.uint32), np.full((rows, cols), np.nan, dtype=np.float32)
+    words = np.zeros((rows, cols), dtype=np.uint32)
+    ground_z = np.full((rows, cols), np.nan, dtype=np.float32)
     for tile in point_map.tiles.values():
         x, y = tile.window.centres()
         measured = np.nonzero(np.isfinite(tile.ground_z))
@@ -194,19 +196,25 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
     ``cols`` (places,) in ``wide``. Span by span, point by point: the words of the cells of a span lie side by side, so
     that all of them are looked up sooner than the places among them.
     """
-    n, rows, width = len(xy), wide.shape[2], wide.shape[3]
+    n = len(xy)
+    rows = wide.shape[2]
+    width = wide.shape[3]
     flat = wide.reshape(-1)
     out = np.zeros((len(cols), len(yaws)), dtype=np.uint8)
     way = np.empty(n, dtype=np.int64)
-    hits, early = np.empty(_SPAN, dtype=np.uint32), np.empty(_SPAN, dtype=np.uint32)
+    hits = np.empty(_SPAN, dtype=np.uint32)
+    early = np.empty(_SPAN, dtype=np.uint32)
     for a in range(len(yaws)):
-        c, s = np.cos(yaws[a]), np.sin(yaws[a])
+        c = np.cos(yaws[a])
+        s = np.sin(yaws[a])
         for i in range(n):
             dr = np.int64(np.floor(s * xy[i, 0] + c * xy[i, 1] + 0.5))
             dc = np.int64(np.floor(c * xy[i, 0] - s * xy[i, 1] + 0.5))
             way[i] = ((2 * (dr & 1) + (dc & 1)) * rows + (dr >> 1)) * width + (dc >> 1)
         for k in range(len(spans)):
-            row, col, place = spans[k, 0], spans[k, 1], spans[k, 2]
+            row = spans[k, 0]
+            col = spans[k, 1]
+            place = spans[k, 2]
             beyond = spans[k + 1, 2] if k + 1 < len(spans) else len(cols)
             hits[:] = 0
             _look_up(flat, row * width + col, way, bits, 0, first, hits)
@@ -227,7 +235,8 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
 def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits: U32) -> None:
     """Add to ``hits`` of each cell of the span that begins ``at`` how many points, shifted by ``way``, match."""
     for i in range(begin, end):
-        start, bit = np.uint64(at + way[i]), bits[i]
+        start = np.uint64(at + way[i])
+        bit = bits[i]
         for j in range(np.uint64(0), np.uint64(_SPAN)):
             hits[j] += (flat[start + j] >> bit) & np.uint32(1)
 
@@ -256,14 +265,18 @@ def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: floa
 @kernel
 def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) -> tuple[float, float, float, float]:
     """(share, x, y, yaw) of the best place and heading around one, on single cells; x and y in cells."""
-    best, at = -1.0, (x, y, yaw)
+    best = -1.0
+    at = (x, y, yaw)
     height, width = words.shape
     for da in range(-3, 4):
         a = yaw + np.radians(0.75) * da
-        c, s = np.cos(a), np.sin(a)
+        c = np.cos(a)
+        s = np.sin(a)
         for dx in range(-4, 5):
             for dy in range(-4, 5):
-                px, py, hits = x + 0.5 * dx, y + 0.5 * dy, np.int64(0)
+                px = x + 0.5 * dx
+                py = y + 0.5 * dy
+                hits = np.int64(0)
                 for i in range(len(xy)):
                     r = np.int64(np.floor(py + s * xy[i, 0] + c * xy[i, 1]))
                     k = np.int64(np.floor(px + c * xy[i, 0] - s * xy[i, 1]))
@@ -271,7 +284,8 @@ def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) ->
                         column = words[r, k] | (words[r, k] << np.uint32(1)) | (words[r, k] >> np.uint32(1))
                         hits += np.int64((column >> bits[i]) & np.uint32(1))
                 if hits > best:
-                    best, at = float(hits), (px, py, a)
+                    best = float(hits)
+                    at = (px, py, a)
     return best / len(xy), at[0], at[1], at[2]
 
 
@@ -297,7 +311,9 @@ class GlobalSearch:
         numbers: GlobalSearchNumbers = GLOBAL_SEARCH,
         check: PoseCheck = POSE_CHECK,
     ) -> None:
-        self.point_map, self.ndt, self.numbers = point_map, ndt, numbers
+        self.point_map = point_map
+        self.ndt = ndt
+        self.numbers = numbers
         self.map_around = map_around(ndt.matcher, point_map)
         self.judge = Judge(range_sigma_m, check)
 
@@ -360,7 +376,8 @@ class GlobalSearch:
             return None
         bits = np.floor(height[used] / numbers.layer_m).astype(np.uint32)
         order = np.random.default_rng(0).permutation(len(sample))[: numbers.points]  # the same each time
-        xy, bits = sample[order, :2], bits[order]
+        xy = sample[order, :2]
+        bits = bits[order]
         # The sensor's height over the ground, and the poses of the best peaks.
         below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
         sensor_m = -float(np.quantile(below, 0.05)) if len(below) else 1.8
@@ -380,7 +397,8 @@ class GlobalSearch:
         likely = highest(scores.ravel(), 400 * numbers.peaks)
         place = likely // numbers.yaws
         heading = likely % numbers.yaws
-        x, y = lay.cols[place] + 0.5, lay.rows[place] + 0.5
+        x = lay.cols[place] + 0.5
+        y = lay.rows[place] + 0.5
         spread = numbers.peaks, numbers.spread_m, numbers.spread_rad
         kept = apart(x * numbers.cell_m, y * numbers.cell_m, yaws[heading], *spread)
         return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
@@ -389,8 +407,10 @@ class GlobalSearch:
         """(4, 4) on the map's ground at a peak, level with it."""
         lay, (_, x, y, yaw) = self._layout, peak
         cell_m = self.numbers.cell_m
-        row, col = int(y), int(x)
-        low_r, low_c = max(row - 5, 0), max(col - 5, 0)
+        row = int(y)
+        col = int(x)
+        low_r = max(row - 5, 0)
+        low_c = max(col - 5, 0)
         patch = lay.ground_z[low_r : row + 6, low_c : col + 6]
         r, c = np.nonzero(np.isfinite(patch))
         A = np.column_stack([c + low_c + 0.5 - x, r + low_r + 0.5 - y, np.ones(len(r))])
@@ -399,7 +419,9 @@ class GlobalSearch:
         ahead = np.array([np.cos(yaw), np.sin(yaw), gx * np.cos(yaw) + gy * np.sin(yaw)])
         ahead /= np.linalg.norm(ahead)
         T = np.eye(4)
-        T[:3, 0], T[:3, 1], T[:3, 2] = ahead, np.cross(up, ahead), up
+        T[:3, 0] = ahead
+        T[:3, 1] = np.cross(up, ahead)
+        T[:3, 2] = up
         T[:3, 3] = np.array([lay.x0 + x * cell_m, lay.y0 + y * cell_m, z]) + sensor_m * up
         return T
 

@@ -133,7 +133,8 @@ class Localiser:
         """Looks in turn that held."""
         self._confirmed = False
         self._looked_at: Fix | None = None
-        self._unconfirmed, self._next_search = 0, self.numbers.first_search
+        self._unconfirmed = 0
+        self._next_search = self.numbers.first_search
 
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
         """See :class:`Localise`."""
@@ -285,7 +286,8 @@ class Localiser:
                 self._confirmed = True
                 self._follow_back()
         else:
-            self._held, self._confirmed = 0, False
+            self._held = 0
+            self._confirmed = False
 
     def _follow_back(self) -> None:
         """The track holds: the scans before it that have no place are registered from it backwards in time, with the
@@ -325,17 +327,20 @@ class Localiser:
         twist = self.tracker.twist
         if len(self._waiting) == 1 and newest.fix.scan.time_s is not None:
             self.tracker.move_to(T_map_lidar, newest.fix.scan.stamp_ns)
-            around, sample = self.map_around(T_map_lidar[:3, 3]), Sample(newest.fix.scan)
+            around = self.map_around(T_map_lidar[:3, 3])
+            sample = Sample(newest.fix.scan)
             twist = self.tracker.guess_motion(around, newest.fix.scan.stamp_ns, sample, T_map_lidar)
         for waiting in self._waiting:
             if waiting.nowhere:
                 continue
             self._register_anew(waiting, shift @ waiting.fix.registration.T_map_lidar, twist)
-        self._held, self._confirmed = 0, False
+        self._held = 0
+        self._confirmed = False
         self._go_on()
 
     def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
-        before, around = waiting.fix.registration.T_map_lidar, self.map_around(guess[:3, 3])
+        before = waiting.fix.registration.T_map_lidar
+        around = self.map_around(guess[:3, 3])
         points = deskew(waiting.fix.scan, twist)
         result = around.refine(thin_for_levels(points), guess)
         waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
@@ -345,7 +350,8 @@ class Localiser:
 
     def _go_on(self) -> None:
         """The track goes on from the newest scan that waits, with the motion of the last two."""
-        newest, twist = self._waiting[-1], None
+        newest = self._waiting[-1]
+        twist = None
         if len(self._waiting) > 1:
             last = self._waiting[-2]
             seconds = 1e-9 * (newest.fix.scan.stamp_ns - last.fix.scan.stamp_ns)
@@ -379,7 +385,8 @@ class GivenPoses:
     def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
         """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
         self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
-        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
+        self._stamps_ns = stamps_ns
+        self._T_map_lidar = T_map_lidar
 
     def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
         """See :class:`Localise`: decided at once."""

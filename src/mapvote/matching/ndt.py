@@ -89,7 +89,9 @@ def room_for(n: int) -> Room:
 @inlined
 def _in_map(points: F32, T: F64, i: int) -> Vector:
     """Point i in map metres."""
-    x, y, z = np.float64(points[0, i]), np.float64(points[1, i]), np.float64(points[2, i])
+    x = np.float64(points[0, i])
+    y = np.float64(points[1, i])
+    z = np.float64(points[2, i])
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -105,26 +107,37 @@ def pair_up(points: F32, T: F64, window: Window, cells: F64, room: Room) -> None
     before, nor guesses whether there is a partner: where there is none, the first voxel's numbers are masked.
     """
     rows, lowest, size, flat, beside = window
-    of, home, origin, moved, partner = room.of, room.home, room.origin, room.moved, room.partner
+    of = room.of
+    home = room.home
+    origin = room.origin
+    moved = room.moved
+    partner = room.partner
     stride = rows.shape[1] * rows.shape[2]
     for first in range(0, points.shape[1], PAIRED_AT_ONCE):
         m = 0
         for i in range(first, min(first + PAIRED_AT_ONCE, points.shape[1])):
             x, y, z = _in_map(points, T, i)
             ax, ay, az = voxel_of(size, x, y, z)
-            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            ix = ax - lowest[0]
+            iy = ay - lowest[1]
+            iz = az - lowest[2]
             moved[m] = i
             m += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
-            home[0, i], home[1, i], home[2, i] = ix, iy, iz
+            home[0, i] = ix
+            home[1, i] = iy
+            home[2, i] = iz
         for w in range(m):
-            ix, iy, iz = np.int64(home[0, moved[w]]), np.int64(home[1, moved[w]]), np.int64(home[2, moved[w]])
+            ix = np.int64(home[0, moved[w]])
+            iy = np.int64(home[1, moved[w]])
+            iz = np.int64(home[2, moved[w]])
             inside = holds(rows, ix, iy, iz, 1)
             at = ix * stride + iy * rows.shape[2] + iz if inside else stride + rows.shape[2] + 1
             for j in range(7):
                 partner[j, w] = flat[np.uint64(at + beside[j])] if inside else np.int32(-1)
         for j in range(7):
             for w in range(m):
-                i, k = moved[w], np.uint64(max(partner[j, w], np.int32(0)))
+                i = moved[w]
+                k = np.uint64(max(partner[j, w], np.int32(0)))
                 there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
                 for c in range(3):
                     low = lowest[c] * size - origin[c]
@@ -152,9 +165,18 @@ def _likelihood(e: np.float32) -> np.float32:
 def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
     """The j-th partner of point i, which lies at (x, y, z) from the origin, as (e, w C, w C u) with u the point from
     the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
-    x, y, z = x - of[j, 0, i], y - of[j, 1, i], z - of[j, 2, i]
-    c00, c01, c02, c11, c12, c22 = of[j, 3, i], of[j, 4, i], of[j, 5, i], of[j, 6, i], of[j, 7, i], of[j, 8, i]
-    b0, b1, b2 = c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z
+    x = x - of[j, 0, i]
+    y = y - of[j, 1, i]
+    z = z - of[j, 2, i]
+    c00 = of[j, 3, i]
+    c01 = of[j, 4, i]
+    c02 = of[j, 5, i]
+    c11 = of[j, 6, i]
+    c12 = of[j, 7, i]
+    c22 = of[j, 8, i]
+    b0 = c00 * x + c01 * y + c02 * z
+    b1 = c01 * x + c11 * y + c12 * z
+    b2 = c02 * x + c12 * y + c22 * z
     e = x * b0 + y * b1 + z * b2
     w = _likelihood(e)
     e = e if c00 + c11 + c22 > np.float32(0.0) else np.float32(1e9)
@@ -227,7 +249,9 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
 def linearise(points: F32, room: Room, T: F64, H: F64, M: F64, g: F64) -> tuple[float, float]:
     """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
     (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
-    sums, R, d = room.sums, room.R, room.d
+    sums = room.sums
+    R = room.R
+    d = room.d
     sums[:] = 0.0
     for r in range(3):
         d[r] = T[r, 3] - room.origin[r]
@@ -257,11 +281,16 @@ def likelihoods(points: F32, T: F64, window: Window, cells: F64, out: F64) -> No
         for i in range(points.shape[1]):
             x, y, z = _in_map(points, T[pose], i)
             ax, ay, az = voxel_of(size, x, y, z)
-            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            ix = ax - lowest[0]
+            iy = ay - lowest[1]
+            iz = az - lowest[2]
             if not holds(rows, ix, iy, iz, 1):
                 continue
-            x, y, z = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
-            nearest, at = CUTOFF_E + 1.0, ix * stride + iy * rows.shape[2] + iz
+            x = x - (ax + 0.5) * size
+            y = y - (ay + 0.5) * size
+            z = z - (az + 0.5) * size
+            nearest = CUTOFF_E + 1.0
+            at = ix * stride + iy * rows.shape[2] + iz
             for j in range(7):
                 k = flat[at + beside[j]]
                 if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
@@ -283,7 +312,8 @@ def inverse_of(A: F64, left: F64, out: F64) -> None:
     ``left`` (6, 6): scratch."""
     for r in range(6):
         for c in range(6):
-            left[r, c], out[r, c] = A[r, c], 1.0 if r == c else 0.0
+            left[r, c] = A[r, c]
+            out[r, c] = 1.0 if r == c else 0.0
     for k in range(6):
         pivot = 1.0 / left[k, k]
         for c in range(6):
@@ -326,11 +356,21 @@ def _covariance(H_inv: F64, M: F64, floor: float, map_variance: F64, half: F64, 
 def _move(T: F64, step: F64, W: F64, turn: F64, turned: F64) -> None:
     """Shift the sensor by rho and turn it by phi, both in map axes, in place (Rodrigues). W, turn, turned (3, 3):
     scratch."""
-    x, y, z = step[3, 0], step[4, 0], step[5, 0]
+    x = step[3, 0]
+    y = step[4, 0]
+    z = step[5, 0]
     angle = np.sqrt(x * x + y * y + z * z)
     s = np.sin(angle) / angle if angle > 1e-8 else 1.0
     c = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
-    W[0, 0], W[0, 1], W[0, 2], W[1, 0], W[1, 1], W[1, 2], W[2, 0], W[2, 1], W[2, 2] = 0.0, -z, y, z, 0.0, -x, -y, x, 0.0
+    W[0, 0] = 0.0
+    W[0, 1] = -z
+    W[0, 2] = y
+    W[1, 0] = z
+    W[1, 1] = 0.0
+    W[1, 2] = -x
+    W[2, 0] = -y
+    W[2, 1] = x
+    W[2, 2] = 0.0
     _times(W, W, turn)
     for i in range(3):
         for j in range(3):
@@ -363,11 +403,15 @@ def _to_prior(T: F64, T_prior: F64, R: F64, step: F64) -> None:
         for k in range(3):
             for c in range(3):
                 R[r, c] += T_prior[r, k] * T[c, k]
-    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    x = 0.5 * (R[2, 1] - R[1, 2])
+    y = 0.5 * (R[0, 2] - R[2, 0])
+    z = 0.5 * (R[1, 0] - R[0, 1])
     sine = np.sqrt(x * x + y * y + z * z)
     angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
     share = angle / sine if sine > 1e-9 else 1.0
-    step[3, 0], step[4, 0], step[5, 0] = x * share, y * share, z * share
+    step[3, 0] = x * share
+    step[4, 0] = y * share
+    step[5, 0] = z * share
     for k in range(3):
         step[k, 0] = T_prior[k, 3] - T[k, 3]
 
@@ -385,9 +429,16 @@ def align(
     (6,): variance of the map's own errors. The prior pose T_prior (4, 4) is weighed against the scan by its information
     ``prior`` (6, 6), zeros without one.
     """
-    H, M, H_inv, information = room.matrices[0], room.matrices[1], room.matrices[2], room.matrices[3]
-    left, half, both = room.matrices[4], room.matrices[5], room.matrices[6]
-    g, step, to_prior = room.columns[0], room.columns[1], room.columns[2]
+    H = room.matrices[0]
+    M = room.matrices[1]
+    H_inv = room.matrices[2]
+    information = room.matrices[3]
+    left = room.matrices[4]
+    half = room.matrices[5]
+    both = room.matrices[6]
+    g = room.columns[0]
+    step = room.columns[1]
+    to_prior = room.columns[2]
     size = window.size
     has_prior = prior[0, 0] > 0.0
     for r in range(3):
@@ -397,7 +448,11 @@ def align(
     for r in range(6):
         for c in range(6):
             covariance[r, c] = 1.0 if r == c else 0.0
-    converged, iterations, likelihood, inliers, floor = False, 0, 0.0, 0.0, 0.0
+    converged = False
+    iterations = 0
+    likelihood = 0.0
+    inliers = 0.0
+    floor = 0.0
     while iterations < most and not converged:
         iterations += 1
         pair_up(points, T, window, cells, room)

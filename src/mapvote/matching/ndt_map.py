@@ -160,7 +160,9 @@ class MapWindow:
 
     def go_on_in(self, point_map: PointMap) -> None:
         """The map is another version from here on: what is ready of tiles that stayed the same remains so."""
-        old, self.point_map, self.ndt_map = self.point_map, point_map, None
+        old = self.point_map
+        self.point_map = point_map
+        self.ndt_map = None
         same = {tile for tile in self._ready if old.tiles.get(tile) is point_map.tiles.get(tile)}
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in same}
 
@@ -205,7 +207,8 @@ def tiles_within(point_map: PointMap, position: F64, half_m: float = NDT_WINDOW.
 
 def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
     """The voxels of all points of a tile, in one piece for each slab of height."""
-    points, pieces = tile.points_map, []
+    points = tile.points_map
+    pieces = []
     slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
     for height in np.unique(slab):
         piece = points[slab == height]
@@ -245,7 +248,8 @@ def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
     m, (a, b, c) = sums[:, 0], cells[:, :3].T
     moments = sums[:, 4:10].T / m - np.stack([a * a, a * b, a * c, b * b, b * c, c * c])
     moments[[0, 3, 5]] += noise_m * noise_m
-    S, C = _symmetric(moments), _symmetric(cells[:, 3:9].T)
+    S = _symmetric(moments)
+    C = _symmetric(cells[:, 3:9].T)
     A = [[(r == s) + S[r][0] * C[0][s] + S[r][1] * C[1][s] + S[r][2] * C[2][s] for s in range(3)] for r in range(3)]
     determinant = (
         A[0][0] * (A[1][1] * A[2][2] - A[1][2] * A[2][1])

@@ -117,7 +117,8 @@ def _diagonalise(A: F64, V: F64) -> None:
             A[min(r, p), max(r, p)] = c * rp - s * rq
             A[min(r, q), max(r, q)] = s * rp + c * rq
             for k in range(3):
-                vp, vq = V[k, p], V[k, q]
+                vp = V[k, p]
+                vq = V[k, q]
                 V[k, p] = c * vp - s * vq
                 V[k, q] = s * vp + c * vq
 
@@ -135,9 +136,13 @@ def _order(A: F64, V: F64) -> None:
 @inlined
 def _upright(V: F64) -> None:
     """The first column becomes the upward direction across the last one."""
-    x, y, z = V[0, 2], V[1, 2], V[2, 2]
+    x = V[0, 2]
+    y = V[1, 2]
+    z = V[2, 2]
     length = np.sqrt(max(1.0 - z * z, 1e-12))
-    V[0, 0], V[1, 0], V[2, 0] = -x * z / length, -y * z / length, (1.0 - z * z) / length
+    V[0, 0] = -x * z / length
+    V[1, 0] = -y * z / length
+    V[2, 0] = (1.0 - z * z) / length
 
 
 @inlined
@@ -172,9 +177,15 @@ def _add_moments(sums: F64, k: int, x: float, y: float, z: float) -> None:
 def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
     """Eqs. (6.2) and (6.3), divided by the count: the mean is returned, the upper triangle of A is the covariance."""
     m = sums[k, 0]
-    mx, my, mz = sums[k, 1] / m, sums[k, 2] / m, sums[k, 3] / m
-    A[0, 0], A[0, 1], A[0, 2] = sums[k, 4] / m - mx * mx, sums[k, 5] / m - mx * my, sums[k, 6] / m - mx * mz
-    A[1, 1], A[1, 2], A[2, 2] = sums[k, 7] / m - my * my, sums[k, 8] / m - my * mz, sums[k, 9] / m - mz * mz
+    mx = sums[k, 1] / m
+    my = sums[k, 2] / m
+    mz = sums[k, 3] / m
+    A[0, 0] = sums[k, 4] / m - mx * mx
+    A[0, 1] = sums[k, 5] / m - mx * my
+    A[0, 2] = sums[k, 6] / m - mx * mz
+    A[1, 1] = sums[k, 7] / m - my * my
+    A[1, 2] = sums[k, 8] / m - my * mz
+    A[2, 2] = sums[k, 9] / m - mz * mz
     return mx, my, mz
 
 
@@ -211,9 +222,11 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
 def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, scratch: F64) -> None:
     """The distributions of the rows ``touched`` (m,), from their sums. A distribution needs MIN_POINTS, and is
     widened by ``floor_m`` to all sides; ``size``: side of a voxel, metres; ``scratch`` (2, 3, 3)."""
-    A, V = scratch[0], scratch[1]
+    A = scratch[0]
+    V = scratch[1]
     sums = voxels.sums
-    thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
+    thin = (FLATNESS * size) * (FLATNESS * size)
+    floor_variance = floor_m * floor_m
     for k in touched:
         sums[k, 10] = 0.0
         m = sums[k, 0]
@@ -239,12 +252,17 @@ def enter_points(points: F64, window: Window, voxels: Voxels, n: int, touched: I
     ``touched`` (n,)): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not
     for points. Points outside ``window`` are left out.
     """
-    rows, lowest, size = window.rows, window.lowest, window.size
+    rows = window.rows
+    lowest = window.lowest
+    size = window.size
     sums = voxels.sums
-    n_touched, looked_at = 0, len(points)
+    n_touched = 0
+    looked_at = len(points)
     for i in range(len(points)):
         ax, ay, az = voxel_of(size, points[i, 0], points[i, 1], points[i, 2])
-        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+        ix = ax - lowest[0]
+        iy = ay - lowest[1]
+        iz = az - lowest[2]
         if not holds(rows, ix, iy, iz, 0):
             continue
         k = rows[ix, iy, iz]
@@ -255,14 +273,18 @@ def enter_points(points: F64, window: Window, voxels: Voxels, n: int, touched: I
             k = n
             n += 1
             rows[ix, iy, iz] = k
-            voxels.place[k, 0], voxels.place[k, 1], voxels.place[k, 2] = ax, ay, az
+            voxels.place[k, 0] = ax
+            voxels.place[k, 1] = ay
+            voxels.place[k, 2] = az
             for c in range(11):
                 sums[k, c] = 0.0
         if sums[k, 10] == 0.0:
             sums[k, 10] = 1.0
             touched[n_touched] = k
             n_touched += 1
-        x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
+        x = points[i, 0] - (ax + 0.5) * size
+        y = points[i, 1] - (ay + 0.5) * size
+        z = points[i, 2] - (az + 0.5) * size
         _add_moments(sums, k, x, y, z)
     return n, looked_at, n_touched
 
@@ -274,10 +296,13 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
     Returns (the new number of rows, how many of ``shared`` (m,) are filled): rows that both have, to :func:`refresh`.
     Voxels outside ``window`` are left out.
     """
-    rows, lowest = window.rows, window.lowest
+    rows = window.rows
+    lowest = window.lowest
     n_shared = 0
     for j in range(len(others.place)):
-        ix, iy, iz = others.place[j, 0] - lowest[0], others.place[j, 1] - lowest[1], others.place[j, 2] - lowest[2]
+        ix = others.place[j, 0] - lowest[0]
+        iy = others.place[j, 1] - lowest[1]
+        iz = others.place[j, 2] - lowest[2]
         if not holds(rows, ix, iy, iz, 0):
             continue
         k = rows[ix, iy, iz]
@@ -301,9 +326,12 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
 @kernel
 def reindex(window: Window, place: I64, n: int) -> None:
     """Enter the first ``n`` voxels, whose world voxels are ``place`` (m, 3), into a window without any."""
-    rows, lowest = window.rows, window.lowest
+    rows = window.rows
+    lowest = window.lowest
     for k in range(n):
-        ix, iy, iz = place[k, 0] - lowest[0], place[k, 1] - lowest[1], place[k, 2] - lowest[2]
+        ix = place[k, 0] - lowest[0]
+        iy = place[k, 1] - lowest[1]
+        iz = place[k, 2] - lowest[2]
         if holds(rows, ix, iy, iz, 0):
             rows[ix, iy, iz] = k
 
@@ -312,8 +340,11 @@ class NdtGrid:
     """One level of the map: voxels of one size. All are kept; those inside the window can be found."""
 
     def __init__(self, level: Level, window: Window) -> None:
-        self.level, self.window, self.n = level, window, 0
-        self._voxels, self._stale = _room_for(1024), list[I64]()
+        self.level = level
+        self.window = window
+        self.n = 0
+        self._voxels = _room_for(1024)
+        self._stale = list[I64]()
 
     @property
     def voxels(self) -> Voxels:

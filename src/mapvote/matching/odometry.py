@@ -180,17 +180,20 @@ class Tracker:
 
     def move_to(self, T_map_lidar: F64, stamp_ns: int, twist: F64 | None = None, score: float = 0.0) -> None:
         """The vehicle was here then: the track goes on from this pose, with this motion or none known."""
-        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+        self.last_pose = T_map_lidar
+        self.last_stamp_ns = stamp_ns
         self.twist, self._measured = (np.zeros(6), False) if twist is None else (twist, True)
         self._usual_score = score
 
     def correct(self, T_map_lidar: F64, twist: F64) -> None:
         """The last scan was taken here, a little beside where it was found: the track goes on from this pose."""
-        self.last_pose, self.twist = T_map_lidar, twist
+        self.last_pose = T_map_lidar
+        self.twist = twist
 
     def is_sound(self, result: Registration) -> bool:
         """Whether a registration converged, overlaps the map and is certain enough; pose_check tests the place."""
-        s, position = self.settings, result.covariance[:3, :3]
+        s = self.settings
+        position = result.covariance[:3, :3]
         if not result.converged or result.inlier_share < s.min_inlier_share:
             return False
         if np.sqrt(position[0, 0] + position[1, 1] + position[2, 2]) < 0.99 * s.max_sigma_m:
@@ -233,7 +236,8 @@ class Tracker:
         """The track goes on from this pose with the measured ``motion``, else with ``twist``."""
         self.twist = twist if motion is None else motion
         self._measured = self._measured or motion is not None
-        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+        self.last_pose = T_map_lidar
+        self.last_stamp_ns = stamp_ns
 
 
 def _differ(twist: F64, other: F64) -> bool:

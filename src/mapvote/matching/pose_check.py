@@ -90,20 +90,23 @@ class Judge:
     """Looks at one scan at one pose of a map."""
 
     def __init__(self, range_sigma_m: float, check: PoseCheck = POSE_CHECK) -> None:
-        self.range_sigma_m, self.check = range_sigma_m, check
+        self.range_sigma_m = range_sigma_m
+        self.check = check
         self._arms = _arms(check)
 
     def judge(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty. ``quick``: other places are found
         less well, for a third less work; a pose that does not hold should be judged again."""
         few, standing, expected, known, here = self._here(around, points_lidar, T_map_lidar)
-        best, lead = None, here
+        best = None
+        lead = here
         for other in self._others(around, few, standing, T_map_lidar, quick):
             ahead = here - self._likelihood(around, standing, other) / expected
             away = float(np.linalg.norm(other[:2, 3] - T_map_lidar[:2, 3]))
             away = away if float(other[:2, 0] @ T_map_lidar[:2, 0]) > 0.0 else np.inf
             if ahead < lead and (away > self.check.same_place_m or (ahead < 0.0 and away > self.check.settled_m)):
-                best, lead = other, ahead
+                best = other
+                lead = ahead
         return Verdict(here, known, lead, best)
 
     def fit(self, around: LocalMatcher, points_lidar: F64, T_map_lidar: F64) -> float:
@@ -166,7 +169,9 @@ def height_above_lowest(points: F64, check: PoseCheck = POSE_CHECK) -> F64:
     half = 40
     cols, rows = np.floor(points[:, :2].T / check.lowest_cell_m).astype(np.int64) + half + 1
     here = np.flatnonzero((rows > 0) & (rows <= 2 * half) & (cols > 0) & (cols <= 2 * half))
-    rows, cols, z = rows[here], cols[here], points[here, 2]
+    rows = rows[here]
+    cols = cols[here]
+    z = points[here, 2]
     low = np.full((2 * half + 2, 2 * half + 2), np.inf)
     np.minimum.at(low, (rows, cols), z)
     out = np.full(len(points), -np.inf)

@@ -70,9 +70,14 @@ def thinned(points_lidar: F32, numbers: ScanPreparation = SCAN_PREPARATION) -> d
 def _deskew(points: F32, time_s: F32, v: F32, w: F32, out: F32) -> None:
     half = np.float32(0.5)
     for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
-        t, x, y, z = time_s[i], points[i, 0], points[i, 1], points[i, 2]
+        t = time_s[i]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         # exp(t * twist) to second order: a first-order rotation would leave centimetres at 50 m in a bend.
-        ux, uy, uz = v[0] + w[1] * z - w[2] * y, v[1] + w[2] * x - w[0] * z, v[2] + w[0] * y - w[1] * x
+        ux = v[0] + w[1] * z - w[2] * y
+        uy = v[1] + w[2] * x - w[0] * z
+        uz = v[2] + w[0] * y - w[1] * x
         h = half * t * t
         out[i, 0] = x + t * ux + h * (w[1] * uz - w[2] * uy)
         out[i, 1] = y + t * uy + h * (w[2] * ux - w[0] * uz)
@@ -103,7 +108,8 @@ def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64
 
 def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
     """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
-    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
+    before = max(i - 1, 0)
+    after = min(i + 1, len(stamps_ns) - 1)
     if before == after:
         return np.zeros(6)
     seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])

@@ -126,7 +126,8 @@ class VgicpMap:
         source = small_gicp.PointCloud(points)
         small_gicp.estimate_covariances(source, small_gicp.KdTree(source), self.numbers.neighbours, 1)
         for level in [self._coarse, self._fine] if first_level == 0 else [self._fine]:
-            reach_m, most = level.reach_m, self.numbers.iterations
+            reach_m = level.reach_m
+            most = self.numbers.iterations
             result = small_gicp.align(level.voxels, source, T, max_correspondence_distance=reach_m, max_iterations=most)
             T = np.array(result.T_target_source)
         T[:3, 3] += self.centre

@@ -86,14 +86,21 @@ def follow_rays(rows: F32, clearance: float) -> Rays:
 @kernel
 def _follow(rows: F32, clearance: float, rays: Rays) -> None:
     """Without a branch, in float32 alone and by an index that cannot be negative, so that it vectorises."""
-    across, along, up = rows[0], rows[1], rows[2]
+    across = rows[0]
+    along = rows[1]
+    up = rows[2]
     reach, x, y, slope, stop, fan = rays
     n = len(across)
-    clear, layer = np.float32(clearance), np.float32(CELL_SIZE)
+    clear = np.float32(clearance)
+    layer = np.float32(CELL_SIZE)
     for i in range(np.uint64(0), np.uint64(n)):
-        dx, dy, dz = across[i], along[i], up[i]
+        dx = across[i]
+        dy = along[i]
+        dz = up[i]
         h = np.sqrt(dx * dx + dy * dy)
-        reach[i], x[i], y[i] = h, dx / h, dy / h
+        reach[i] = h
+        x[i] = dx / h
+        y[i] = dy / h
         slope[i] = dz / (layer * h)
         stop[i] = h - clear * h / np.sqrt(h * h + dz * dz)
         fan[i] = min(np.int32(turn(dx, dy) * np.float32(FANS)), np.int32(FANS - 1))
@@ -109,8 +116,11 @@ _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 def gather_rays(rays: Rays) -> Fans:
     """Sort rays into fans. A ray that ends in the sensor's own cell proves nothing."""
     room = len(rays.reach) + FANS
-    first, last = np.zeros(FANS, np.int32), np.empty(FANS, np.int32)
-    slope, stop, end = np.empty(room, np.float32), np.empty(room, np.float32), np.zeros(FANS, np.float32)
+    first = np.zeros(FANS, np.int32)
+    last = np.empty(FANS, np.int32)
+    slope = np.empty(room, np.float32)
+    stop = np.empty(room, np.float32)
+    end = np.zeros(FANS, np.float32)
     fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
     _gather(rays, fans)
     return fans
@@ -118,7 +128,8 @@ def gather_rays(rays: Rays) -> Fans:
 
 @kernel
 def _gather(rays: Rays, fans: Fans) -> None:
-    n, own = np.uint64(len(rays.reach)), np.float32(CELL_SIZE)
+    n = np.uint64(len(rays.reach))
+    own = np.float32(CELL_SIZE)
     first, last, slope, stop, end, direction = fans
     for i in range(n):
         fan = np.uint64(rays.fan[i])
@@ -134,10 +145,12 @@ def _gather(rays: Rays, fans: Fans) -> None:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
     for i in range(n):  # rays that are not kept are overwritten: no branch to predict
-        fan, e = np.uint64(rays.fan[i]), rays.stop[i]
+        fan = np.uint64(rays.fan[i])
+        e = rays.stop[i]
         keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
         k = np.uint64(last[fan])
-        slope[k], stop[k] = rays.slope[i], e
+        slope[k] = rays.slope[i]
+        stop[k] = e
         last[fan] += 1 if keep else 0
         end[fan] = max(end[fan], e if keep else np.float32(0.0))
 
@@ -161,8 +174,10 @@ class Way(NamedTuple):
 @inlined
 def set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     """The way from (x, y), in cells, in direction (dx, dy), where it has come ``at`` metres."""
-    far, along = 1e18, 1e-9  # a fan along an axis never comes to the next row or column
-    c, r = int(np.floor(x + dx * at / CELL_SIZE)), int(np.floor(y + dy * at / CELL_SIZE))
+    far = 1e18
+    along = 1e-9  # a fan along an axis never comes to the next row or column
+    c = int(np.floor(x + dx * at / CELL_SIZE))
+    r = int(np.floor(y + dy * at / CELL_SIZE))
     next_c = far if abs(dx) < along else ((c + (dx > 0)) - x) / dx * CELL_SIZE
     next_r = far if abs(dy) < along else ((r + (dy > 0)) - y) / dy * CELL_SIZE
     width_c = far if abs(dx) < along else CELL_SIZE / abs(dx)
@@ -187,7 +202,8 @@ class Crossed(NamedTuple):
 
 def _room_for(cells: int) -> Crossed:
     room = cells + _LANES
-    low, high = np.zeros(room, np.uint32), np.zeros(room, np.uint32)
+    low = np.zeros(room, np.uint32)
+    high = np.zeros(room, np.uint32)
     return Crossed(np.zeros(room, np.int32), np.zeros(room + 1, np.float32), np.zeros(room, np.int32), low, high)
 
 
@@ -200,7 +216,9 @@ def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer:
     n = 0
     while 0 <= r < rows and 0 <= c < cols and t < end:
         k = np.uint64(r * cols + c)
-        out.cell[n], out.entered[n], out.bottom[n] = k, t, base[r, c] - layer
+        out.cell[n] = k
+        out.entered[n] = t
+        out.bottom[n] = base[r, c] - layer
         n += 1
         t = min(next_c, next_r)
         column = next_c < next_r
@@ -209,7 +227,8 @@ def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer:
         next_c += width_c if column else 0.0
         next_r += 0.0 if column else width_r
     for j in range(n, n + _LANES):
-        out.entered[j], out.bottom[j] = t, 0
+        out.entered[j] = t
+        out.bottom[j] = 0
     return n
 
 
@@ -220,8 +239,10 @@ def _pass(
     """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
     and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above the
     columns."""
-    t, bottom = crossed.entered, crossed.bottom
-    none, most = np.int32(0), np.int32(_HALF_COLUMN - 1)
+    t = crossed.entered
+    bottom = crossed.bottom
+    none = np.int32(0)
+    most = np.int32(_HALF_COLUMN - 1)
     b = np.uint64(0)
     while b < np.uint64(n) and t[b] < stop:
         for i in range(np.uint64(_LANES)):  # unsigned: an index that cannot be negative vectorises
@@ -231,7 +252,8 @@ def _pass(
             from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + up))
             to = np.int32(max(enter, leave) - np.int32(bottom[j] + up))
             here = (t[j] < stop) & (to >= none) & (from_ <= most)
-            first, last = np.uint32(min(max(from_, none), most)), np.uint32(min(max(to, none), most))
+            first = np.uint32(min(max(from_, none), most))
+            last = np.uint32(min(max(to, none), most))
             bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
             words[j] |= np.uint32(bits) if here else np.uint32(0)
         b += np.uint64(_LANES)
@@ -242,7 +264,8 @@ def _enter(crossed: Crossed, n: int, passed: U64) -> None:
     """Enter the voxels that a fan passed into the plane (flat), and clear the words. Bit 63, all above, is never
     passed."""
     for j in range(n):
-        low, high = np.uint64(crossed.low[j]), np.uint64(crossed.high[j] & np.uint32(0x7FFFFFFF))
+        low = np.uint64(crossed.low[j])
+        high = np.uint64(crossed.high[j] & np.uint32(0x7FFFFFFF))
         passed[np.uint64(crossed.cell[j])] |= low | high << np.uint64(_HALF_COLUMN)
     for j in range(n + _LANES):
         crossed.low[j] = crossed.high[j] = 0
@@ -259,7 +282,8 @@ def _mark_passed(
 ) -> None:
     layer = int(np.floor(origin[2] / CELL_SIZE))
     height = np.float32(origin[2] / CELL_SIZE - layer)
-    x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
+    x = (origin[0] - corner[0]) / CELL_SIZE
+    y = (origin[1] - corner[1]) / CELL_SIZE
     for f in range(FANS):
         if fans.end[f] <= _MARKS_FROM[f]:
             continue
@@ -270,7 +294,8 @@ def _mark_passed(
         for j in range(1, n):
             lowest = min(lowest, crossed.bottom[j])
         for k in range(fans.first[f], fans.last[f]):
-            slope, stop = fans.slope[k], fans.stop[k]
+            slope = fans.slope[k]
+            stop = fans.stop[k]
             halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF_COLUMN else 1
             for half in range(halves):
                 words = crossed.low if half == 0 else crossed.high

@@ -194,8 +194,12 @@ class Frontend:
         self._spread = spread
         self._confirmed: deque[Fix] = deque()
         """Fixes whose scans wait for their turn."""
-        self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
-        self._with_sight, self._sky = with_sight, None if sensor is None else Sky(sensor)
+        self._localise = localise
+        self._movers = movers
+        self._ground = ground
+        self._compared = compared
+        self._with_sight = with_sight
+        self._sky = None if sensor is None else Sky(sensor)
         self._waiting: deque[PlacedScan] = deque()
         self._observed = -1
         self._ended = False
@@ -231,7 +235,8 @@ class Frontend:
 
     def cut(self) -> DriveReport:
         """The report of the scans that are done; those that still wait are the first of the drive from here on."""
-        done, n = self.report, self.done
+        done = self.report
+        n = self.done
         self.report = done.split(n)
         self._waiting = deque(replace(scan, index=scan.index - n) for scan in self._waiting)
         self._observed -= n
@@ -273,7 +278,8 @@ class Frontend:
     def _place(self, fix: Fix, points: F32, scan: Scan, index: int) -> PlacedScan:
         """``points`` (n, 3) of one LiDAR of the fix, de-skewed, and its ``scan``."""
         T_map_lidar = fix.registration.T_map_lidar
-        points_map, origin_map = transform(T_map_lidar, points), scan.origin_map(T_map_lidar)
+        points_map = transform(T_map_lidar, points)
+        origin_map = scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)

@@ -107,9 +107,13 @@ def _aim(x: np.float32, y: np.float32, z: np.float32, pixels: Pixels) -> tuple[n
 def _enter_image(rows: F32, pixels: Pixels, pixel: I32, steps: I32, flat: U16, out: U16) -> None:
     """:func:`range_image` of places (3, n) from the sensor, by scratch: ``pixel`` (n,), the last one being nowhere,
     ``steps`` (n,) of range, and ``flat`` (turns * slopes + 1,)."""
-    x, y, z = rows[0], rows[1], rows[2]
-    turns, n = pixels.turns, np.uint64(len(x))
-    slopes, nowhere = np.int32(pixels.slopes), np.int32(pixels.turns * pixels.slopes)
+    x = rows[0]
+    y = rows[1]
+    z = rows[2]
+    turns = pixels.turns
+    n = np.uint64(len(x))
+    slopes = np.int32(pixels.slopes)
+    nowhere = np.int32(pixels.turns * pixels.slopes)
     for i in range(np.uint64(0), n):  # unsigned: an index that cannot be negative vectorises
         rho, a, b = _aim(x[i], y[i], z[i], pixels)
         pixel[i] = np.int32(a * slopes + b) if (rho >= LEAST_RANGE_M) & (b >= 0) & (b < slopes) else nowhere
@@ -122,15 +126,18 @@ def _enter_image(rows: F32, pixels: Pixels, pixel: I32, steps: I32, flat: U16, o
     wide = np.uint64(pixels.slopes)
     for k in range(turns):
         left = np.uint64(k - 1 if k > 0 else turns - 1) * wide
-        middle, right = np.uint64(k) * wide, np.uint64(k + 1 if k + 1 < turns else 0) * wide
+        middle = np.uint64(k) * wide
+        right = np.uint64(k + 1 if k + 1 < turns else 0) * wide
         for s in range(np.uint64(0), wide):
             out[k, s] = min(flat[middle + s], min(flat[left + s], flat[right + s]))
 
 
 def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
     """(turns, slopes) nearest horizontal range among the returns (n, 3) in each direction and to its left and right."""
-    n, size = len(points), pixels.turns * pixels.slopes
-    out, flat = np.empty((pixels.turns, pixels.slopes), np.uint16), np.empty(size + 1, np.uint16)
+    n = len(points)
+    size = pixels.turns * pixels.slopes
+    out = np.empty((pixels.turns, pixels.slopes), np.uint16)
+    flat = np.empty(size + 1, np.uint16)
     _enter_image(rows_from(points, origin), pixels, np.empty(n, np.int32), np.empty(n, np.int32), flat, out)
     return out
 
@@ -167,8 +174,12 @@ _LEAST_PIXELS, _MOST_PIXELS = 2, 8
 def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.float32, sought: Sought) -> None:
     """Compute range and direction of the first ``n`` samples: fills ``steps``, ``pixel`` and ``around``."""
     x, y, z, _ = samples
-    steps, pixel, around = sought.steps, sought.pixel, sought.around
-    near, slopes, reach = np.int32(LEAST_RANGE_M * PER_M), np.int32(pixels.slopes), height_m * pixels.per_slope
+    steps = sought.steps
+    pixel = sought.pixel
+    around = sought.around
+    near = np.int32(LEAST_RANGE_M * PER_M)
+    slopes = np.int32(pixels.slopes)
+    reach = height_m * pixels.per_slope
     for i in range(np.uint64(0), np.uint64(n)):
         rho, a, b = _aim(x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2], pixels)
         steps[i] = np.int32(rho * PER_M + np.float32(0.5))
@@ -182,7 +193,9 @@ def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.fl
 def _read(n: int, image: U16, sought: Sought) -> None:
     """Read the ranges at, below and above each sample's pixel. Most samples read only _LEAST_PIXELS to each side: the
     first loop is short, so that it requests many pixels at once and waits less for memory."""
-    here, below, above = sought.here, sought.below, sought.above
+    here = sought.here
+    below = sought.below
+    above = sought.above
     for w in range(np.uint64(0), np.uint64(n)):
         p = np.uint64(max(sought.pixel[w], np.int32(_LEAST_PIXELS)))
         here[w] = image[p]
@@ -192,7 +205,8 @@ def _read(n: int, image: U16, sought: Sought) -> None:
         p = np.uint64(sought.pixel[w])
         if (sought.around[w] > _LEAST_PIXELS) & (p > 0):
             for s in range(np.uint64(_LEAST_PIXELS + 1), np.uint64(sought.around[w] + 1)):
-                below[w], above[w] = min(below[w], image[p - s]), min(above[w], image[p + s])
+                below[w] = min(below[w], image[p - s])
+                above[w] = min(above[w], image[p + s])
 
 
 @kernel
@@ -214,16 +228,22 @@ def look(
     behind_m, height_m, enough = rule
     _seek(samples, n, sensor, pixels, np.float32(height_m), sought)
     _read(n, image, sought)
-    margin, left = np.int32(behind_m * PER_M), np.uint64(0)
+    margin = np.int32(behind_m * PER_M)
+    left = np.uint64(0)
     for w in range(np.uint64(0), np.uint64(n)):
-        below, above, steps = sought.below[w], sought.above[w], sought.steps[w]
+        below = sought.below[w]
+        above = sought.above[w]
+        steps = sought.steps[w]
         r = np.int32(min(sought.here[w], min(below, above)))
         known = (sought.pixel[w] > 0) & (r != np.int32(NO_RETURN)) & (r >= steps - margin)
         through = known & (r > steps + margin)
         low = np.uint8(1) if below < NO_RETURN else np.uint8(0)
         high = np.uint8(2) if above < NO_RETURN else np.uint8(0)
         i = np.uint64(of[w])
-        x[left], y[left], z[left], of[left] = x[w], y[w], z[w], of[w]
+        x[left] = x[w]
+        y[left] = y[w]
+        z[left] = z[w]
+        of[left] = of[w]
         free[i] += 1 if through else 0
         hit[i] += 1 if known & ~through else 0
         sides[i] |= low | high if through else np.uint8(0)
@@ -347,14 +367,16 @@ class MovingFilter:
         m = left = len(scan.samples)
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
-        waiting, sought = Samples(x, y, z, np.arange(m, dtype=np.int32)), room_to_look(m)
+        waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
+        sought = room_to_look(m)
         # Each of the other scans counts what it saw at the samples.
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = movers.margin_m, movers.height_m, movers.enough
             left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
         # A voxel is brief if rays passed it on both sides and most scans that could see it saw through it.
-        free, total = counts.free, counts.free + counts.hit
+        free = counts.free
+        total = counts.free + counts.hit
         brief = (counts.sides == BOTH_SIDES) & (free >= movers.min_free) & (free >= movers.free_share * total)
         # The samples' cells in a square around the sensor.
         half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
@@ -391,7 +413,8 @@ def _choose(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float,
     ``chosen`` (n,) and ``keys`` (n,)."""
     count = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(points))):  # what is not chosen is written over: no branch to predict
-        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        x = points[i, 0] - origin[0]
+        y = points[i, 1] - origin[1]
         chosen[count] = i
         count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach * reach) else np.uint64(0)
     for k in range(count):
@@ -411,7 +434,8 @@ def _scatter(chosen: I32, of: I32, voxel_of: I32) -> None:
 
 def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, F64]:
     """(voxel_of (n,), first point of each voxel (m, 3)), voxels in order of their first points; -1 for no voxel."""
-    chosen, keys = np.empty(len(points), np.int32), np.empty(len(points), np.int64)
+    chosen = np.empty(len(points), np.int32)
+    keys = np.empty(len(points), np.int64)
     count = _choose(points, obstacle, origin, reach, cell, chosen, keys)
     of, first = grouped(keys[:count])  # scans of 66,000 points have 7,000 voxels
     voxel_of = np.empty(len(points), dtype=np.int32)
@@ -455,14 +479,24 @@ def _components(
 ) -> None:  # fmt: skip
     """Into ``out`` (m,) which voxels move, see :func:`moving_components`; ``work`` (9, m): scratch, ``plane``
     (side * side,): scratch that holds -1."""
-    cells, cell_of, n_seen, n_brief, total = work[0], work[1], work[2], work[3], work[4]
-    moving, label, stack, wanted = work[5], work[6], work[7], work[8]
+    cells = work[0]
+    cell_of = work[1]
+    n_seen = work[2]
+    n_brief = work[3]
+    total = work[4]
+    moving = work[5]
+    label = work[6]
+    stack = work[7]
+    wanted = work[8]
     n = 0
     for i in range(len(place)):
         at = place[i]
         if plane[at] < 0:
             plane[at] = n
-            cells[n], n_seen[n], n_brief[n], wanted[n] = at, 0, 0, 1
+            cells[n] = at
+            n_seen[n] = 0
+            n_brief[n] = 0
+            wanted[n] = 1
             n += 1
         k = plane[at]
         cell_of[i] = k
@@ -500,7 +534,8 @@ def moving_components(
     ``min_voxels`` of them. Where a mover touches something static, the component splits at the cells that are mostly
     static, and each remaining part moves if at least ``share_part`` of it was brief.
     """
-    out, plane = np.empty(len(place), dtype=np.bool_), np.full(side * side, -1, dtype=np.int32)
+    out = np.empty(len(place), dtype=np.bool_)
+    plane = np.full(side * side, -1, dtype=np.int32)
     work = np.empty((9, len(place)), dtype=np.int64)
     _components(place, side, seen, brief, min_voxels, share_whole, share_part, plane, work, out)
     return out

@@ -96,7 +96,8 @@ def find_obstacles(points_map: F64, reference: Reference) -> tuple[Bool, I32]:
     cell = np.empty(len(points_map), dtype=np.int32)
     obstacle = np.empty(len(points_map), dtype=np.bool_)
     grid = reference.grid
-    lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
+    lattice = (grid.lattice.x0, grid.lattice.y0)
+    corner = (grid.row0, grid.col0)
     _obstacles(points_map, reference.ground_z, reference.base, lattice, corner, cell, obstacle)
     return obstacle, cell
 
@@ -115,7 +116,8 @@ def mark_sight(
     rays: Rays, obstacle: NDArray[np.bool_], fans: Fans, origin: F64, corner: tuple[float, float], sight: U8
 ) -> None:
     """Walk every fan from the sensor to the edge of the window, and enter how far it sees into ``sight``."""
-    nearest, farthest = np.full(FANS, np.inf, np.float32), np.zeros(FANS, np.float32)
+    nearest = np.full(FANS, np.inf, np.float32)
+    farthest = np.zeros(FANS, np.float32)
     _mark_sight(rays, obstacle, fans.direction, origin, corner, sight, nearest, farthest)
 
 
@@ -125,9 +127,11 @@ def _mark_sight(
     nearest: F32, farthest: F32,
 ) -> None:  # fmt: skip
     rows, cols = sight.shape
-    x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
+    x = (origin[0] - corner[0]) / CELL_SIZE
+    y = (origin[1] - corner[1]) / CELL_SIZE
     for i in range(len(rays.reach)):
-        h, f = rays.reach[i], rays.fan[i]
+        h = rays.reach[i]
+        f = rays.fan[i]
         if h >= CELL_SIZE:
             farthest[f] = max(farthest[f], h)
             nearest[f] = min(nearest[f], h if obstacle[i] else np.float32(np.inf))
@@ -135,7 +139,8 @@ def _mark_sight(
         if farthest[f] == 0.0:
             continue
         dx, dy = direction[f]
-        step_r, step_c = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
+        step_r = 1 if dy > 0 else -1
+        step_c = 1 if dx > 0 else -1
         r, c, t0, next_r, next_c, width_r, width_c = set_out(x, y, dx, dy, np.float32(0.0))
         while 0 <= r < rows and 0 <= c < cols:
             level = 1 if t0 > farthest[f] else (2 if t0 > nearest[f] else 3)
@@ -260,7 +265,8 @@ class Sky:
         fan_of = np.repeat(np.arange(len(self._fan)), beams_above)
         n_rays = int(beams_above.sum())
         beam = np.arange(n_rays) - np.repeat(np.cumsum(beams_above) - beams_above - above, beams_above)
-        x, y = self._x[fan_of], self._y[fan_of]
+        x = self._x[fan_of]
+        y = self._y[fan_of]
         slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
         far = np.full(n_rays, np.float32(self._rule.follow_m))
         return Rays(far, x, y, slope, far, self._fan[fan_of])

@@ -88,10 +88,14 @@ _EIGHT_NEIGHBOURS = np.ones((3, 3))
 def count_scan(evidence: PackedTiles, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
     """Count one scan in the ``evidence`` of a drive, a vehicle's or a survey's: WORDS words a cell. Returns (rows,
     cols) words of the voxels that hold a return which the map does not explain."""
-    view, here, scan, grid = seen.view, seen.reference, seen.scan, seen.view.grid
+    view = seen.view
+    here = seen.reference
+    scan = seen.scan
+    grid = seen.view.grid
     near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
     cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-    still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
+    still = scan.obstacle & ~seen.moving
+    corner = (grid.x0, grid.y0)
     mark_near(scan.points_map, cell, still, here.base, here.occupied, corner, rule.hit_reach_m / CELL_SIZE, near, apart)
     for planes, part in evidence.under(grid):
         _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
@@ -110,8 +114,10 @@ def mark_near(
     for i in range(np.uint64(0), np.uint64(len(points))):
         if not chosen[i] or cell[i] < 0:
             continue
-        x, y = (points[i, 0] - corner[0]) / CELL_SIZE, (points[i, 1] - corner[1]) / CELL_SIZE
-        z, mapped = points[i, 2] / CELL_SIZE, np.uint64(0)
+        x = (points[i, 0] - corner[0]) / CELL_SIZE
+        y = (points[i, 1] - corner[1]) / CELL_SIZE
+        z = points[i, 2] / CELL_SIZE
+        mapped = np.uint64(0)
         for r in range(max(int(y - reach), 0), min(int(y + reach), rows - 1) + 1):
             for c in range(max(int(x - reach), 0), min(int(x + reach), cols - 1) + 1):
                 word = _layers(int(np.floor(z - reach)), int(np.floor(z + reach)), base[r, c])
@@ -125,7 +131,8 @@ def mark_near(
 @inlined
 def _layers(lowest: int, highest: int, base: int) -> np.uint64:
     """The word of the layers ``lowest`` to ``highest`` of the world in a column that begins at ``base``."""
-    low, high = layer_bit(lowest, base), layer_bit(highest, base)
+    low = layer_bit(lowest, base)
+    high = layer_bit(highest, base)
     return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 
@@ -137,7 +144,9 @@ def _enter_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
         for c in range(part.col, part.end_col):
             if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
                 continue
-            cell, rays, missed = planes[r + part.down, c + part.right], passed[r, c], passed[r, c] & ~near[r, c]
+            cell = planes[r + part.down, c + part.right]
+            rays = passed[r, c]
+            missed = passed[r, c] & ~near[r, c]
             cell[PASSED] |= rays
             crossed = missed & (rays >> np.uint64(1) | _HIGHEST) & (rays << np.uint64(1) | _LOWEST)
             add_one(cell, (crossed, (near[r, c] & occupied[r, c]) | apart[r, c], missed))
@@ -198,7 +207,8 @@ def _weigh_voxels(
     gone_rays, hit_rays, together, new_rays = bounds
     for r in range(part.row, part.end_row):
         for c in range(part.col, part.end_col):
-            cell, mapped = planes[r + part.down, c + part.right], occupied[r, c]
+            cell = planes[r + part.down, c + part.right]
+            mapped = occupied[r, c]
             out.passed[r, c] = cell[PASSED]
             mapped_or_hit = mapped
             for k in range(COUNT_PLANES):
@@ -207,7 +217,8 @@ def _weigh_voxels(
                 one = np.uint64(1) << np.uint64(bit)
                 if not mapped_or_hit & one:
                     continue
-                hits, crossed = count_of(cell, HIT, bit), count_of(cell, CROSSED, bit)
+                hits = count_of(cell, HIT, bit)
+                crossed = count_of(cell, CROSSED, bit)
                 if mapped & one:
                     if max(crossed, least_passed(cell, bit) // together) >= gone_rays + hit_rays * hits:
                         out.gone[r, c] |= one
@@ -229,7 +240,9 @@ def judge_window(
     they rise over the ground, not finite where there are none. ``gone`` are the voxels that went, of changed-empty
     cells and of cells that stand, ``new`` those that came."""
     # The state of each cell by its own voxels.
-    mapped, stands, passed = occupied != 0, drive.stands != 0, drive.passed != 0
+    mapped = occupied != 0
+    stands = drive.stands != 0
+    passed = drive.passed != 0
     high = mapped & (height_m >= min_height_m)
     gone: U64 = np.where(high, drive.gone, NO_VOXELS)
     beyond: U64 = np.where(mapped, NO_VOXELS, drive.beyond)

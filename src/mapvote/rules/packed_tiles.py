@@ -94,9 +94,12 @@ class PackedTiles(Mapping[TileIndex, U64]):
     """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it."""
 
     def __init__(self, lattice: Lattice, words: int, packing: TilePacking = TILE_PACKING) -> None:
-        self.lattice, self.words, self.packing = lattice, words, packing
+        self.lattice = lattice
+        self.words = words
+        self.packing = packing
         self._open: dict[TileIndex, U64] = {}
-        self._shelf, self._packed = Shelf(packing), dict[TileIndex, Slot]()
+        self._shelf = Shelf(packing)
+        self._packed = dict[TileIndex, Slot]()
         self._spare: list[U64] = []
         """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
@@ -116,7 +119,8 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def near(self, tile: TileIndex) -> U64:
         """The planes of a tile, to be changed in place; zeros if there were none."""
         if tile not in self._open:
-            packed, planes = self._packed.pop(tile, None), self._zeros()
+            packed = self._packed.pop(tile, None)
+            planes = self._zeros()
             self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
         return self._open[tile]
 

@@ -93,7 +93,8 @@ def _of_points(
         for c in range(counts.shape[1]):
             word = min(counts[r, c], COUNTED_POINTS)
             if occupied[r, c]:
-                dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
+                dx = x0 + (c + 0.5) * CELL_SIZE - origin[0]
+                dy = y0 + (r + 0.5) * CELL_SIZE - origin[1]
                 dz = bottom_z[r, c] - origin[2]
                 above = dx * up[0] + dy * up[1] + dz * up[2]  # as the sensor leans, not as the world lies
                 if above > tan_top * np.sqrt(max(dx * dx + dy * dy + dz * dz - above * above, 0.0)):
@@ -119,7 +120,8 @@ def cell_words(
     ``without_movers``: view and that sight of the scan without its movers; default: those of the whole scan.
     """
     words = np.zeros(view.counts.shape, dtype=np.uint16)
-    tan_top, grid = float(np.tan(np.radians(sensor.fov_top_deg))), view.grid
+    tan_top = float(np.tan(np.radians(sensor.fov_top_deg)))
+    grid = view.grid
     _of_points(
         view.counts,
         view.hit,
@@ -174,8 +176,10 @@ def _clear_of_cells(seen: Observation, chosen: Bool, n_min: int) -> U8:
 
 def _cast(seen: Observation, chosen: Bool, obstacle: Bool) -> ScanView:
     """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that occlude the cells behind them."""
-    scan, still = seen.scan, np.zeros(int(chosen.sum()), dtype=np.bool_)
-    points, cell = scan.points_map[chosen], scan.cell[chosen]
+    scan = seen.scan
+    still = np.zeros(int(chosen.sum()), dtype=np.bool_)
+    points = scan.points_map[chosen]
+    cell = scan.cell[chosen]
     return cast_rays(points, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
 
 
@@ -232,7 +236,9 @@ class PaperVoter:
     """Paper III: every scan classifies every cell and casts its votes."""
 
     def __init__(self, voting: VotingSettings, paper: PaperSettings, sensor: Sensor, point_map: PointMap) -> None:
-        self.voting, self.paper, self.sensor = voting, paper, sensor
+        self.voting = voting
+        self.paper = paper
+        self.sensor = sensor
         self._tally = Tally(point_map.lattice)
 
     def observe(self, seen: Observation) -> U64:

@@ -97,8 +97,11 @@ class SurfaceVoter:
         judged: JudgedBlocks = JUDGED_BLOCKS,
         odds: ChangeOdds = CHANGE_ODDS,
     ) -> None:
-        self.voting, self.point_map = voting, point_map
-        self.rule, self.judged, self.odds = rule, judged, odds
+        self.voting = voting
+        self.point_map = point_map
+        self.rule = rule
+        self.judged = judged
+        self.odds = odds
         self.evidence = PackedTiles(point_map.lattice, WORDS)
 
     def observe(self, seen: Observation) -> U64:
@@ -117,7 +120,9 @@ class SurfaceVoter:
         here = reference_window(self.point_map, window)
         known_free = here.free if here.free is not None else above_ground_points(self.point_map, window)
         height_m = here.top_z - here.ground_z
-        weighed, counted, free = Facts.none(window.shape), self.evidence, {}
+        weighed = Facts.none(window.shape)
+        counted = self.evidence
+        free = {}
         for tile in window.tiles():
             if tile in counted:
                 planes = counted[tile]
@@ -183,7 +188,8 @@ def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice], odd
     planes (rows, cols) of the window reach a cell or more beyond the tile.
     """
     cells = changed_cells_of(np.ascontiguousarray(states[tile]))
-    rows, cols = cells // TILE_CELLS + tile[0].start, cells % TILE_CELLS + tile[1].start
+    rows = cells // TILE_CELLS + tile[0].start
+    cols = cells % TILE_CELLS + tile[1].start
     out = np.zeros((len(cells), N_FEATURES))
     for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY) if len(cells) else ():
         of_state = states[rows, cols] == state

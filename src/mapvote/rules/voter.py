@@ -80,7 +80,8 @@ class Tally:
             common = window.intersection(grid)
             if tile not in self.tiles:
                 self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
-            inner, outer = common.slices_in(window), common.slices_in(grid)
+            inner = common.slices_in(window)
+            outer = common.slices_in(grid)
             cast(self.tiles[tile][inner], states[outer], weights[outer])
 
 
@@ -162,8 +163,11 @@ class NewPoints:
         """``beyond``: also take points outside the local grid. The paper takes none, and the filter of moving objects
         does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``names``:
         attributes that are kept with each point."""
-        self.lattice, self.beyond, self.names = lattice, beyond, tuple(names)
-        self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Slot]](list)
+        self.lattice = lattice
+        self.beyond = beyond
+        self.names = tuple(names)
+        self._shelf = Shelf()
+        self._runs = defaultdict[TileIndex, list[Slot]](list)
         """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
         self._last: F64 | None = None
         """The last run, if it is still small."""
@@ -173,7 +177,8 @@ class NewPoints:
     def gather(self, seen: Observation, may_be_new: U64) -> None:
         """Offer the points of one scan that lie in ``may_be_new`` (rows, cols) of its view, or outside the view."""
         scan = seen.scan
-        words, base = may_be_new.ravel(), np.ascontiguousarray(scan.reference.base).ravel()
+        words = may_be_new.ravel()
+        base = np.ascontiguousarray(scan.reference.base).ravel()
         self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
         if self.beyond:
             self._offer_of(scan, self._strange_beyond(scan))
@@ -187,8 +192,10 @@ class NewPoints:
 
         They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
         """
-        grid, outer = scan.outer.grid, scan.outer
-        lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
+        grid = scan.outer.grid
+        outer = scan.outer
+        lattice = (grid.lattice.x0, grid.lattice.y0)
+        corner = (grid.row0, grid.col0)
         found = np.empty(len(scan.points_map), np.int64)
         n = _beyond(
             scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
@@ -199,7 +206,8 @@ class NewPoints:
     def offer(self, points_map: F64, fields: Fields | None = None) -> None:
         """Points (n, 3), map metres, and those of their attributes (n,) that a scan has."""
         if len(points_map):
-            n, scanned = len(points_map), fields or {}
+            n = len(points_map)
+            scanned = fields or {}
             rows = {name: point_field(name) for name in self.names}
             sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
             self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
@@ -214,7 +222,8 @@ class NewPoints:
         if self._last is None:
             for tile, points in self._of_tiles(run).items():
                 self._runs[tile].append(self._shelf.put(points.tobytes()))
-        self._waiting, self._count = [], 0
+        self._waiting = []
+        self._count = 0
 
     def _short(self) -> list[F64]:
         return [] if self._last is None else [self._last]

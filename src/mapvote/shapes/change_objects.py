@@ -146,11 +146,15 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
 
     ``decided`` are the decisions on this tile between the two, in ascending order of version.
     """
-    old, new, index = before.points, after.points, before.index
-    old_cell, new_cell = before.cells, after.cells
+    old = before.points
+    new = after.points
+    index = before.index
+    old_cell = before.cells
+    new_cell = after.cells
     cell = np.concatenate([new_cell, old_cell])
     z = np.concatenate([new[:, 2], old[:, 2]]).astype(np.float64)
-    came, went = ~found_among(new, old), ~found_among(old, new)
+    came = ~found_among(new, old)
+    went = ~found_among(old, new)
     n_came = np.bincount(new_cell[came], minlength=TILE_CELLS**2)
     n_went = np.bincount(old_cell[went], minlength=TILE_CELLS**2)
     flat = np.flatnonzero(n_came + n_went)
@@ -213,7 +217,8 @@ def _lengths_m(rows: I64, cols: I64, pieces: I32) -> F64:
     k = int(pieces.max()) + 1
     sides = []
     for along in (rows, cols):
-        low, high = np.full(k, _NEVER), np.full(k, _UNTIL)
+        low = np.full(k, _NEVER)
+        high = np.full(k, _UNTIL)
         np.minimum.at(low, pieces, along)
         np.maximum.at(high, pieces, along)
         sides.append(high - low + 1)
@@ -225,13 +230,16 @@ def _object(
 ) -> ChangeObject:
     """``mine``: the cells of one thing; ``sizes_m``: of every cell, how long and how wide its piece is."""
     longest_m, width_m = (float(of_piece[mine].max()) for of_piece in sizes_m)
-    rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
+    rows = cells.rows[mine]
+    cols = cells.cols[mine]
+    versions = cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
     by_vote = (versions > 0) & ~cells.fell[mine]
     voted = mine[by_vote] if by_vote.any() else mine
     judged = voted[~cells.stands[voted]]
-    seen_first, seen_last = int(cells.first_ns[mine].min()), int(cells.last_ns[mine].max())
+    seen_first = int(cells.first_ns[mine].min())
+    seen_last = int(cells.last_ns[mine].max())
     columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
     return ChangeObject(
         id=f"{kind}.v{made_in[0] if made_in else 0}.{rows[0]}.{cols[0]}",
@@ -261,8 +269,11 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
     """Votes, times, version and confidence of the changed cells, as the last decision for them counted them."""
     n = len(flat)
     votes, against, versions = (np.zeros(n, dtype=np.int64) for _ in range(3))
-    odds, first, last = np.full(n, UNSAID, dtype=np.int8), np.full(n, _NEVER), np.full(n, _UNTIL)
-    stands, fell = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    odds = np.full(n, UNSAID, dtype=np.int8)
+    first = np.full(n, _NEVER)
+    last = np.full(n, _UNTIL)
+    stands = np.zeros(n, dtype=np.bool_)
+    fell = np.zeros(n, dtype=np.bool_)
     for decision, drives in decided:
         said = decision.states.reshape(-1)[flat]
         tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat] // VOTE_UNIT

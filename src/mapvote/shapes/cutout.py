@@ -66,7 +66,8 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
         common = before.window.intersection(window)
         known = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z)
         ground[common.slices_in(window)] = known[common.slices_in(before.window)]
-        gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+        gone = ~found_among(before.points, after.points)
+        come = ~found_among(after.points, before.points)
         for kind, points in (
             ("kept", after.points_map[~come]),
             ("removed", before.points_map[gone]),

@@ -152,7 +152,8 @@ MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
     """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
-    side, squares = TILE_CELLS * CELL_SIZE, []
+    side = TILE_CELLS * CELL_SIZE
+    squares = []
     for tile in tiles:
         window = lattice.tile((tile["row"], tile["col"]))
         x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))

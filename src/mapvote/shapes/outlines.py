@@ -162,7 +162,8 @@ def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) ->
 def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
     """(n,) the cells beyond the cut along the longest slot that has enough on either side; None without one."""
     margin = SLOT_CELLS
-    r, c = rows - rows.min() + margin, cols - cols.min() + margin
+    r = rows - rows.min() + margin
+    c = cols - cols.min() + margin
     image = np.zeros((r.max() + margin + 1, c.max() + margin + 1), dtype=np.bool_)
     image[r, c] = True
     slots, count = scipy.ndimage.label(scipy.ndimage.binary_closing(image, _DISK) & ~image, np.ones((3, 3)))
@@ -174,7 +175,8 @@ def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
             continue
         middle, along, length, width = _line(slot)
         across = (at - middle) @ np.array([-along[1], along[0]])
-        beyond, bridge = across > 0, 0.5 * np.count_nonzero(np.abs(across) < 1)
+        beyond = across > 0
+        bridge = 0.5 * np.count_nonzero(np.abs(across) < 1)
         narrow = max(PIECE_RULE.wall_cells, bridge) <= length and width <= SLOT_CELLS
         enough = PIECE_RULE.least_share <= beyond.mean() <= 1 - PIECE_RULE.least_share
         if narrow and enough and (best is None or length > best[0]):

@@ -123,7 +123,9 @@ def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
     taken = np.zeros(first[-1], dtype=np.bool_)
     out = np.full(len(points), len(sizes), dtype=np.uint8)
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2] - low
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2] - low
         for k in range(len(sizes) - 1, -1, -1):
             col = min(max(int(x / sizes[k]), 0), sides[k] - 1)
             row = min(max(int(y / sizes[k]), 0), sides[k] - 1)
@@ -140,7 +142,9 @@ def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) 
     """(n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
     out = np.empty((len(points), 4), dtype=np.uint16)
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         row = min(max(int(y / CELL_SIZE), 0), TILE_CELLS - 1)
         col = min(max(int(x / CELL_SIZE), 0), TILE_CELLS - 1)
         ground = float(ground_z[row, col])
@@ -157,6 +161,7 @@ def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> 
     """Points that differ between two states of one tile. ``index``: the tile's, if it was
     loaded without its window."""
     ground = (after if len(after.points) else before).ground_z
-    gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+    gone = ~found_among(before.points, after.points)
+    come = ~found_among(after.points, before.points)
     clouds = [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
     return b"".join([np.array(index or after.index, dtype="<i4").tobytes(), *clouds])

@@ -119,7 +119,8 @@ def build_map(
     surveyor = Surveyor(settings, _lattice_of(drives), all(drive.has_precise_prior for drive in drives), numbers)
     _go_through(chain.from_iterable(map(surveyor.follow, drives)), progress, 0, 2 * scans)
     tracks, bent_m = settle_poses(surveyor.tracks)
-    cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
+    cloud = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks)
+    lattice = surveyor.draft.lattice
     del surveyor  # frees the largest part of the first pass's memory
     # The second pass: the points.
     road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud) for track in tracks])
@@ -224,7 +225,10 @@ class Surveyor:
         tracker = Tracker(self.ndt_map.around, self.ndt)
         tracker.twist = _first_motion(drive)
         precise = drive.has_precise_prior
-        poses, registered, broken, lost = [], [], [], 0
+        poses = []
+        registered = []
+        broken = []
+        lost = 0
         for i, scan in enumerate(drive):
             prior = PosePrior.of(drive, i)
             fix = self._locate(tracker, scan, prior if precise or not len(self.draft) else None)
@@ -297,7 +301,8 @@ class Surveyor:
 
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
-        points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
+        points_map = transform(T_map_lidar, fix.points)
+        position = T_map_lidar[:3, 3]
         spread = points_map.take(thin(points_map - position, self.numbers.points_m), axis=0)
         self.ndt_map.around(position).enter(spread)
         if not self._all_precise:

@@ -106,7 +106,9 @@ class Mapper:
         self, draft: PointMap, settings: Settings, road: F64 | None = None, numbers: Cleaning = CLEANING
     ) -> None:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
-        self.draft, self.road, self.settings = draft, road, settings
+        self.draft = draft
+        self.road = road
+        self.settings = settings
         self.numbers = numbers
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = PackedTiles(draft.lattice, WORDS)
@@ -134,9 +136,12 @@ class Mapper:
 
     def _add(self, seen: list[Observation]) -> None:
         for observation in seen:
-            scan, moving = observation.scan, observation.moving
-            ground_z, left_out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
-            reach2, beside = self.settings.mapping.reach_m**2, np.zeros(ground_z.size, np.bool_)
+            scan = observation.scan
+            moving = observation.moving
+            ground_z = scan.reference.ground_z
+            left_out = np.empty(len(moving), np.bool_)
+            reach2 = self.settings.mapping.reach_m**2
+            beside = np.zeros(ground_z.size, np.bool_)
             places = scan.points_map, scan.origin_map, reach2, self.numbers.road_m
             _leave_out(*places, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
             self.cloud.enter(scan.points_map, left_out)
@@ -148,9 +153,12 @@ class Mapper:
         points, scans = self.cloud.points()
         counts = self._counts(points)
         kept = ~(_standing(points, self.draft) & seen_through(counts, numbers))
-        points, scans, counts = points[kept], scans[kept], counts[kept]
+        points = points[kept]
+        scans = scans[kept]
+        counts = counts[kept]
         # The ground anew without trails, which lift the draft's: undersides of cars had passed for ground.
-        laid, lattice = map_from_points(points, lattice=self.draft.lattice, road=self.road), self.draft.lattice
+        laid = map_from_points(points, lattice=self.draft.lattice, road=self.road)
+        lattice = self.draft.lattice
         obstacle = _standing(points, laid)
         dropped = (obstacle & seen_through(counts, numbers)) | mirrored(points, laid, self.road, numbers)
         if self.settings.mapping.drop_strays:
@@ -219,7 +227,8 @@ def _leave_out(
                 for j in range(max(c - 1, 0), min(c + 2, cols)):
                     beside[k * cols + j] = True
     for i in range(len(points)):
-        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        x = points[i, 0] - origin[0]
+        y = points[i, 1] - origin[1]
         out[i] = moving[i] | (x * x + y * y > reach2)
         if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
             r, c = divmod(cell[i], cols)
@@ -233,7 +242,8 @@ def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64, out: I64) -> None:
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
-            out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
+            out[i, 0] = count_of(cell, HIT, bits[i])
+            out[i, 1] = count_of(cell, PASSES, bits[i])
             out[i, 2] = least_passed(cell, bits[i])
 
 
@@ -257,7 +267,8 @@ def mirrored(points: F64, point_map: PointMap, road: F64 | None, numbers: Cleani
 
 def _unbroken(ground_z: F32, numbers: Cleaning = CLEANING) -> Bool:
     """(rows, cols) cells around which the ground is known and has no step."""
-    side, known = 2 * numbers.level_cells + 1, np.isfinite(ground_z)
+    side = 2 * numbers.level_cells + 1
+    known = np.isfinite(ground_z)
     highest = ndimage.maximum_filter(np.where(known, ground_z, np.inf), side, mode="nearest")
     lowest = ndimage.minimum_filter(np.where(known, ground_z, -np.inf), side, mode="nearest")
     with np.errstate(invalid="ignore"):
@@ -312,7 +323,8 @@ def seen_through(counts: I64, numbers: Cleaning = CLEANING) -> Bool:
 
     A voxel of a standing surface can be crossed, too. So the bound is far below that of a vehicle that calls it gone.
     """
-    hit, crossed = counts[:, 0], counts[:, 2]
+    hit = counts[:, 0]
+    crossed = counts[:, 2]
     return np.asarray((crossed >= numbers.seen_through) & (hit < numbers.trail_share * (hit + crossed)))
 
 
@@ -324,7 +336,8 @@ def specks(points: F64, times: I32, lattice: Lattice, largest: int = CLEANING.la
     """
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     table = np.zeros(1 << max(2 * len(keys), 2).bit_length(), dtype=np.int64)
-    often, out = np.zeros(len(table), dtype=np.bool_), np.zeros(len(keys), dtype=np.bool_)
+    often = np.zeros(len(table), dtype=np.bool_)
+    out = np.zeros(len(keys), dtype=np.bool_)
     _specks(keys, times <= 1, table, often, np.empty(largest + 1, np.int64), out)
     return out
 
@@ -343,7 +356,8 @@ def lone_points(tile: Tile) -> Bool:
 
 def without_lone_points(point_map: PointMap) -> tuple[PointMap, int]:
     """The map without its :func:`lone_points`, and how many these were. Tiles without any stay the same objects."""
-    tiles, dropped = dict(point_map.tiles), 0
+    tiles = dict(point_map.tiles)
+    dropped = 0
     for index, tile in point_map.tiles.items():
         lone = lone_points(tile)
         if lone.any():
@@ -363,11 +377,15 @@ def _specks(keys: I64, once: Bool, table: I64, often: Bool, group: I64, out: Boo
         often[slot] |= not once[i] or table[slot] == keys[i]  # a second point in one voxel
         table[slot] = keys[i]
     for i in range(len(keys)):
-        group[0], n, k = keys[i], 1, 0
+        group[0] = keys[i]
+        n = 1
+        k = 0
         alone = not often[slot_of(keys[i], table)]
         while alone and k < n:
             for around in range(27):
-                dx, dy, dz = around // 9 - 1, around // 3 % 3 - 1, around % 3 - 1
+                dx = around // 9 - 1
+                dy = around // 3 % 3 - 1
+                dz = around % 3 - 1
                 beside = group[k] + dx * BESIDE[0] + dy * BESIDE[1] + dz * BESIDE[2]
                 slot = slot_of(beside, table)
                 empty_or_entered = table[slot] == 0

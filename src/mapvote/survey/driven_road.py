@@ -79,7 +79,8 @@ ATTITUDE_CHECK = AttitudeCheck()
 def road_under(T_map_lidar: F64, registered: Bool, cloud: F64, numbers: RoadSearch = ROAD_SEARCH) -> F64:
     """(k, 3) the road under a drive at poses (n, 4, 4), those ``registered`` (n,), every 0.15 m along the path, from
     the points (m, 3) of the map, all map metres; none if these do not show it."""
-    path, none = _dense(T_map_lidar[:, :3, 3], registered, numbers), np.zeros((0, 3))
+    path = _dense(T_map_lidar[:, :3, 3], registered, numbers)
+    none = np.zeros((0, 3))
     if len(path) == 0:
         return none
     distance, at = scipy.spatial.cKDTree(path[:, :2]).query(cloud[:, :2], distance_upper_bound=numbers.track_m)
@@ -200,7 +201,8 @@ def _slope(along: F64, depth: F64, numbers: AttitudeCheck) -> float:
     """Slope of the road in points (n,) at ``along`` and ``depth``, metres below the path; NaN if they show none."""
     densest_m = _densest(depth, np.arange(*numbers.depths_m))
     road = np.abs(depth - densest_m) < numbers.around_m
-    s, d = along[road], depth[road]
+    s = along[road]
+    d = depth[road]
     if len(s) < numbers.min_points or np.ptp(np.percentile(s, (5, 95))) < numbers.spread_m:
         return np.nan
     line = scipy.optimize.least_squares(

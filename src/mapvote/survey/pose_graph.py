@@ -158,7 +158,8 @@ def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) ->
             (j, i, A_t_W.transpose(0, 2, 1)),
         ]
     for anchor in anchors:
-        W, i = _weight(anchor.sigma_m, anchor.sigma_rad), anchor.pose
+        W = _weight(anchor.sigma_m, anchor.sigma_rad)
+        i = anchor.pose
         believed = np.ones(len(i)) if anchor.weights is None else anchor.weights
         np.add.at(gradient, i, believed[:, None] * W * logs(inverses(anchor.T_map) @ poses[i]))
         blocks.append((i, i, believed[:, None, None] * np.diag(W)))
@@ -240,7 +241,9 @@ def carried_along(
     before, after = (np.concatenate([t.T_map_lidar[t.registered] for t in tracks]) for tracks in (surveyed, settled))
     if np.array_equal(before, after):
         return points
-    moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
+    moved = after @ inverses(before)
+    tree = cKDTree(before[:, :3, 3])
+    out = np.empty_like(points)
     for first in range(0, len(points), numbers.points_at_once):
         part = slice(first, first + numbers.points_at_once)
         T = moved[tree.query(points[part])[1]]
@@ -268,7 +271,9 @@ def _pieces(tracks: Sequence[DriveTrack], starts: I64) -> I64:
 
 def _laid_on_priors(drives: Sequence[Drive], T: F64, placed: I64, starts: I64, numbers: PoseSettling) -> F64:
     """(4, 4) one motion of the whole, from all drives' priors."""
-    positions, priors, sigmas_m = [], [], []
+    positions = []
+    priors = []
+    sigmas_m = []
     for start, drive in zip(starts, drives, strict=False):
         if drive.T_map_lidar_prior is not None:
             of_drive = placed[(placed >= start) & (placed < start + len(drive))]
@@ -312,7 +317,8 @@ def _links(drives: Sequence[Drive], T: F64, placed: I64, piece_of: I64, numbers:
     consecutive = piece_of[placed[:-1]] == piece_of[placed[1:]]
     pairs = [(placed[:-1][consecutive], placed[1:][consecutive])]
     tree = cKDTree(T[placed, :3, 3])
-    first, second = [], []
+    first = []
+    second = []
     for j, near in zip(placed, tree.query_ball_point(T[placed, :3, 3], numbers.revisit_m), strict=True):
         older = [
             i
@@ -368,8 +374,10 @@ def _distances(T: F64, positions: F64, priors: F64) -> F64:
 
 def _yaw(positions: F64, priors: F64, weights: F64) -> float:
     w = weights / weights.sum()
-    a, b = positions[:, :2] - w @ positions[:, :2], priors[:, :2] - w @ priors[:, :2]
-    cross, dot = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), w @ (a * b).sum(axis=1)
+    a = positions[:, :2] - w @ positions[:, :2]
+    b = priors[:, :2] - w @ priors[:, :2]
+    cross = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    dot = w @ (a * b).sum(axis=1)
     return float(np.arctan2(cross, dot))
 
 

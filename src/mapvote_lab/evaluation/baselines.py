@@ -88,27 +88,27 @@ def _march(
     rows, cols = base.shape
     n_touched = 0
     for i in range(len(points)):
-        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        dx = points[i, 0] - origin[0]
+        dy = points[i, 1] - origin[1]
+        dz = points[i, 2] - origin[2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if length < CELL_SIZE:
             continue
-        dx, dy, dz = dx / length, dy / length, dz / length
-        c, r, z = (
-            int(np.floor((origin[0] - x0) / CELL_SIZE)),
-            int(np.floor((origin[1] - y0) / CELL_SIZE)),
-            int(np.floor(origin[2] / CELL_SIZE)),
-        )
-        ec, er, ez = (
-            int(np.floor((points[i, 0] - x0) / CELL_SIZE)),
-            int(np.floor((points[i, 1] - y0) / CELL_SIZE)),
-            int(np.floor(points[i, 2] / CELL_SIZE)),
-        )
-        sc, sr, sz = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-        wc, wr, wz = (
-            CELL_SIZE / max(abs(dx), 1e-12),
-            CELL_SIZE / max(abs(dy), 1e-12),
-            CELL_SIZE / max(abs(dz), 1e-12),
-        )
+        dx = dx / length
+        dy = dy / length
+        dz = dz / length
+        c = int(np.floor((origin[0] - x0) / CELL_SIZE))
+        r = int(np.floor((origin[1] - y0) / CELL_SIZE))
+        z = int(np.floor(origin[2] / CELL_SIZE))
+        ec = int(np.floor((points[i, 0] - x0) / CELL_SIZE))
+        er = int(np.floor((points[i, 1] - y0) / CELL_SIZE))
+        ez = int(np.floor(points[i, 2] / CELL_SIZE))
+        sc = 1 if dx > 0 else -1
+        sr = 1 if dy > 0 else -1
+        sz = 1 if dz > 0 else -1
+        wc = CELL_SIZE / max(abs(dx), 1e-12)
+        wr = CELL_SIZE / max(abs(dy), 1e-12)
+        wz = CELL_SIZE / max(abs(dz), 1e-12)
         tc = ((c + (sc > 0)) * CELL_SIZE + x0 - origin[0]) * sc / max(abs(dx), 1e-12)
         tr = ((r + (sr > 0)) * CELL_SIZE + y0 - origin[1]) * sr / max(abs(dy), 1e-12)
         tz = ((z + (sz > 0)) * CELL_SIZE - origin[2]) * sz / max(abs(dz), 1e-12)
@@ -152,15 +152,20 @@ def dempster(
     The rest of each mass is unknown; of the result at least ``least_unknown`` stays so, which also keeps it defined
     for total contradiction.
     """
-    u1, u2 = 1.0 - o1 - f1, 1.0 - o2 - f2
-    o, f, u = o1 * o2 + o1 * u2 + u1 * o2, f1 * f2 + f1 * u2 + u1 * f2, u1 * u2
+    u1 = 1.0 - o1 - f1
+    u2 = 1.0 - o2 - f2
+    o = o1 * o2 + o1 * u2 + u1 * o2
+    f = f1 * f2 + f1 * u2 + u1 * f2
+    u = u1 * u2
     total = o + f + u
     if total <= 0.0:
         return 0.0, 0.0
-    o, f = o / total, f / total
+    o = o / total
+    f = f / total
     known = o + f
     if known > 1.0 - least_unknown:
-        o, f = o * (1.0 - least_unknown) / known, f * (1.0 - least_unknown) / known
+        o = o * (1.0 - least_unknown) / known
+        f = f * (1.0 - least_unknown) / known
     return o, f
 
 
@@ -172,10 +177,12 @@ def _absorb(
     """One scan's counts into a vehicle's masses; the counts are cleared again."""
     for i in range(n):
         v = touched[i]
-        o, f = 1.0 - (1.0 - hit) ** hits[v], 1.0 - (1.0 - passed) ** passes[v]
+        o = 1.0 - (1.0 - hit) ** hits[v]
+        f = 1.0 - (1.0 - passed) ** passes[v]
         o, f = dempster(o, 0.0, 0.0, f, least_unknown)
         occupied[v], free[v] = dempster(occupied[v], free[v], o, f, least_unknown)
-        hits[v], passes[v] = 0, 0
+        hits[v] = 0
+        passes[v] = 0
 
 
 @kernel
@@ -192,7 +199,10 @@ def _cells(map_words: U64, occupied: F32, free: F32, states: U8, of_map: float, 
     rows, cols = map_words.shape
     for r in range(rows):
         for c in range(cols):
-            in_map, gone, new, seen = 0, 0, 0, 0
+            in_map = 0
+            gone = 0
+            new = 0
+            seen = 0
             for k in range(LAYERS):
                 v = (r * cols + c) * LAYERS + k
                 mapped = (map_words[r, c] >> np.uint64(k)) & np.uint64(1) == np.uint64(1)
@@ -247,7 +257,8 @@ def combine(vehicles: Sequence[EvidenceMap], reference: Reference, masses: Evide
     states = np.full(reference.grid.shape, NO_VOTE, dtype=np.uint8)
     if not vehicles:
         return states
-    occupied, free = vehicles[0].occupied.copy(), vehicles[0].free.copy()
+    occupied = vehicles[0].occupied.copy()
+    free = vehicles[0].free.copy()
     for other in vehicles[1:]:
         _combine(occupied, free, other.occupied, other.free, masses.least_unknown)
     _cells(reference.occupied, occupied, free, states, masses.of_map, masses.conflict)
@@ -258,7 +269,8 @@ def heights_above_ground(point_map: PointMap, points: F64) -> F64:
     """(n,) metres above the map's ground of points (n, 3); above the nearest known ground where it is unknown."""
     lattice = point_map.lattice
     rows, cols = lattice.cells_of(points) if len(points) else (np.zeros(1, np.int64), np.zeros(1, np.int64))
-    row, col = int(rows.min()), int(cols.min())
+    row = int(rows.min())
+    col = int(cols.min())
     window = Grid(lattice, row, col, int(rows.max()) - row + 1, int(cols.max()) - col + 1)
     reference = reference_window(point_map, window)
     filled = np.where(np.isnan(reference.ground_z), reference.base * CELL_SIZE, reference.ground_z)
@@ -286,7 +298,8 @@ class NearestNeighbour:
         if len(self._clouds) > self._rule.merge_every:
             self._clouds = [self._cloud()]
         x, y = self._grid.centres()
-        rows, cols = np.abs(y - origin_map[1]) <= self._half, np.abs(x - origin_map[0]) <= self._half
+        rows = np.abs(y - origin_map[1]) <= self._half
+        cols = np.abs(x - origin_map[0]) <= self._half
         self._seen[np.ix_(rows, cols)] = True
 
     def _cloud(self) -> F64:
@@ -346,7 +359,8 @@ def yardsticks(
     for folder in folders:
         maps.append(EvidenceMap(reference))
         with np.load(folder / "evidence.npz") as file:
-            maps[-1].occupied[file["known"]], maps[-1].free[file["known"]] = file["occupied"], file["free"]
+            maps[-1].occupied[file["known"]] = file["occupied"]
+            maps[-1].free[file["known"]] = file["free"]
     evidence = combine(maps, reference), [combine([one], reference) for one in maps]
     return {"nearest": (plurality(votes), nearest), "evidence": evidence}, mean
 
@@ -359,9 +373,11 @@ def _folder(scene: Scene, vehicle: str) -> Path:
 def _measure(task: tuple[Scene, str, F64]) -> None:
     """One vehicle's pass at the poses it found before: both yardsticks watch the scans that vote."""
     scene, name, T_map_lidar = task
-    drive, point_map = scene.drive(name), scene.point_map
+    drive = scene.drive(name)
+    point_map = scene.point_map
     reference = reference_window(point_map, scene.truth.grid_on(point_map.lattice))
-    nearest, evidence = NearestNeighbour(map_obstacles(point_map), reference.grid), EvidenceMap(reference)
+    nearest = NearestNeighbour(map_obstacles(point_map), reference.grid)
+    evidence = EvidenceMap(reference)
     seconds: dict[str, list[float]] = {"nearest": [], "evidence": []}
 
     def watch(observations: list[Observation]) -> None:
@@ -378,7 +394,8 @@ def _measure(task: tuple[Scene, str, F64]) -> None:
     for i in there:
         watch(vehicle.observe(drive.read_scan(int(i))))
     watch(vehicle.finish())
-    ballot, stages = vehicle.ballot(case), vehicle.report.stage_s
+    ballot = vehicle.ballot(case)
+    stages = vehicle.report.stage_s
     start = time.thread_time()
     states = nearest.states()
     at_end = (time.thread_time() - start) / max(len(there), 1)

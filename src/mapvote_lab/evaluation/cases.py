@@ -143,7 +143,9 @@ class KeptDrive:
     """Sightings of the scans of one drive over the cells of ``window``, packed scan by scan."""
 
     def __init__(self, window: Grid, sensor: Sensor, n_min: int) -> None:
-        self.window, self.sensor, self.n_min = window, sensor, n_min
+        self.window = window
+        self.sensor = sensor
+        self.n_min = n_min
         self._windows: list[tuple[int, int, int, int]] = []
         self._packed: list[bytes] = []
 
@@ -170,7 +172,8 @@ Words = Sequence[tuple[int, int, bytes, tuple[int, int]]]
 def read_kept(folder: Path) -> Words:
     """Read the file that :meth:`KeptDrive.write` wrote."""
     with np.load(folder / "kept.npz") as file:
-        ends, words = np.cumsum(file["sizes"]), file["words"].tobytes()
+        ends = np.cumsum(file["sizes"])
+        words = file["words"].tobytes()
         packed = [words[start:end] for start, end in zip([0, *ends], ends, strict=False)]
         return [(r, c, one, (h, w)) for (r, c, h, w), one in zip(file["windows"].tolist(), packed, strict=True)]
 
@@ -208,7 +211,9 @@ def _cast(
     rows, cols = mapped.shape
     for i in range(max(margin, -row0), min(words.shape[0] - margin, rows - row0)):
         for j in range(max(margin, -col0), min(words.shape[1] - margin, cols - col0)):
-            r, c, word = row0 + i, col0 + j, words[i, j]
+            r = row0 + i
+            c = col0 + j
+            word = words[i, j]
             state = states[np.int64(mapped[r, c]), word]
             if state != no_vote:
                 tally[r, c, state] += weights[word]

@@ -78,15 +78,19 @@ def with_things(drive: Drive, things: Sequence[Thing], reference: F64, rule: Pla
     """
 
     def read_scan(i: int) -> Scan:
-        scan, T = drive.read_scan(i), reference[i]
+        scan = drive.read_scan(i)
+        T = reference[i]
         points = deskew(scan, motion_at(drive.stamps_ns, reference, i)).astype(np.float32)
         rng = np.random.default_rng([i, 2])
-        keep, at, ends_on = np.ones(len(points), dtype=np.bool_), points.copy(), np.full(len(points), -1)
+        keep = np.ones(len(points), dtype=np.bool_)
+        at = points.copy()
+        ends_on = np.full(len(points), -1)
         for k, thing in enumerate(things):
             if np.linalg.norm(thing.centre - T[:2, 3]) < rule.reach_m:
                 if thing.goes is not None:
                     inside, on = _take_out(points, keep, at, thing, T, drive.sensor.range_sigma_m, rng, rule)
-                    ends_on[inside], ends_on[on] = -1, k
+                    ends_on[inside] = -1
+                    ends_on[on] = k
                 if len(thing.comes):
                     ends_on[_put_in(points, at, thing, T, drive.sensor.range_sigma_m, rng, rule)] = k
         for k, thing in enumerate(things):
@@ -212,7 +216,8 @@ class Site:
             if np.linalg.norm(ahead) < 1e-3:
                 continue
             yaw = float(np.arctan2(ahead[1], ahead[0]))
-            side, away = rng.choice([-1.0, 1.0]), rng.uniform(*self.rule.path_m)
+            side = rng.choice([-1.0, 1.0])
+            away = rng.uniform(*self.rule.path_m)
             spot = self.path[k, :2] + side * away * np.array([-np.sin(yaw), np.cos(yaw)])
             spot = spot + rng.uniform(-self.rule.along_m, self.rule.along_m) * np.array([np.cos(yaw), np.sin(yaw)])
             z = float(self.ground(spot[None])[0])
@@ -229,7 +234,8 @@ class Site:
         cells = np.floor(self.obstacles[:, :2] / CELL_SIZE)
         _, column, layers = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         tall = self.obstacles[layers[column.ravel()] >= 5, :2]
-        tree, out = cKDTree(tall) if len(tall) else None, list[Thing]()
+        tree = cKDTree(tall) if len(tall) else None
+        out = list[Thing]()
         for k in rng.permutation(len(tall)):
             assert tree is not None
             near = tall[tree.query_ball_point(tall[k], 0.5 * self.rule.wall_side_m)]
@@ -290,7 +296,8 @@ class Site:
         middle = points[:, :2].mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((points[:, :2] - middle).T)) if len(points) > 20 else (None, np.eye(2))
         local = (points[:, :2] - middle) @ axes[:, ::-1]
-        low, high = local.min(axis=0), local.max(axis=0)
+        low = local.min(axis=0)
+        high = local.max(axis=0)
         length, width = high - low
         tall = float(self._heights(points).max())
         if spread is None or not (2.8 < length < 5.8 and 1.0 < width < 2.6 and 1.1 < tall < 2.1):

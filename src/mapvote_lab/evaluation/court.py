@@ -130,7 +130,8 @@ def evaluate_court(
     """Scores of every case on cast scans, of the sessions' clouds as ballots, of one of them alone, and of plain
     distances between clouds."""
     surfaces = choose_case(settings, "surfaces")
-    as_clouds, shown = [], list[CloudChange]()
+    as_clouds = []
+    shown = list[CloudChange]()
     for k, (name, cloud) in enumerate(court.sessions.items()):
         tell("voting with clouds", k, len(SESSIONS))
         votes = vote_of_session(name, name, court.reference, cloud, surfaces, end_ns=rule.ended_ns + k)
@@ -153,14 +154,17 @@ def cast_drive(name: str, cloud: PointMap, rule: CourtRule = COURT_RULE) -> Driv
     """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground; one every
     ``rule.step_m``."""
     # Places along the way, equally far apart.
-    points, standing, sensor = all_points(cloud), map_obstacles(cloud), SENSORS["hdl32e"]
+    points = all_points(cloud)
+    standing = map_obstacles(cloud)
+    sensor = SENSORS["hdl32e"]
     window = reduce(Grid.union, (cloud.lattice.tile(tile) for tile in cloud.tiles))
     surveyed = _surveyed(cloud, window)
     corners = np.array(rule.way, dtype=np.float64)
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
     at = np.arange(0.0, along[-1], rule.step_m)
     xy = np.column_stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)])
-    poses, scans = [], []
+    poses = []
+    scans = []
     # At each place the sensor stands upright over the ground and looks along the way.
     for k, place in enumerate(xy):
         ground = points[np.hypot(*(points[:, :2] - place).T) < 2.5, 2]
@@ -232,13 +236,17 @@ def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64
     that pass something ``beside`` them or end farther than ``as_far``."""
     reach = np.linalg.norm(points, axis=1)
     near = (reach > 1.5) & (reach < rule.reach_m)
-    points, reach = points[near], reach[near]
+    points = points[near]
+    reach = reach[near]
     beams = np.sort(np.radians(elevations_deg))
     elevation = np.arcsin(points[:, 2] / reach)
     half = 0.5 * rule.disc_m / reach
     ring = np.clip(np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64), 0, len(beams) - 1)
     hit = np.abs(elevation - beams[ring]) < np.maximum(half, 0.0015)
-    ring, reach, half, points = ring[hit], reach[hit], half[hit], points[hit]
+    ring = ring[hit]
+    reach = reach[hit]
+    half = half[hit]
+    points = points[hit]
     col = _column(points, rule)
     image = np.full((len(beams), rule.columns), np.inf)
     wide = np.minimum((half / rule.column_rad).astype(np.int64), 12)
@@ -246,7 +254,8 @@ def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64
         covers = np.abs(j) <= wide
         np.minimum.at(image, (ring[covers], (col[covers] + j) % rule.columns), reach[covers])
     r, c = np.nonzero(np.isfinite(image) & (image < beside + rule.same_thing_m))
-    azimuth, distance = (c + 0.5) * rule.column_rad - np.pi, image[r, c]
+    azimuth = (c + 0.5) * rule.column_rad - np.pi
+    distance = image[r, c]
     flat = distance * np.cos(beams[r])
     taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])
     taken = taken[flat <= as_far[c]]
@@ -270,8 +279,10 @@ def _fused(
 def _by_distance(court: Court, shown: list[CloudChange], rule: CourtRule) -> CourtScore:
     """Plain cloud-to-cloud: a point more than ``rule.far_m`` from every point of the other cloud is gone or new;
     published where two sessions say so of a cell."""
-    before, reference = map_obstacles(court.reference), all_points(court.reference)
-    x, y = before[:, 0], before[:, 1]
+    before = map_obstacles(court.reference)
+    reference = all_points(court.reference)
+    x = before[:, 0]
+    y = before[:, 1]
     rows, cols = court.reference.lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]]))
     size = int((np.ptp(y) + 120) / CELL_SIZE), int((np.ptp(x) + 120) / CELL_SIZE)
     grid = Grid(court.reference.lattice, int(rows[0]), int(cols[0]), *size)
@@ -296,7 +307,8 @@ def _by_distance(court: Court, shown: list[CloudChange], rule: CourtRule) -> Cou
 
 def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float = 0.0) -> np.ndarray:
     x0, y0, x1, y1 = box
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     return np.asarray((x > x0 - margin_m) & (x < x1 + margin_m) & (y > y0 - margin_m) & (y < y1 + margin_m))
 
 
@@ -311,11 +323,13 @@ def _score(
         np.logical_or.reduce([_in_box(p, box, rule.margin_m) for _, box in CHANGES.values()]) for p in (before, after)
     ]
     # Decided objects outside the boxes, and those that no session's cloud shows.
-    others, false = [], []
+    others = []
+    false = []
     x, y = grid.centres()
     for kind, state in (("gone", CellState.CHANGED_EMPTY), ("new", CellState.CHANGED_OCCUPIED)):
         for rows, cols in pieces(states == state):
-            area_m2, xy = round(len(rows) * CELL_SIZE**2, 1), np.column_stack([x[cols], y[rows]])
+            area_m2 = round(len(rows) * CELL_SIZE**2, 1)
+            xy = np.column_stack([x[cols], y[rows]])
             if area_m2 <= rule.false_m2 or any(_in_box(xy, box, rule.margin_m).any() for _, box in CHANGES.values()):
                 continue
             others.append(area_m2)

@@ -90,7 +90,8 @@ class Story:
 
 def tell(evaluation: Evaluation, done: PublishedRound, *, drives_bytes: int, kept: bool) -> Story:
     """Count what the vote changed, area by area."""
-    old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[CASE].updated)
+    old = all_points(evaluation.first_map)
+    new = all_points(evaluation.outcomes[CASE].updated)
     survived, added = same_rows(old, new)
     deleted = old[~survived]
 
@@ -106,7 +107,8 @@ def report_page(
     evaluation: Evaluation, story: Story, pictures: list[tuple[Path, str]], out: Path, cutouts: Sequence[Cutout] = ()
 ) -> str:
     """report.html's text: what happened, in the order in which it happened."""
-    drawn, held = {path.stem: (path, caption) for path, caption in pictures}, story.published.held
+    drawn = {path.stem: (path, caption) for path, caption in pictures}
+    held = story.published.held
     sections = [
         _what_happened(evaluation, [drawn["scans"], drawn["street"]]),
         ReportSection(
@@ -249,9 +251,11 @@ def draw_scans(scene: Scene, path: Path) -> Picture:
 def _measured(scene: Scene, name: str, step: int = 4) -> tuple[F64, Bool, float]:
     """(points (n, 3) in map metres, whether each is on a moving body (n,), height of the road) of every ``step``-th
     scan of a drive."""
-    drive, poses = scene.drive(name), scene.true_poses(name)
+    drive = scene.drive(name)
+    poses = scene.true_poses(name)
     localise = GivenPoses(drive.stamps_ns, poses)
-    points, moving = [], []
+    points = []
+    moving = []
     for i in range(0, len(drive), step):
         [fix] = localise.push(drive.read_scan(i), None)
         points.append(transform(fix.registration.T_map_lidar, fix.points))
@@ -358,13 +362,15 @@ def draw_scan(recording: Drive, path: Path) -> Path:
 
 def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
     """Draw the map and the returns (n, 3) of each new body, by whether the vote found their cells."""
-    street, points = run.street, all_points(run.street.point_map)
+    street = run.street
+    points = all_points(run.street.point_map)
     positions = street.T_map_lidar[:, :3, 3]
     middle = positions[len(positions) // 2]
     along = positions[-1] - positions[0]
     road_z = float(np.median(positions[:, 2])) - float(street.built.tracks[0].heights.median_m)
     near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 70.0
-    clouds, colours = [points[near]], [figures.shades(points[near, 2] - road_z)]
+    clouds = [points[near]]
+    colours = [figures.shades(points[near, 2] - road_z)]
     for returns in cast:
         found = street.grid.value_at(run.states[CASE] == CellState.CHANGED_OCCUPIED, returns)
         clouds.append(returns)
@@ -414,7 +420,8 @@ def demo(
     was interrupted is continued by the next one. Two processes compile the kernels while this one simulates; the memory
     that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
     """
-    settings, work = Settings(), out / "work"
+    settings = Settings()
+    work = out / "work"
     scene = Scene("street" if full else "corner", DEMO_PLAN.seed, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     with processes(2) as compilers:
@@ -456,7 +463,9 @@ def demo(
 def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:
     """Whether the server's map is the offline rule's but for new points that it leaves out: of what comes and goes it
     also asks who looked last (fusion/change_time.py)."""
-    old, by_server, by_rule = all_points(first), all_points(served), all_points(offline)
+    old = all_points(first)
+    by_server = all_points(served)
+    by_rule = all_points(offline)
     agreed, left_out = same_rows(by_server, by_rule)
     return bool(agreed.all()) and not same_rows(left_out, old)[0].any()
 

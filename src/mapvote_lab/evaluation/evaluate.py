@@ -72,9 +72,11 @@ def survey_anew(scene: Scene, without: str, progress: Progress = untold) -> tupl
     folder = scene.work / f"surveyed-anew-without-{without}"
     names = [name for name in scene.drive_names("v") if name != without]
     if not folder.exists():
-        drives, sigma = [], np.array([DRIVE_PLAN.rtk_sigma_m] * 3 + [np.radians(DRIVE_PLAN.rtk_sigma_deg)] * 3)
+        drives = []
+        sigma = np.array([DRIVE_PLAN.rtk_sigma_m] * 3 + [np.radians(DRIVE_PLAN.rtk_sigma_deg)] * 3)
         for name in names:  # the error is smooth, as the first survey's: white noise averages out
-            drive, rng = scene.drive(name), np.random.default_rng([scene.seed, *name.encode()])
+            drive = scene.drive(name)
+            rng = np.random.default_rng([scene.seed, *name.encode()])
             errors = ar1(1e-9 * np.diff(drive.stamps_ns), sigma, rng)
             T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
             drives.append(
@@ -100,7 +102,8 @@ def in_changed_areas(
     near none."""
     corners = [np.zeros((0, 2)), *(np.asarray(o["footprint"]) for o in truth.objects)]
     away_m = scene.true_poses(vehicle)[:, None, :2, 3] - np.concatenate(corners)[None]
-    drive, scans = scene.drive(vehicle), np.flatnonzero((np.linalg.norm(away_m, axis=2) <= near_m).any(axis=1))
+    drive = scene.drive(vehicle)
+    scans = np.flatnonzero((np.linalg.norm(away_m, axis=2) <= near_m).any(axis=1))
     if not len(scans):
         return {}
     T_true = scene.true_poses(vehicle)[scans]
@@ -160,7 +163,8 @@ def vote_by_http(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> Pu
                 if client.send(ballot) == "spooled":
                     raise MapvoteError(f"{url}: did not take {ballot.vehicle}'s ballot; see {folder / 'server.log'}")
         ask = {"reason": "a round of votes on this machine"}
-        answer, held = httpx2.post(f"{url}/v1/publish", json=ask, timeout=120.0), ""
+        answer = httpx2.post(f"{url}/v1/publish", json=ask, timeout=120.0)
+        held = ""
         if answer.status_code == 409:
             held = str(answer.json().get("detail", "for no reason given"))
             answer = httpx2.post(f"{url}/v1/publish", json={**ask, "override": True}, timeout=120.0)
@@ -204,7 +208,8 @@ def evaluate(
     workers = min(2, os.cpu_count() or 1)
     drives = passes(scene, cases, workers, progress, keep=readings is not None)
     voted = time.perf_counter()
-    truth, first_map = scene.truth, scene.point_map
+    truth = scene.truth
+    first_map = scene.point_map
     jury = Jury(first_map, truth)
     best = next((c.name for c in cases if c.name == scene.settings.voting.method), cases[0].name)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
@@ -257,7 +262,9 @@ def _scored(
     scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress
 ) -> tuple[dict[str, CaseOutcome], dict[str, CaseResult]]:
     """By case: what the server makes of its ballots, and the scores."""
-    first_map, outcomes, entries = scene.point_map, dict[str, CaseOutcome](), dict[str, CaseResult]()
+    first_map = scene.point_map
+    outcomes = dict[str, CaseOutcome]()
+    entries = dict[str, CaseResult]()
     for i, case in enumerate(cases):
         progress("scoring", i, len(cases))
         ballots = [drive.ballots[case.name] for drive in drives]

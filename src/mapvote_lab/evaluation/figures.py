@@ -39,7 +39,8 @@ class Camera:
 
     def project(self, points: F64) -> tuple[F64, F64]:
         """(pixels (n, 2) as x right and y down, depth (n,) metres in front of the camera)."""
-        a, e = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
+        a = np.radians(self.azimuth_deg)
+        e = np.radians(self.elevation_deg)
         back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         right = np.array([-np.sin(a), np.cos(a), 0.0])
         up = np.cross(back, right)
@@ -56,7 +57,8 @@ class Camera:
 def shades(height: F64) -> F32:
     """(n, 3) grey-blue by height above ground (n,), metres: pale ground, darker walls."""
     share = np.clip((height[:, None] - 0.2) / 9.0, 0.0, 1.0)
-    low, high = np.array(to_rgb("#a9b8c4")), np.array(to_rgb("#33506a"))
+    low = np.array(to_rgb("#a9b8c4"))
+    high = np.array(to_rgb("#33506a"))
     colours = low + (high - low) * share
     colours[height < 0.3] = to_rgb("#d3dade")
     return colours.astype(np.float32)
@@ -80,11 +82,16 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
         at = corner[sizes == size] - size // 2
         for dx in range(size):
             for dy in range(size):
-                x, y = at[:, 0] + dx, at[:, 1] + dy
+                x = at[:, 0] + dx
+                y = at[:, 1] + dy
                 inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
-                xi, yi, who = x[inside], y[inside], chosen[inside]
+                xi = x[inside]
+                yi = y[inside]
+                who = chosen[inside]
                 nearer = depth[who] <= depth_image[yi, xi]
-                xi, yi, who = xi[nearer], yi[nearer], who[nearer]
+                xi = xi[nearer]
+                yi = yi[nearer]
+                who = who[nearer]
                 image[yi, xi] = colours[who]
                 depth_image[yi, xi] = depth[who]
     image *= _eye_dome(depth_image)[..., None]
@@ -152,7 +159,8 @@ def _from_above(points: F64, height: F64, grid: Grid) -> np.ndarray:
     known = np.isfinite(top)
     share = np.clip(top / 10.0, 0.0, 1.0)[..., None]
     share[~known] = 0.0
-    low, high = np.array([0.83, 0.86, 0.89]), np.array([0.16, 0.25, 0.34])
+    low = np.array([0.83, 0.86, 0.89])
+    high = np.array([0.16, 0.25, 0.34])
     image = low + (high - low) * np.sqrt(share)
     image[~known] = 1.0
     return image

@@ -68,7 +68,8 @@ def gallery(
 
 def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]]:
     """(name, figure, caption) of every picture, one after the other: a figure takes tens of megabytes."""
-    old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[case].updated)
+    old = all_points(evaluation.first_map)
+    new = all_points(evaluation.outcomes[case].updated)
     survived, added = same_rows(old, new)
     deleted = old[~survived]
     paths = _paths(evaluation)
@@ -85,7 +86,8 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
         caption = f"{area.name.capitalize()} in bird's-eye view, points {verb}: Figure {figure}."
         yield area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption
     nearest = _scan_near(evaluation, areas)
-    v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
+    v = evaluation.scene.settings.voting
+    n_min = evaluation.scene.settings.paper.n_min
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "surfaces") if n in evaluation.outcomes}
     truth = np.full(256, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
     truth[[1, 2, Label.UNSCORED]] = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED
@@ -100,7 +102,8 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     yield "states", figures.cell_states(panels, evaluation.window, outlines=outlines), caption
     yield "table_iv", figures.score_bars(shown, names), "Table IV as bars, the paper's figures beside ours."
     if evaluation.best == "surfaces":
-        decisions, lattice = evaluation.outcomes["surfaces"].decisions, evaluation.first_map.lattice
+        decisions = evaluation.outcomes["surfaces"].decisions
+        lattice = evaluation.first_map.lattice
         found = {
             state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
             for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
@@ -126,7 +129,8 @@ def _area(
     road_y = float(np.mean(np.concatenate([path[:, 1] for _, path in paths])))
     middle = area.box.mean(axis=0)
     north = middle[1] > road_y
-    low, high = area.box[0] - [22.0, 6.0], area.box[1] + [22.0, 6.0]
+    low = area.box[0] - [22.0, 6.0]
+    high = area.box[1] + [22.0, 6.0]
     low[1], high[1] = (road_y - 9.0, high[1]) if north else (low[1], road_y + 9.0)
     ground_z = float(np.median(np.concatenate([path[:, 2] for _, path in paths])))
 
@@ -167,7 +171,8 @@ def _scan_near(evaluation: Evaluation, areas: list[ChangedArea]) -> int:
 def _scan(evaluation: Evaluation, index: int) -> Figure:
     drive = evaluation.scene.drive(evaluation.drives[0].vehicle)
     T_map_lidar = evaluation.drives[0].T_map_lidar[index]
-    scan, moving = drive.read_scan(index), evaluation.truth.moving(evaluation.drives[0].vehicle, index)
+    scan = drive.read_scan(index)
+    moving = evaluation.truth.moving(evaluation.drives[0].vehicle, index)
     points = transform(T_map_lidar, scan.points)
     ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
     colours = figures.shades(heights_above_ground(evaluation.first_map, points))
@@ -184,7 +189,8 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
 def _local_grid(evaluation: Evaluation, index: int) -> Figure:
     """The local grid by one scan alone under the paper's rule, and by the whole drive."""
     first = evaluation.drives[0]
-    scene, name = evaluation.scene, first.vehicle
+    scene = evaluation.scene
+    name = first.vehicle
     drive = scene.drive(name)
     voting = paper_cases(scene.settings)["1"].voting
     there = np.isfinite(first.T_map_lidar).all(axis=(1, 2))

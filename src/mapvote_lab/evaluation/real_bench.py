@@ -187,7 +187,9 @@ def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
     reference = reference_window(street.point_map, street.grid)
     for points in clouds:
         rows, cols, inside = street.grid.indices_of(points)
-        rows, cols, z = rows[inside], cols[inside], points[inside, 2]
+        rows = rows[inside]
+        cols = cols[inside]
+        z = points[inside, 2]
         high = z - reference.ground_z[rows, cols] >= GROUND_MARGIN_M
         out[rows[high], cols[high]] = True
     return out
@@ -211,7 +213,8 @@ def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
 def precision_near(asked: Sequence[Asked], states: U8, grid: Grid, near_cells: int = BENCH_RULE.near_cells) -> float:
     """Share of the cells decided changed within ``near_cells`` of the things that are, or lie next to, cells so
     changed."""
-    near, right = np.zeros(grid.shape, dtype=np.bool_), np.zeros(grid.shape, dtype=np.bool_)
+    near = np.zeros(grid.shape, dtype=np.bool_)
+    right = np.zeros(grid.shape, dtype=np.bool_)
     for a in asked:
         near |= ndimage.binary_dilation(a.cells, NEIGHBOURS, iterations=near_cells)
         right |= ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state)

@@ -86,7 +86,8 @@ def _largest(bench: Bench, case: str) -> Sheet:
 
 def _changed(bench: Bench, case: str) -> Sheet:
     headings = ("thing", "asked", "half found", "touched", "cell recall", "rays a scan")
-    rows, said = [], []
+    rows = []
+    said = []
     for name, (run, asked) in bench.changed.items():
         said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
         for f in [] if name == ChangedRun.BUILT_IN_RAIN else _found(bench, case, name):
@@ -149,9 +150,11 @@ def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], pa
 
 def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path, most: int = 20) -> None:
     """The whole street, and close-ups of at most ``most`` things, the least found first: found, missed, false."""
-    picture, states = _street(run), run.states[case]
+    picture = _street(run)
+    states = run.states[case]
     picture[is_changed(states)] = to_rgb(Colour.INK)
-    share, spots = [], []
+    share = []
+    spots = []
     x, y = run.street.grid.centres()
     for a in asked:
         picture[a.cells] = to_rgb(Colour.UNSURE)

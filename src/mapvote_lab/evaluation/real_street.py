@@ -82,7 +82,8 @@ def split(n: int, block: int, rule: StreetRule = STREET_RULE) -> tuple[I64, list
     MapvoteError if that leaves too few to vote.
     """
     blocks = np.arange(n) // block
-    mapped, rest = np.flatnonzero(blocks % 2 == 0), np.flatnonzero(blocks % 2 == 1)
+    mapped = np.flatnonzero(blocks % 2 == 0)
+    rest = np.flatnonzero(blocks % 2 == 1)
     needed = rule.least_scans * rule.vehicles
     if len(rest) < needed:
         raise MapvoteError(
@@ -175,7 +176,8 @@ def open_recording(folder: Path, settings: Settings, scans: str | None = None) -
     """
     whole = open_drive(folder)
     chosen = parse_scans(scans, len(whole), str(folder))
-    recording, file = part_of(whole, chosen), folder / "poses.txt"
+    recording = part_of(whole, chosen)
+    file = folder / "poses.txt"
     if not file.is_file():
         return recording, build_map([recording], settings)[1].tracks[0].T_map_lidar
     T = read_T_map_lidar(file, folder)
@@ -200,9 +202,12 @@ def lay_street(
 
 def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, first_pose_only: bool = False) -> RealRun:
     """Three vehicles drive the street's other blocks; every case is decided."""
-    recording, movers = edit(street.recording), street.movers.copy()
+    recording = edit(street.recording)
+    movers = street.movers.copy()
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
-    reports, metres, prior_metres = [], [], []
+    reports = []
+    metres = []
+    prior_metres = []
     for k, scans in enumerate(street.voting):
         drive = part_of(recording, scans, f"v{k + 1}")
         T_true = street.T_map_lidar[scans]
@@ -409,7 +414,8 @@ def disturbed(sigma_m: float = 0.5, sigma_deg: float = 2.0) -> Edit:
     """An independent error in every scan, normal in x, y and yaw; the vehicle knows twice as much."""
 
     def edit(drive: Drive) -> Drive:
-        T, rng = _prior_of(drive), np.random.default_rng(0)
+        T = _prior_of(drive)
+        rng = np.random.default_rng(0)
         off = np.zeros((len(T), 6))
         off[:, :2] = rng.normal(0.0, sigma_m, (len(T), 2))
         off[:, 5] = rng.normal(0.0, np.radians(sigma_deg), len(T))
@@ -427,6 +433,7 @@ def _prior_of(drive: Drive) -> F64:
 
 def _aside(T: F64, metres: F64) -> F64:
     """Poses (n, 4, 4) moved by ``metres`` (n,) half way between ahead and aside as the drive begins."""
-    ahead, out = np.arctan2(T[0, 1, 0], T[0, 0, 0]) + 0.25 * np.pi, T.copy()
+    ahead = np.arctan2(T[0, 1, 0], T[0, 0, 0]) + 0.25 * np.pi
+    out = T.copy()
     out[:, :2, 3] += metres[:, None] * np.array([np.cos(ahead), np.sin(ahead)])
     return out

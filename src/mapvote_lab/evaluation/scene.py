@@ -94,7 +94,8 @@ class Scene:
     def folder(self) -> Path:
         """Drives and truth."""
         text = load_scenario(self.scenario, self.overrides).model_dump_json()
-        name, thinning = f"{Path(self.scenario).stem}-{self.seed}", inspect.getsource(voxel_downsample)
+        name = f"{Path(self.scenario).stem}-{self.seed}"
+        thinning = inspect.getsource(voxel_downsample)
         return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM), GROUND_MARGIN_M, thinning)}"
 
     @property
@@ -168,7 +169,9 @@ class SharedPass:
         *,
         localise: Localise | None = None,
     ) -> None:
-        self.drive, self.point_map, self.settings = drive, point_map, settings
+        self.drive = drive
+        self.point_map = point_map
+        self.settings = settings
         self._frontend = Frontend(
             localise or Localiser(point_map, settings, drive.sensor),
             MovingFilter(drive.sensor, settings.moving),
@@ -267,7 +270,8 @@ def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str, keep: bool = 
 
 def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = False) -> None:
     """One vehicle's drive with a voter for every case; ballots and poses into the cache, whole or not at all."""
-    drive, point_map = scene.drive(name), scene.point_map
+    drive = scene.drive(name)
+    point_map = scene.point_map
     localise = None
     if scene.poses == "truth":
         assert drive.T_map_lidar_prior is not None
@@ -280,7 +284,8 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
         if keeper:
             keeper.watch(observations)
     observations = vehicle.finish()
-    report, poses = vehicle.report, np.full((len(drive), 4, 4), np.nan)
+    report = vehicle.report
+    poses = np.full((len(drive), 4, 4), np.nan)
     found = np.setdiff1d(np.arange(len(drive)), report.lost)
     poses[found] = np.array(report.T_map_lidar)[found]
     with whole_folder(pass_folder(scene, cases, name, keep), sign="pass.json") as folder:

@@ -108,7 +108,9 @@ def score_cells(states: U8, truth: U8) -> Scores:
     scored = truth != Label.UNSCORED
     pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
     table = np.bincount(pairs, minlength=9).reshape(3, 3)
-    right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
+    right = np.diag(table)
+    decided = table.sum(axis=0)
+    true = table.sum(axis=1)
     precision = ByClass(*(ratio(right[k], decided[k]) for k in range(3)))
     return Scores.of(precision, ByClass(*(ratio(right[k], true[k]) for k in range(3))))
 
@@ -236,10 +238,14 @@ class MapJudge:
         rule: ScoreRule = SCORE_RULE,
     ) -> None:
         self._rule = rule
-        self._old, self._added, self._scored, self._reach_m = old_points, added, scored, reach_m
+        self._old = old_points
+        self._added = added
+        self._scored = scored
+        self._reach_m = reach_m
         self._now = cKDTree(np.concatenate([kept, added]))
         to_removed = _distance(old_points, cKDTree(removed))
-        to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
+        to_kept = _distance(old_points, cKDTree(kept))
+        to_now = _distance(old_points, self._now)
         self.stale = (to_removed <= reach_m) & (to_removed < to_now)
         self.valid = (to_kept <= reach_m) & (to_kept <= to_removed)
 
@@ -266,7 +272,9 @@ class MapJudge:
         it)."""
         survived, _ = same_rows(self._old, new_points)
         reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
-        left, added, visible = [], [], 0
+        left = []
+        added = []
+        visible = 0
         for kind, inside in objects:
             if kind == "demolished":
                 own = survived[self.stale & inside(self._old)]
@@ -345,7 +353,8 @@ def reliability(
     states = np.full(len(rows), state, dtype=np.uint8)
     # The probability of each, and whether the truth agrees, where the truth is scored.
     probability = change_probability(states, votes, against, beside, odds.astype(np.int8))
-    r, c = rows - window.row0, cols - window.col0
+    r = rows - window.row0
+    c = cols - window.col0
     inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
     labels = truth[r[inside], c[inside]]
     scored = labels != Label.UNSCORED

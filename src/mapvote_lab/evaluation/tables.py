@@ -222,7 +222,9 @@ def _map_table(result: EvaluationResult) -> Iterator[Sheet]:
     rows = []
     for case, entry in result.cases.items():
         if entry.map is not None:
-            scores, objects, false = entry.map, entry.objects, entry.objects.false_m2
+            scores = entry.map
+            objects = entry.objects
+            false = entry.objects.false_m2
             rows.append(
                 [
                     case_name(case),

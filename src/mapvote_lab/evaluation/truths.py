@@ -97,7 +97,8 @@ class Truth:
 
     def grid_on(self, lattice: Lattice) -> Grid:
         """The truth's window on a map's lattice; MapvoteError if the two do not fall on the same cells."""
-        row, col = (self.y0 - lattice.y0) / CELL_SIZE, (self.x0 - lattice.x0) / CELL_SIZE
+        row = (self.y0 - lattice.y0) / CELL_SIZE
+        col = (self.x0 - lattice.x0) / CELL_SIZE
         if abs(row - round(row)) > 1e-6 or abs(col - round(col)) > 1e-6:
             raise MapvoteError(
                 f"{self.folder}: its cells start at ({self.x0}, {self.y0}), off the map's lattice "
@@ -116,7 +117,8 @@ class Truth:
     def surfaces(self) -> tuple[F64, F64, F64]:
         """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
         with np.load(self.folder / "surface.npz") as file:
-            points, label = file["points"].astype(np.float64), file["label"]
+            points = file["points"].astype(np.float64)
+            label = file["label"]
         return points[label == Role.KEPT], points[label == Role.ADDED], points[label == Role.REMOVED]
 
     def cells_of(self, footprint: list[list[float]], around_m: float = TRUTH_READING.around_m) -> Bool:
@@ -138,9 +140,14 @@ def read_truth(scene: Path) -> Truth:
     folder = scene / "truth"
     try:
         with np.load(folder / "truth.npz") as file:
-            strict, provenance, reason = file["strict"], file["provenance"], file["reason"]
-            densest, hit, passed = file["densest"], file["hit"], file["passed"]
-            x0, y0 = float(file["x0"]), float(file["y0"])
+            strict = file["strict"]
+            provenance = file["provenance"]
+            reason = file["reason"]
+            densest = file["densest"]
+            hit = file["hit"]
+            passed = file["passed"]
+            x0 = float(file["x0"])
+            y0 = float(file["y0"])
         objects = json.loads((folder / "objects.json").read_text())["objects"]
     except (OSError, KeyError, ValueError) as error:
         raise MapvoteError(f"{folder}: no usable truth ({error}); simulate the scene again") from error
@@ -163,7 +170,8 @@ def rigid_between(T_map_a: F64, T_world_a: F64, arm_m: float = 2.0) -> F64:
     Each pose stands for its position and for points ``arm_m`` along its axes, so that a straight road, whose positions
     leave the turn about it open, still fixes all six degrees of freedom.
     """
-    to, of = T_map_a[:, :3, 3].mean(axis=0), T_world_a[:, :3, 3].mean(axis=0)
+    to = T_map_a[:, :3, 3].mean(axis=0)
+    of = T_world_a[:, :3, 3].mean(axis=0)
     spread = (T_map_a[:, :3, 3] - to).T @ (T_world_a[:, :3, 3] - of)
     spread += arm_m**2 * np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
     u, _, vt = np.linalg.svd(spread)
@@ -185,7 +193,8 @@ def error_summary(T_found: F64, T_true: F64) -> PoseErrors:
     there = np.isfinite(T_found).all(axis=(1, 2))
     metres, radians = pose_errors(T_found[there], T_true[there])
     if not there.any():
-        metres, radians = np.zeros(1), np.zeros(1)
+        metres = np.zeros(1)
+        radians = np.zeros(1)
     return PoseErrors(
         scans=len(T_found),
         localised=int(there.sum()),
@@ -229,7 +238,8 @@ def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
 def _rims(truth: Truth, samples: F64, border_m: float) -> tuple[Bool, Bool]:
     """(cells with a sample farther than ``border_m`` from their rim, cells with one no farther than that outside
     it)."""
-    x, y = (samples[:, 0] - truth.x0) % CELL_SIZE, (samples[:, 1] - truth.y0) % CELL_SIZE
+    x = (samples[:, 0] - truth.x0) % CELL_SIZE
+    y = (samples[:, 1] - truth.y0) % CELL_SIZE
     inner = np.abs(np.column_stack([x, y]) - CELL_SIZE / 2).max(axis=1, initial=0.0) < CELL_SIZE / 2 - border_m
     firm = _count(truth, samples[inner]) > 0
     near = np.zeros_like(firm)

@@ -61,7 +61,8 @@ class Traffic:
         """(bodies, 3) map points half a metre above the ground where each body ends, 2.5 m behind its middle."""
         everyone = np.arange(len(self._paths))
         x, y, yaw = self.poses(everyone, np.full(len(everyone), stamp_s)).T
-        x, y = x - 2.5 * np.cos(yaw), y - 2.5 * np.sin(yaw)
+        x = x - 2.5 * np.cos(yaw)
+        y = y - 2.5 * np.sin(yaw)
         return np.column_stack([x, y, self._terrain.height(x, y) + 0.5])
 
     def mesh(self, stamp_s: float, T_map_lidar: F64, rate_hz: float | None, reach_m: float) -> tuple[F32, I32]:
@@ -109,7 +110,8 @@ def _lanes(scenario: Scenario, terrain: Terrain, own_lane: str, clock: F64, rng:
         entry = 0.0 if direction > 0 else scenario.length_m
         turns = scenario.crossing_m is not None and "outer" in name and name != own_lane
         for ahead in _spots(scenario.traffic.car_spacing_m, 11.0, speed * clock[-1], scenario.length_m, rng):
-            body, aside = _motor_vehicle(rng), rng.normal(0.0, 0.15)
+            body = _motor_vehicle(rng)
+            aside = rng.normal(0.0, 0.15)
             if name == own_lane and -13.0 < ahead < 15.0:
                 continue
             start = (entry + direction * ahead, terrain.axis_y + offset + aside)
@@ -123,7 +125,8 @@ def _lanes(scenario: Scenario, terrain: Terrain, own_lane: str, clock: F64, rng:
 def _kerbsides(scenario: Scenario, terrain: Terrain, clock: F64, rng: np.random.Generator) -> list[Track]:
     """Cyclists between the outer lane and the parked cars; pedestrians both ways on the sidewalks."""
     tracks = []
-    length, axis = scenario.length_m, terrain.axis_y
+    length = scenario.length_m
+    axis = terrain.axis_y
     for direction in (1, -1):
         for ahead in _spots(scenario.traffic.two_wheeler_spacing_m, 4.0, 7.0 * clock[-1], length, rng):
             start = ((0.0 if direction > 0 else length) + direction * ahead, axis + direction * (STREET.kerb_m - 2.4))
@@ -146,9 +149,11 @@ def _queues(scenario: Scenario, terrain: Terrain, clock: F64, rng: np.random.Gen
     tracks = []
     for direction in (1, -1):  # northbound keeps to the west
         for offset in (1.75, 5.25):
-            stop, arrival = -(STREET.kerb_m + STREET.stop_line_m), rng.uniform(0.0, 4.0)
+            stop = -(STREET.kerb_m + STREET.stop_line_m)
+            arrival = rng.uniform(0.0, 4.0)
             while stop > -PACE.beyond_m:
-                speed, brake = rng.uniform(7.0, 10.0), 2.5
+                speed = rng.uniform(7.0, 10.0)
+                brake = 2.5
                 left = np.clip(speed - brake * np.maximum(clock - arrival, 0.0), 0.0, None)
                 along = stop - speed**2 / (2 * brake) + speed * np.minimum(clock - arrival, 0.0)
                 along = along + (speed**2 - left**2) / (2 * brake)
@@ -172,10 +177,13 @@ def _straight(
     start: tuple[float, float], heading: float, speed: float, weave_m: float, clock: F64, rng: np.random.Generator
 ) -> F64:
     """A track along ``heading`` at constant speed, weaving a little from side to side."""
-    rate, phase = rng.uniform(0.3, 0.8), rng.uniform(0.0, 2.0 * np.pi)
-    along, aside = speed * clock, weave_m * np.sin(rate * clock + phase)
+    rate = rng.uniform(0.3, 0.8)
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    along = speed * clock
+    aside = weave_m * np.sin(rate * clock + phase)
     yaw = heading + weave_m * rate * np.cos(rate * clock + phase) / speed
-    c, s = np.cos(heading), np.sin(heading)
+    c = np.cos(heading)
+    s = np.sin(heading)
     return np.column_stack([start[0] + c * along - s * aside, start[1] + s * along + c * aside, yaw])
 
 

@@ -182,12 +182,15 @@ def _drive(task: _Task) -> tuple[I32, I32, U8, Bool]:
     scenario, seed, folder, drive, first, last = task
     stage = _stage(scenario, seed)
     still, traffic = _street(scenario, seed, drive)
-    route, sensor, roles = stage.routes[drive], stage.sensor, stage.world.roles()
+    route = stage.routes[drive]
+    sensor = stage.sensor
+    roles = stage.world.roles()
     writer = _writer(folder, route, stage)
     counts = np.zeros((len(Role), *stage.ground.shape), dtype=np.int32)
     most = np.zeros(stage.ground.shape, dtype=np.int32)
     removed = [] if route.vehicle is None else np.flatnonzero(roles == Role.REMOVED).tolist()
-    gone, passes = Caster(*stage.world.mesh(removed or [0])), np.zeros_like(counts)
+    gone = Caster(*stage.world.mesh(removed or [0]))
+    passes = np.zeros_like(counts)
     for index in range(first, last):
         rng = np.random.default_rng(np.random.SeedSequence([seed, 6, drive, index]))
         stamp_s = index / route.rate_hz
@@ -198,7 +201,8 @@ def _drive(task: _Task) -> tuple[I32, I32, U8, Bool]:
         bodies = Caster(*traffic.mesh(stamp_s, T_map_lidar, turning, sensor.max_range_m))
         near, passing, body_cosine = bodies.cast(rays.origins, rays.directions)
         moving = near < ranges
-        ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
+        ranges = np.where(moving, near, ranges)
+        cosine = np.where(moving, body_cosine, cosine)
         hits = Hits(ranges, np.where(moving, passing, objects), cosine, moving)
         reported, false, lost = spoil(
             rays, hits, stage.kinds, (still, bodies), traffic.tails(stamp_s), sensor, scenario.flaws,

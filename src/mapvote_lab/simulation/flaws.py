@@ -121,7 +121,8 @@ def reflected(
     ``casters``: of static and of moving objects. A mirror shows static objects only.
     """
     chosen = rng.permutation(np.flatnonzero(smooth))[: 4 * wanted]
-    indices, ranges = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.float32)]
+    indices = [np.zeros(0, dtype=np.int64)]
+    ranges = [np.zeros(0, dtype=np.float32)]
     for caster, its_rays in zip(casters, (~hits.moving[chosen], hits.moving[chosen]), strict=True):
         met = chosen[its_rays]
         if len(met):
@@ -132,7 +133,8 @@ def reflected(
             beyond, _, _ = casters[0].cast((mirror + 0.01 * bounced).astype(np.float32), bounced.astype(np.float32))
             indices.append(met)
             ranges.append((hits.ranges[met] + beyond).astype(np.float32))
-    index, way = np.concatenate(indices), np.concatenate(ranges)
+    index = np.concatenate(indices)
+    way = np.concatenate(ranges)
     seen = np.flatnonzero(way < sensor.max_range_m)[:wanted]
     return index[seen], way[seen]
 
@@ -164,7 +166,8 @@ def shortened(
     if flaws.rain > 0:
         drop = rng.exponential(sizes.drops_m, len(ranges)).astype(np.float32)
         wet = (rng.random(len(ranges)) < flaws.rain) & (drop < ranges)
-        ranges[wet], short = drop[wet], short | wet
+        ranges[wet] = drop[wet]
+        short = short | wet
     for k in np.flatnonzero(rng.random(len(tails)) < flaws.exhaust):
         offset = tails[k] - rays.origins
         along = np.einsum("ij,ij->i", offset, rays.directions)
@@ -173,7 +176,8 @@ def shortened(
         half_way_through = np.sqrt(np.maximum(sizes.plume_m**2 - miss, 0.0))
         ends = (along + rng.uniform(-1.0, 1.0, len(ranges)) * half_way_through).astype(np.float32)
         inside &= ends < ranges
-        ranges[inside], short = ends[inside], short | inside
+        ranges[inside] = ends[inside]
+        short = short | inside
     return short
 
 
@@ -194,6 +198,8 @@ def spoil(
     wanted = round(flaws.reflection_share * np.count_nonzero(hits.ranges < sensor.max_range_m))
     if wanted:
         index, way = reflected(rays, hits, wet | glass | paint, casters, wanted, sensor, rng)
-        ranges[index], false[index], lost[index] = way, True, False
+        ranges[index] = way
+        false[index] = True
+        lost[index] = False
     short = shortened(rays, ranges, tails, flaws, rng)
     return ranges, false | short, lost & ~short

@@ -67,12 +67,16 @@ class Caster:
 def _first_hits(far: F32, triangle: I32, normals: F32, directions: F32, owners: I32) -> tuple[F32, I32, F32]:
     """Range, object and |cos of incidence| of rays that met a ``triangle`` each (n,), or -1."""
     n = len(far)
-    ranges, objects, cosine = np.full(n, np.inf, np.float32), np.empty(n, np.int32), np.zeros(n, np.float32)
+    ranges = np.full(n, np.inf, np.float32)
+    objects = np.empty(n, np.int32)
+    cosine = np.zeros(n, np.float32)
     for i in range(n):
         objects[i] = owners[triangle[i]]
         if triangle[i] >= 0:
             ranges[i] = far[i]
-            x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+            x = normals[i, 0]
+            y = normals[i, 1]
+            z = normals[i, 2]
             along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
             cosine[i] = abs(along) / (np.sqrt(x * x + y * y + z * z) + np.float32(1e-12))
     return ranges, objects, cosine

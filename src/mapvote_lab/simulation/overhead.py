@@ -31,8 +31,10 @@ def board() -> F64:
 def over_house(house: F64, rng: np.random.Generator) -> dict[str, F64]:
     """By kind what hangs over a house (n, 3, 3), map metres, a metre and more above its top: a crown over the front, a
     wire and the deck of a viaduct along the street, both 8 m longer than the house on either side."""
-    low, high = house.reshape(-1, 3).min(axis=0), house.reshape(-1, 3).max(axis=0)
-    middle, top = 0.5 * (low + high), high[2]
+    low = house.reshape(-1, 3).min(axis=0)
+    high = house.reshape(-1, 3).max(axis=0)
+    middle = 0.5 * (low + high)
+    top = high[2]
     long = low[0] - 8.0, high[0] + 8.0
     crown = foliage(rng, (2.2, 2.2, 1.4), 0.0, 400, 0.28)
     return {

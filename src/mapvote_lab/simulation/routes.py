@@ -96,7 +96,8 @@ class Route:
         x = along if direction > 0 else self.length - along
         y = self.terrain.axis_y + offset + direction * aside
         yaw = tilt + (0.0 if direction > 0 else np.pi)
-        c, s = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         ahead = self.terrain.height(x + 1.4 * c, y + 1.4 * s), self.terrain.height(x - 1.4 * c, y - 1.4 * s)
         across = self.terrain.height(x - 0.8 * s, y + 0.8 * c), self.terrain.height(x + 0.8 * s, y - 0.8 * c)
         pitch = -np.arctan2(ahead[0] - ahead[1], 2.8) + np.radians(0.12) * np.sin(7.5 * time_s + p[2])
@@ -152,10 +153,24 @@ def make_routes(scenario: Scenario, terrain: Terrain, seed: int, plan: DrivePlan
 
 def _from_xyz_rpy(x: F64, y: F64, z: F64, roll: F64, pitch: F64, yaw: F64) -> F64:
     """core.geometry.from_xyz_rpy over (n,) arrays: (n, 4, 4)."""
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    cr = np.cos(roll)
+    sr = np.sin(roll)
+    cp = np.cos(pitch)
+    sp = np.sin(pitch)
+    cy = np.cos(yaw)
+    sy = np.sin(yaw)
     T = np.zeros((len(x), 4, 4))
-    T[:, 0, 0], T[:, 0, 1], T[:, 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
-    T[:, 1, 0], T[:, 1, 1], T[:, 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
-    T[:, 2, 0], T[:, 2, 1], T[:, 2, 2] = -sp, cp * sr, cp * cr
-    T[:, 0, 3], T[:, 1, 3], T[:, 2, 3], T[:, 3, 3] = x, y, z, 1.0
+    T[:, 0, 0] = cy * cp
+    T[:, 0, 1] = cy * sp * sr - sy * cr
+    T[:, 0, 2] = cy * sp * cr + sy * sr
+    T[:, 1, 0] = sy * cp
+    T[:, 1, 1] = sy * sp * sr + cy * cr
+    T[:, 1, 2] = sy * sp * cr - cy * sr
+    T[:, 2, 0] = -sp
+    T[:, 2, 1] = cp * sr
+    T[:, 2, 2] = cp * cr
+    T[:, 0, 3] = x
+    T[:, 1, 3] = y
+    T[:, 2, 3] = z
+    T[:, 3, 3] = 1.0
     return T

@@ -39,7 +39,8 @@ def cylinder(radius: float, z0: float, z1: float, sides: int = 8, top_radius: fl
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
     low = ring * radius + [0, 0, z0]
     high = ring * (radius if top_radius is None else top_radius) + [0, 0, z1]
-    low2, high2 = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
+    low2 = np.roll(low, -1, axis=0)
+    high2 = np.roll(high, -1, axis=0)
     centre = np.broadcast_to([0.0, 0.0, z1], low.shape)
     faces = [[low, low2, high2], [low, high2, high], [high, high2, centre]]
     return np.concatenate([np.stack(face, axis=1) for face in faces])
@@ -59,13 +60,16 @@ def foliage(
 def hedge(rng: np.random.Generator, length: float, width: float, height: float) -> F64:
     """A leafy box from x = 0 to ``length``, y around 0, z from the ground."""
     leaves = int(60 * length * max(height, 0.5))
-    low, high = [0.0, -0.5 * width, 0.05], [length, 0.5 * width, height]
+    low = [0.0, -0.5 * width, 0.05]
+    high = [length, 0.5 * width, height]
     return rng.uniform(low, high, size=(leaves, 3))[:, None, :] + rng.uniform(-0.12, 0.12, size=(leaves, 3, 3))
 
 
 def car(length: float = 4.4, width: float = 1.8, height: float = 1.5) -> F64:
     """A saloon, x forward, centred, wheels at z = 0."""
-    waist, l2, w2 = 0.58 * height, 0.5 * length, 0.5 * width
+    waist = 0.58 * height
+    l2 = 0.5 * length
+    w2 = 0.5 * width
     body = taper((-l2, l2, -w2, w2, 0.2), (-l2 + 0.1, l2 - 0.15, -w2 + 0.05, w2 - 0.05, waist))
     cabin = taper(
         (-0.92 * l2, 0.45 * l2, -w2 + 0.08, w2 - 0.08, waist), (-0.7 * l2, 0.1 * l2, -w2 + 0.2, w2 - 0.2, height)
@@ -80,7 +84,8 @@ def car(length: float = 4.4, width: float = 1.8, height: float = 1.5) -> F64:
 
 def van(length: float = 5.6, width: float = 2.0, height: float = 2.4) -> F64:
     """A delivery van or small lorry, x forward."""
-    l2, w2 = 0.5 * length, 0.5 * width
+    l2 = 0.5 * length
+    w2 = 0.5 * width
     cargo = box(-l2, 0.5 * l2, -w2, w2, 0.35, height)
     front = taper((0.5 * l2, l2, -w2, w2, 0.3), (0.5 * l2, 0.75 * l2, -w2 + 0.1, w2 - 0.1, 0.9 * height))
     return join([cargo, front])
@@ -109,7 +114,8 @@ def two_wheeler(height: float = 1.7, motor: bool = False) -> F64:
 
 def place(triangles: F64, x: float, y: float, z: float, yaw: float = 0.0) -> F64:
     """Turn by ``yaw`` (radians, counter-clockwise) and move."""
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + [x, y, z]
 
 
@@ -125,7 +131,8 @@ def sample(triangles: F64, spacing: float, rng: np.random.Generator) -> F64:
 
 def tree(rng: np.random.Generator) -> F64:
     """A street tree: trunk and a crown that lets some rays pass."""
-    trunk, crown = rng.uniform(2.2, 3.0), rng.uniform(1.4, 2.4)
+    trunk = rng.uniform(2.2, 3.0)
+    crown = rng.uniform(1.4, 2.4)
     half = (crown, crown * rng.uniform(0.7, 0.95), rng.uniform(1.2, 2.2))
     leaves = foliage(rng, half, trunk + 0.8 * half[2], int(55 * crown**2), 0.28)
     return join([cylinder(rng.uniform(0.09, 0.2), -0.5, trunk + half[2], 7), leaves])
@@ -195,7 +202,8 @@ def building(rng: np.random.Generator, width: float, depth: float, height: float
     if floors >= 2 and rng.uniform() < 0.5:
         parts += _balconies(rng, width, floors)
     if rng.uniform() < 0.4:  # a sign that juts out over the sidewalk
-        u, z = rng.uniform(0.5, width - 0.7), rng.uniform(2.8, max(2.9, height - 2.0))
+        u = rng.uniform(0.5, width - 0.7)
+        z = rng.uniform(2.8, max(2.9, height - 2.0))
         parts.append(box(u, u + 0.15, -0.9, 0.0, z, min(z + 1.6, height)))
     if rng.uniform() < 0.5:  # steps, a vending machine, flower boxes
         u = rng.uniform(0.3, width - 1.8)
@@ -209,7 +217,8 @@ def _walls(rng: np.random.Generator, width: float, depth: float, height: float) 
     if kind == "plain" or width < 7.0:
         return [box(0, width, 0, depth, FOOT_M, height)]
     if kind == "recess":
-        left, right = rng.uniform(0.25, 0.4) * width, rng.uniform(0.6, 0.75) * width
+        left = rng.uniform(0.25, 0.4) * width
+        right = rng.uniform(0.6, 0.75) * width
         back = rng.uniform(0.6, 1.8)
         return [
             box(0, left, 0, depth, FOOT_M, height),
@@ -217,7 +226,8 @@ def _walls(rng: np.random.Generator, width: float, depth: float, height: float) 
             box(left, right, back, depth, FOOT_M, height),
         ]
     if kind == "step":
-        split, back = rng.uniform(0.35, 0.65) * width, rng.uniform(0.8, 2.5)
+        split = rng.uniform(0.35, 0.65) * width
+        back = rng.uniform(0.8, 2.5)
         return [
             box(0, split, 0, depth, FOOT_M, height),
             box(split, width, back, depth, FOOT_M, height * rng.uniform(0.6, 1)),
@@ -230,9 +240,11 @@ def _walls(rng: np.random.Generator, width: float, depth: float, height: float) 
 
 def _roof(rng: np.random.Generator, width: float, depth: float, height: float) -> list[F64]:
     if height > 9.0 or rng.uniform() < 0.5:  # flat, with a parapet or a plant room
-        u, v = rng.uniform(0.2, 0.5) * width, rng.uniform(0.3, 0.5) * depth
+        u = rng.uniform(0.2, 0.5) * width
+        v = rng.uniform(0.3, 0.5) * depth
         return [box(u, u + 0.3 * width, v, v + 0.3 * depth, height, height + 2.2)]
-    over, rise = rng.uniform(0.2, 0.6), rng.uniform(1.2, 2.8)
+    over = rng.uniform(0.2, 0.6)
+    rise = rng.uniform(1.2, 2.8)
     ridge = 0.5 * depth
     return [
         taper(
@@ -244,8 +256,10 @@ def _roof(rng: np.random.Generator, width: float, depth: float, height: float) -
 
 def _awning(rng: np.random.Generator, width: float) -> list[F64]:
     """A roof over the shop front: the map has points there only high above the ground."""
-    u0, u1 = rng.uniform(0.0, 0.3) * width, rng.uniform(0.65, 1.0) * width
-    reach, z = rng.uniform(0.9, 1.9), rng.uniform(2.4, 3.1)
+    u0 = rng.uniform(0.0, 0.3) * width
+    u1 = rng.uniform(0.65, 1.0) * width
+    reach = rng.uniform(0.9, 1.9)
+    z = rng.uniform(2.4, 3.1)
     return [taper((u0, u1, -reach, 0.0, z), (u0, u1, -0.3, 0.0, z + 0.6))]
 
 

@@ -135,7 +135,8 @@ def count_hits(points: F32, objects: I32, roles: I32, ground: F64, size: float, 
     for i in range(len(points)):
         if objects[i] <= 0:  # the ground, or nothing
             continue
-        c, r = int(np.floor(points[i, 0] / size)), int(np.floor(points[i, 1] / size))
+        c = int(np.floor(points[i, 0] / size))
+        r = int(np.floor(points[i, 1] / size))
         if r < 0 or c < 0 or r >= ground.shape[0] or c >= ground.shape[1]:
             continue
         if points[i, 2] - ground[r, c] >= margin:
@@ -152,12 +153,14 @@ def dense_survey(
     Only rays towards bodies that changed are cast: elsewhere nothing could change.
     """
     # Poses along the route, and the circles around bodies that changed.
-    roles, ground = world.roles(), ground_cells(world, scenario)
+    roles = world.roles()
+    ground = ground_cells(world, scenario)
     changed = [i for i, role in enumerate(roles) if role in (Role.ADDED, Role.REMOVED)]
     circles = np.array([_circle(world.bodies[i].triangles) for i in changed]).reshape(-1, 3)
     poses = route.poses(np.arange(0.0, route.length / route.speed, rule.step_m / route.speed))
     hits = np.zeros((2, len(Role), *ground.shape), dtype=np.int32)
-    samples, labels = [], []
+    samples = []
+    labels = []
     # The street before holds what stays and what is demolished; the street after what stays and what is built.
     for when, role in enumerate((Role.REMOVED, Role.ADDED)):
         caster = Caster(*world.mesh([i for i, r in enumerate(roles) if r in (Role.KEPT, role)]))
@@ -167,7 +170,8 @@ def dense_survey(
             origins = np.ascontiguousarray(np.broadcast_to(T[:3, 3].astype(np.float32), directions.shape))
             ranges, objects, _ = caster.cast(origins, directions)
             met = objects != NOTHING
-            points, objects = origins[met] + ranges[met, None] * directions[met], objects[met]
+            points = origins[met] + ranges[met, None] * directions[met]
+            objects = objects[met]
             count_hits(on_grid(points, scenario), objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits[when])
             changed_points.append(points[roles[objects] == role])
         # One sample of a changed surface for each voxel.
@@ -193,7 +197,8 @@ def passed_surfaces(gone: Caster, origins: F32, directions: F32, ranges: F32, ru
 
 
 def _circle(triangles: F64) -> tuple[float, float, float]:
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low = triangles.min(axis=(0, 1))
+    high = triangles.max(axis=(0, 1))
     middle = 0.5 * (low + high)
     return float(middle[0]), float(middle[1]), float(0.5 * np.hypot(*(high - low)[:2])) + 0.3
 
@@ -291,7 +296,8 @@ def write_truth(
     kept = sample(np.concatenate(stays), rule.kept_sample_m, np.random.default_rng(0)).astype(np.float32)
     near = (kept[:, :2] > -20.0) & (kept[:, :2] < (scenario.length_m + 20.0, scenario.width_m + 20.0))
     kept = kept[near.all(axis=1)]
-    changed, roles = np.concatenate([d[1] for d in dense]), np.concatenate([d[2] for d in dense])
+    changed = np.concatenate([d[1] for d in dense])
+    roles = np.concatenate([d[2] for d in dense])
     first = voxel_downsample(changed, rule.sample_m)
     label = np.concatenate([np.full(len(kept), Role.KEPT, dtype=np.uint8), roles[first]])
     T = T_map_street(scenario)

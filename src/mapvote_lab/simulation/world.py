@@ -80,7 +80,10 @@ class Terrain:
         ys = np.unique(ys)
         gx, gy = np.meshgrid(xs, ys)
         grid = np.stack([gx, gy, self.height(gx, gy)], axis=-1)
-        a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+        a = grid[:-1, :-1]
+        b = grid[:-1, 1:]
+        c = grid[1:, 1:]
+        d = grid[1:, :-1]
         return np.concatenate([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
 
 
@@ -170,7 +173,9 @@ class Side:
 
     def at(self, s: float, v: float) -> tuple[float, float]:
         """Map (x, y) of (s, v)."""
-        c, sn, o = np.cos(self.yaw), np.sin(self.yaw), self.sign * v
+        c = np.cos(self.yaw)
+        sn = np.sin(self.yaw)
+        o = self.sign * v
         return float(self.x0 + c * s - sn * o), float(self.y0 + sn * s + c * o)
 
 
@@ -192,12 +197,10 @@ def make_world(scenario: Scenario, seed: int) -> World:
 
 def _sides(scenario: Scenario) -> list[Side]:
     """North and south of the main street, then both sides of the one that crosses it."""
-    axis, low, high, cross = (
-        0.5 * scenario.width_m,
-        -STREET.margin_m,
-        scenario.length_m + STREET.margin_m,
-        scenario.crossing_m,
-    )
+    axis = 0.5 * scenario.width_m
+    low = -STREET.margin_m
+    high = scenario.length_m + STREET.margin_m
+    cross = scenario.crossing_m
     if cross is None:
         return [Side(0.0, axis, 0.0, sign, ((low, high),)) for sign in (1, -1)]
     gap = STREET.sidewalk_m + 0.5
@@ -246,7 +249,9 @@ def _frontage(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     equal = int(rng.integers(1 << 32)) if scenario.house_m else None
     for low, high, change in _plots(scenario, side, rng):
         draw = rng if equal is None else np.random.default_rng(equal)  # the same draws make the same house
-        width, height, turn = high - low, draw.uniform(4.0, 15.0), draw.normal(0.0, 0.015)
+        width = high - low
+        height = draw.uniform(4.0, 15.0)
+        turn = draw.normal(0.0, 0.015)
         setback = STREET.sidewalk_m + draw.choice([draw.uniform(0.2, 0.9), draw.uniform(0.9, 3.0)], p=[0.65, 0.35])
         yards = change == "kept" and equal is None
         if yards and draw.uniform() < 0.09:  # a fence or hedge in front, a shed at the back
@@ -317,13 +322,18 @@ def _overhead(scenario: Scenario, bodies: list[Body], terrain: Terrain, rng: np.
 
 def _parked_cars(scenario: Scenario, terrain: Terrain, rng: np.random.Generator) -> list[Body]:
     """Kerbside cars: some always there, some not, and the scenario's extra cars of single passes."""
-    passes, bodies, vacant = scenario.vehicles, [], []
+    passes = scenario.vehicles
+    bodies = []
+    vacant = []
     for side in _sides(scenario):
         slots = [s for low, high in side.spans for s in np.arange(low + 4.0, high - 4.0, 6.2)]
         for s in slots:
             make = van if rng.uniform() < 0.12 else car
-            jitter, turn, draw = rng.uniform(-0.4, 0.4), rng.normal(0, 0.02), rng.uniform()
-            before, visits = bool(rng.uniform() < 0.5), tuple((rng.uniform(size=10) < 0.5).tolist())[:passes]
+            jitter = rng.uniform(-0.4, 0.4)
+            turn = rng.normal(0, 0.02)
+            draw = rng.uniform()
+            before = bool(rng.uniform() < 0.5)
+            visits = tuple((rng.uniform(size=10) < 0.5).tolist())[:passes]
             triangles = side.put(make(), s + jitter, STREET.kerb_m - 1.15, terrain, turn)
             if draw < scenario.clutter.parked_share:
                 bodies.append(Body("parked car", triangles))

@@ -85,14 +85,16 @@ def create_app(
     app.add_exception_handler(RequestValidationError, unusable)
     app.add_exception_handler(405, not_allowed)
     describe_keys(app)
-    hosts, guard = Hosts(parts.settings.server.hosts), Guard(parts, opened=opened, owner=owner)
+    hosts = Hosts(parts.settings.server.hosts)
+    guard = Guard(parts, opened=opened, owner=owner)
     app.add_middleware(Watch, hosts=hosts, guard=guard, proxies=Proxies(parts.settings.server.proxies), parts=parts)
     return app
 
 
 async def keep_overview(parts: Services) -> None:
     """Make the overview of each new version, until it is cancelled; no tile is begun once the server stops."""
-    known, stop = None, parts.stopping.is_set
+    known = None
+    stop = parts.stopping.is_set
     while True:
         try:
             newest = await parts.newest.put(None)
@@ -144,7 +146,8 @@ class _Transport(httpx2.BaseTransport):
     """:class:`httpx2.ASGITransport`, which is asynchronous, for synchronous callers in any thread."""
 
     def __init__(self, app: FastAPI, portal: BlockingPortal) -> None:
-        self._asgi, self._portal = httpx2.ASGITransport(app=app), portal
+        self._asgi = httpx2.ASGITransport(app=app)
+        self._portal = portal
 
     def handle_request(self, request: httpx2.Request) -> httpx2.Response:
         return self._portal.call(self._answer, request)

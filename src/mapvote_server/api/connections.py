@@ -256,7 +256,8 @@ class Connection(asyncio.Protocol):
 
     def go_on(self) -> None:
         """Its turn in line has come."""
-        self._waits, self._in_line = False, True
+        self._waits = False
+        self._in_line = True
         self._loop.call_soon(self._begin_held)
 
     def identify(self, name: str, *, privileged: bool) -> None:
@@ -292,13 +293,15 @@ class Connection(asyncio.Protocol):
         """Whether the request of a complete head begins now; else it is held until its turn."""
         self._in_line = self._line.enter(self)
         if not self._in_line:
-            self._waits, self._held = True, data
+            self._waits = True
+            self._held = data
             self._stop()
             self.transport.pause_reading()
         return self._in_line
 
     def _begin_held(self) -> None:
-        data, self._held = self._held, b""
+        data = self._held
+        self._held = b""
         if not self.transport.is_closing():
             self.transport.resume_reading()
             self._pass_on(data)
@@ -343,7 +346,10 @@ class Connection(asyncio.Protocol):
 
     def begin_request(self, has_body: bool) -> None:
         """A head is complete: wait for its body, if it has one."""
-        self._head, self._asked, self._answering, self._body_left = None, True, True, has_body
+        self._head = None
+        self._asked = True
+        self._answering = True
+        self._body_left = has_body
         self._crowd.busy(self)
         self._stop()
         if has_body:
@@ -442,7 +448,8 @@ def _fault_of(head: bytes) -> bytes | None:
 
 def watched(inner: type[asyncio.Protocol], patience: Patience, know: Know) -> type[asyncio.Protocol]:
     """A factory of protocols, each behind a :class:`Connection`; uvicorn calls it as the class ``inner``."""
-    crowd, line = Crowd(patience.connections), Line()
+    crowd = Crowd(patience.connections)
+    line = Line()
     return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd, line, know))
 
 

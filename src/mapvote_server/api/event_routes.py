@@ -106,7 +106,8 @@ async def _stream(request: Request, parts: Services, seq: int, key: Key | None, 
         for event in found if named else without_names(found):
             yield as_sse(event)
         if found:
-            seq, silent = found[-1].seq, 0.0
+            seq = found[-1].seq
+            silent = 0.0
             continue
         await asyncio.sleep(LISTENER_TIMES.poll_s)
         silent += LISTENER_TIMES.poll_s

@@ -111,7 +111,8 @@ class Lane:
         step_aside()  # the queue of this lane has an order of its own
         await self._turn(name)
         # From here on the thread gives the turn back, also if the client goes away meanwhile.
-        under_way, loop = Work(self._limit_s), asyncio.get_running_loop()
+        under_way = Work(self._limit_s)
+        loop = asyncio.get_running_loop()
         try:
             self._check(name)
             context = copy_context()

@@ -96,7 +96,8 @@ async def collections(request: Request, parts: Parts, known: Known) -> Response:
 async def collection(request: Request, parts: Parts, known: Known, name: str) -> Response:
     """One of them, with its extent."""
     _check(request)
-    kind, place = _named(name, known), OnEarth.of(parts.store)
+    kind = _named(name, known)
+    place = OnEarth.of(parts.store)
     box = extent(await _features(parts, name, kind, known, request), place)
     about = _described(request, name, kind, place)
     if box is not None:
@@ -107,13 +108,15 @@ async def collection(request: Request, parts: Parts, known: Known, name: str) ->
 @router.get("/ogc/collections/{name}/items")
 async def items(request: Request, parts: Parts, known: Known, name: str) -> Response:
     """Its features: those that meet ``bbox`` and ``datetime``, ``limit`` of them after ``offset``."""
-    kind, place = _named(name, known), OnEarth.of(parts.store)
+    kind = _named(name, known)
+    place = OnEarth.of(parts.store)
     asked = _Asked.of(request, kind, place)
     features = await _features(parts, name, kind, known, request)
     features = within(features, asked.box, place, asked.box_crs) if asked.box and features else features
     features = during(features, asked.datetime) if asked.datetime else features
     shown = [placed(feature, place, asked.crs) for feature in features[asked.offset : asked.offset + asked.limit]]
-    path, query = f"/collections/{name}/items", dict(request.query_params)
+    path = f"/collections/{name}/items"
+    query = dict(request.query_params)
     links = [
         _link(request, path, "self", _GEOJSON, "this page", query),
         _link(request, path, "alternate", _HTML, "this page for people", query | {"f": "html"}),
@@ -133,7 +136,8 @@ async def items(request: Request, parts: Parts, known: Known, name: str) -> Resp
 @router.get("/ogc/collections/{name}/items/{feature_id}")
 async def item(request: Request, parts: Parts, known: Known, name: str, feature_id: str) -> Response:
     """One feature."""
-    kind, place = _named(name, known), OnEarth.of(parts.store)
+    kind = _named(name, known)
+    place = OnEarth.of(parts.store)
     asked = _Asked.of(request, kind, place, ("crs",))
     features = await _features(parts, name, kind, known, request)
     found = next((feature for feature in features if feature["id"] == feature_id), None)
@@ -174,7 +178,8 @@ class _Asked:
             raise BadRequest("bbox needs numbers separated by commas") from error
         limit = min(_integer(query, "limit", _USUAL_PAGE, 1), _LARGEST_PAGE)
         offset = _integer(query, "offset", 0, 0)
-        crs, box_crs = query.get("crs", CRS84), query.get("bbox-crs", CRS84)
+        crs = query.get("crs", CRS84)
+        box_crs = query.get("bbox-crs", CRS84)
         return cls(limit, offset, crs, box, box_crs, query.get("datetime", ""))
 
 

@@ -336,7 +336,8 @@ async def ready(parts: Parts) -> Ready:
 
     ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
     """
-    version, damaged = await parts.check_ready(), await parts.look_up(_damaged, parts.store)
+    version = await parts.check_ready()
+    damaged = await parts.look_up(_damaged, parts.store)
     return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
 
 

@@ -111,7 +111,8 @@ def packed(request: Request, data: bytes, cache: str) -> Response:
     """Bytes, compressed where the client takes it."""
     headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
     if takes_zstd(request):
-        data, headers["Content-Encoding"] = compress(data, 1), "zstd"
+        data = compress(data, 1)
+        headers["Content-Encoding"] = "zstd"
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 

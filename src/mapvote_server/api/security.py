@@ -231,7 +231,9 @@ class Watch:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        start, status, key = time.perf_counter(), 500, None
+        start = time.perf_counter()
+        status = 500
+        key = None
 
         async def watched(message: Message) -> None:
             nonlocal status

@@ -87,7 +87,8 @@ class Uploads:
     AT_ONCE = 4
 
     def __init__(self, each: int, together: int) -> None:
-        self._each, self._together = each, together
+        self._each = each
+        self._together = together
         self._bytes = 0
         self._under_way: dict[_Upload, None] = {}
         self._of: TallyOf[str] = TallyOf()
@@ -176,7 +177,8 @@ class Batcher(Generic[Asked, Answer]):
         loop = asyncio.get_running_loop()
         while self._waiting:
             await asyncio.sleep(0)  # requests of the same moment join
-            some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
+            some = self._waiting[: self._limit]
+            self._waiting = self._waiting[self._limit :]
             answers: Sequence[Answer | Exception]
             try:
                 answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in some])
@@ -196,7 +198,8 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        counter, histogram = partial(Counter, registry=self.registry), partial(Histogram, registry=self.registry)
+        counter = partial(Counter, registry=self.registry)
+        histogram = partial(Histogram, registry=self.registry)
         self.requests = counter("mapvote_requests", "Requests answered", ["method", "status"])
         self.ballots = counter("mapvote_ballots", "Ballots acknowledged", ["result"])
         self.seconds = histogram("mapvote_request_seconds", "Time to answer", ["method"])
@@ -280,7 +283,8 @@ class Progress:
 
     def report(self, done: int, of: int) -> None:
         """Note how many tiles are done. Conflict, with the name, once an operator has cancelled the publish."""
-        self.done, self.of = done, of
+        self.done = done
+        self.of = of
         if self.cancelled_by is not None:
             raise Conflict(f"cancelled by {self.cancelled_by} after {done} of {of} tiles: nothing was published")
 
@@ -330,7 +334,8 @@ class Services:
         self, store: Store, settings: Settings, gate: Gate | None, executor: Executor | None, *, limited: bool = True
     ) -> None:
         most = settings.server
-        self.store, self.settings = store, settings
+        self.store = store
+        self.settings = settings
         self.gate = gate
         """Compares a version with the one before, before it is published."""
         self.lookups = ThreadPoolExecutor(2, "lookups")
@@ -363,7 +368,9 @@ class Services:
         """Keys that were right when they came last, by their hashes."""
         self.manifests = Manifests(store)
         self.publishing = Publishing()
-        self.clouds, self.feed, self.metrics = Clouds(store), Feed(store), Metrics()
+        self.clouds = Clouds(store)
+        self.feed = Feed(store)
+        self.metrics = Metrics()
         self.limit = RateLimit(most.ballots_per_minute, max(1.0, SERVICE_SIZES.burst * most.ballots_per_minute))
         self.uploads = Uploads(most.max_body_bytes, SERVICE_SIZES.uploads * most.max_body_bytes)
         self._probe = Probe(store.database)

@@ -71,7 +71,8 @@ class Clouds:
     def __init__(self, store: Store, kept_bytes: int = OVERVIEW_SIZES.kept_bytes) -> None:
         self._store = store
         self._room = kept_bytes
-        self._lock, self._making = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
+        self._making = threading.Lock()
         self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
         self._overview: tuple[int, bytes] = 0, b""
         self._coarse: dict[_Drawn, Levels] = {}
@@ -197,7 +198,9 @@ def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
     fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_SIZES.points)
     finest = int(fits[-1]) if len(fits) else -1
     share = OVERVIEW_SIZES.points // max(len(made), 1)
-    rows, clouds, bright = [], [], []
+    rows = []
+    clouds = []
+    bright = []
     any_bright = any(levels.bright is not None for _, levels in made)
     for index, levels in made:
         whole = min(finest, int(np.searchsorted(levels.ends, len(levels.packed), side="right")) - 1)

@@ -81,7 +81,8 @@ class Objects:
 
     def places_m(self, lattice: Lattice) -> tuple[F64, F64]:
         """(x, y) of their middles, map metres."""
-        cols, rows = self.col_sum / self.cells, self.row_sum / self.cells
+        cols = self.col_sum / self.cells
+        rows = self.row_sum / self.cells
         return lattice.x0 + CELL_SIZE * (cols + 0.5), lattice.y0 + CELL_SIZE * (rows + 0.5)
 
 
@@ -133,12 +134,15 @@ def compare(index: TileIndex, votes: Iterable[TileVote]) -> list[Compared]:
     if not ordered:
         return []
     claims = np.stack([_CLAIMS[said_by(vote).reshape(-1)] for vote in ordered])
-    occupied, empty = claims == _OCCUPIED, claims == _EMPTY
+    occupied = claims == _OCCUPIED
+    empty = claims == _EMPTY
     all_occupied, all_empty = (claim.sum(axis=0, dtype=np.int16) for claim in (occupied, empty))
-    before_occupied, before_empty = np.zeros_like(all_occupied), np.zeros_like(all_empty)
+    before_occupied = np.zeros_like(all_occupied)
+    before_empty = np.zeros_like(all_empty)
     out = []
     for i, vote in enumerate(ordered):
-        others_occupied, others_empty = all_occupied - occupied[i], all_empty - empty[i]
+        others_occupied = all_occupied - occupied[i]
+        others_empty = all_empty - empty[i]
         # A side that has the majority, and a vote both before this one and after it.
         agree_occupied = (others_occupied > others_empty) & (before_occupied > 0) & (others_occupied > before_occupied)
         agree_empty = (others_empty > others_occupied) & (before_empty > 0) & (others_empty > before_empty)
@@ -181,7 +185,8 @@ def over_borders(borders: Sequence[Border]) -> Objects:
     part = np.concatenate([border.part + k for border, k in zip(borders, first, strict=True)])
     rows, cols = (np.concatenate([getattr(border, name) for border in borders]) for name in ("rows", "cols"))
     order = np.lexsort((cols, rows))
-    part, key = part[order], (rows * _ROW + cols)[order]
+    part = part[order]
+    key = (rows * _ROW + cols)[order]
     pairs = []
     for row, col in _AROUND:
         beside = key + (row * _ROW + col)
@@ -189,7 +194,8 @@ def over_borders(borders: Sequence[Border]) -> Objects:
         pairs.append(np.stack([part, part[at]])[:, key[at] == beside])
     one, other = np.concatenate(pairs, axis=1)
     alike = parts.occupied[one] == parts.occupied[other]
-    one, other = one[alike], other[alike]
+    one = one[alike]
+    other = other[alike]
     graph = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), shape=(len(parts), len(parts)))
     number, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     cells = np.bincount(label, weights=parts.cells, minlength=number).astype(np.int64)

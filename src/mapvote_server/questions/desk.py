@@ -75,7 +75,8 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 
 
 def _desk_of(store: Store, found: Round) -> Desk:
-    version, budget = found.newest.number, found.asked.settings.false_deletions
+    version = found.newest.number
+    budget = found.asked.settings.false_deletions
     before = [_tile(store, version, fused.index) for fused in found.changed]
     tiles = [(tile, edited_tile(fused, tile)) for fused, tile in zip(found.changed, before, strict=True)]
     decided = [fused.record for fused in found.changed if fused.record is not None]

@@ -162,8 +162,10 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
     if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M):
         raise MapvoteError(f"({x}, {y}): give map metres, within {FARTHEST_M / 1e3:,.0f} km of the map's origin")
     rows, cols = store.lattice.cells_of(np.array([[x, y]]))
-    row, col = int(rows[0]), int(cols[0])
-    index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
+    row = int(rows[0])
+    col = int(cols[0])
+    index = (row // TILE_CELLS, col // TILE_CELLS)
+    cell = (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
         tile = tile_as_of(connection, store.lattice.tile(index), version_of(connection).number)
         now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
@@ -230,7 +232,8 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
         return asked, judged, {stored.seq: vote for stored, vote in zip(readable, said, strict=True)}
 
     asked, judged, said = from_sound_ballots(connection, asked, look)
-    policy, counting = asked.policy, [one.vote for one in judged if one.vote is not None]
+    policy = asked.policy
+    counting = [one.vote for one in judged if one.vote is not None]
 
     def history() -> Sequence[TileVote]:
         return recent_votes(connection, tile, asked)
@@ -246,7 +249,8 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], know
     flat = now.cell[0] * TILE_CELLS + now.cell[1]
     past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
     said = {**now.said, **{seq: vote for seq, (_, vote) in past.items()}}
-    counted, left_out = defaultdict[int, list[int]](list), defaultdict[int, list[LeftOut]](list)
+    counted = defaultdict[int, list[int]](list)
+    left_out = defaultdict[int, list[LeftOut]](list)
     for record in records:
         for standing in _standings(record):
             if standing.ballot in said and said[standing.ballot].spoken()[now.cell]:
@@ -261,18 +265,21 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], know
     everyone += [(past[seq][0], ended.get(seq, "stands no more")) for seq in gone]
     found = []
     for stored, reason in everyone:
-        vote, seq = said.get(stored.seq), stored.seq
+        vote = said.get(stored.seq)
+        seq = stored.seq
         text: tuple[str, int | None, float | None] = UNREADABLE, None, None
         if vote is not None:
             text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
-        whose, end = (stored.vehicle, stored.drive, stored.version), utc(seen(stored.end_ns, known))
+        whose = (stored.vehicle, stored.drive, stored.version)
+        end = utc(seen(stored.end_ns, known))
         found.append(CellVote(*whose, *text, end, not reason, reason, tuple(counted[seq]), tuple(left_out[seq])))
     return found
 
 
 def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str]:
     """The reason why each of some ballots ended."""
-    b, e = schema.ballots.c, schema.events.c
+    b = schema.ballots.c
+    e = schema.events.c
     ends = sa.select(b.seq, e.kind).join(schema.events, e.seq == b.gone_seq).where(b.seq.in_(ballots))
     return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
 
@@ -282,7 +289,8 @@ def _why_not(standing: Standing, now: _Now) -> str:
     if not standing.why and not now.said[standing.ballot].spoken()[now.cell]:
         return "says nothing here"
     why: Why = standing.why_not(now.cell[0] * TILE_CELLS + now.cell[1])
-    fuse, memory = now.asked.settings, now.tile.memory
+    fuse = now.asked.settings
+    memory = now.tile.memory
     if why == "window":
         return f"older than {fuse.max_age_days:g} days or not among the last {fuse.latest_vehicles} vehicles"
     if why == "spent" and memory is not None:
@@ -324,7 +332,8 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     """Probability that the cell changed as the record states, without the changes in cells of other tiles. None if the
     record states no change or cannot be read any more."""
     try:
-        states, counted = record.states, record.tally[cell].astype(np.int64) // VOTE_UNIT
+        states = record.states
+        counted = record.tally[cell].astype(np.int64) // VOTE_UNIT
         odds = record.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
     except MapvoteError:
         return None
@@ -352,7 +361,9 @@ def _lacks(now: _Now, votes: Sequence[CellVote]) -> list[str]:
 
 def _thing(now: _Now) -> list[str]:
     """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
-    tile, cell, fuse = now.tile, now.cell, now.asked.settings
+    tile = now.tile
+    cell = now.cell
+    fuse = now.asked.settings
     text = _waits(now)
     if tile.obstacle_words[cell]:
         brought = tile.memory is not None and tile.memory.came_s[cell] > 0
@@ -370,7 +381,9 @@ def _thing(now: _Now) -> list[str]:
 
 def _waits(now: _Now) -> list[str]:
     """Decisions that do not change the map yet, or change it otherwise than voted, with the reason."""
-    found, cell, text = now.decided, now.cell, []
+    found = now.decided
+    cell = now.cell
+    text = []
     if found.passing is not None and found.passing[cell]:
         text.append("temporary: a new object here is not expected to stay, so the map does not take it")
     elif found.denied is not None and found.denied[cell]:
@@ -445,7 +458,8 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     newest: dict[str, TileVote] = {}
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
-        states, before = said_by(vote), newest.get(vote.vehicle, silent)
+        states = said_by(vote)
+        before = newest.get(vote.vehicle, silent)
         assert before.states is not None
         spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
         last[spoken] = vote.end_ns
@@ -479,7 +493,8 @@ def _probabilities(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
     votes = changes[kinds, rows, cols]
     states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
     against = said[:, rows, cols].sum(axis=0) - votes
-    out, claimed = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    out = np.zeros(said.shape[1:])
+    claimed = np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
     claimed[rows, cols] = states
     odds = agreed_odds(vehicles, claimed, quorum).at(rows * TILE_CELLS + cols)
     out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)

@@ -132,7 +132,10 @@ def within(features: Sequence[dict[str, Any]], box: Sequence[float], place: OnEa
     """The features that a box meets: (x0, y0, x1, y1) in a system. BadRequest if it is none."""
     if len(box) not in (4, 6) or not np.isfinite(box).all():
         raise BadRequest("bbox needs four numbers, or six with heights")
-    x0, y0, x1, y1 = box[0], box[1], box[len(box) // 2], box[len(box) // 2 + 1]
+    x0 = box[0]
+    y0 = box[1]
+    x1 = box[len(box) // 2]
+    y1 = box[len(box) // 2 + 1]
     if y0 > y1 or (x0 > x1 and crs != CRS84):
         raise BadRequest("bbox: the lower corner comes first")
     # The edges of a box are curves in the map: it is cut into short ones.

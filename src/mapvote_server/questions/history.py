@@ -133,7 +133,8 @@ class Log:
 
 def overview(store: Store) -> Info:
     """The figures of `mapvote info`."""
-    b, t = schema.ballots, schema.ballot_tiles
+    b = schema.ballots
+    t = schema.ballot_tiles
     standing = sa.select(sa.func.count(), sa.func.count(sa.distinct(b.c.vehicle))).where(b.c.gone_seq.is_(None))
     with store.database.reading() as connection:
         newest = version_of(connection)
@@ -252,7 +253,9 @@ class Feed:
     def __init__(
         self, store: Store, poll_s: float = EVENT_POLLS.poll_s, seconds: Callable[[], float] = time.monotonic
     ) -> None:
-        self._store, self._poll_s, self._seconds = store, poll_s, seconds
+        self._store = store
+        self._poll_s = poll_s
+        self._seconds = seconds
         self._lock = Lock()
         self._recent: deque[Event] = deque(maxlen=EVENT_POLLS.most)
         self._newest: int | None = None
@@ -263,11 +266,13 @@ class Feed:
         with self._lock:
             now = self._seconds()
             if self._newest is None:
-                self._newest, self._polled_s = newest_event(self._store), now
+                self._newest = newest_event(self._store)
+                self._polled_s = now
             elif now - self._polled_s >= self._poll_s:
                 found = events_after(self._store, self._newest)
                 self._recent.extend(found)
-                self._newest, self._polled_s = (found[-1].seq if found else self._newest), now
+                self._newest = found[-1].seq if found else self._newest
+                self._polled_s = now
             if seq >= self._newest:
                 return []
             if self._recent and self._recent[0].seq <= seq + 1:

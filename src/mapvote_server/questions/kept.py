@@ -51,7 +51,8 @@ class KeptTiles(Generic[Found]):
         self.lock = Lock()
         """To be held while a question is asked."""
         self.found: dict[TileIndex, Found] = {}
-        self._came, self._went = came, went
+        self._came = came
+        self._went = went
         self._unread: set[TileIndex] = set()
         self._moment: _Moment | None = None
 
@@ -60,7 +61,8 @@ class KeptTiles(Generic[Found]):
     ) -> None:
         """Look at every tile that an event touched since the last time; at all of them at first, under another policy,
         and once ballots were cleared away."""
-        last, newest = self._moment, version_of(connection).number
+        last = self._moment
+        newest = version_of(connection).number
         rules = asked.policy.fuse, asked.policy.round
         moment = _Moment(newest_seq(connection), newest, rules, next_ripe_ns(connection, asked))
         ripe = last is not None and last.until_ns is not None and now_ns >= last.until_ns

@@ -159,12 +159,15 @@ def standings_of(
     cells = {name: sum(entry.cells for entry in by_vehicle[name]) for name in names}
     spread = {name: over_borders([entry.border for entry in by_vehicle[name]]) for name in names}
     objects = {name: len(spread[name]) + sum(entry.inside for entry in by_vehicle[name]) for name in names}
-    all_cells, all_objects = sum(cells.values()), sum(objects.values())
+    all_cells = sum(cells.values())
+    all_objects = sum(objects.values())
     threshold = significance / max(1, sum(n > 0 for n in cells.values()))
     out = []
     for name in names:
-        mine, found = cells[name], objects[name]
-        others, others_found = all_cells - mine, all_objects - found
+        mine = cells[name]
+        found = objects[name]
+        others = all_cells - mine
+        others_found = all_objects - found
         p_value = _tail(found, others_found, tolerated * mine, others)
         verdict: Stance = "undecidable"
         if mine and p_value < threshold:
@@ -225,7 +228,8 @@ class CoveredTile:
 def tiles_seen(store: Store, known: bool) -> list[CoveredTile]:
     """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
     ``known``, see :func:`mapvote_server.questions.explain.seen`."""
-    b, t = schema.ballots, schema.ballot_tiles
+    b = schema.ballots
+    t = schema.ballot_tiles
     last = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
     last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
     with store.database.reading() as connection:
@@ -246,7 +250,8 @@ MOST_PATHS = 500
 def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
     """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
     ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
-    b, p = schema.ballots.c, schema.paths.c
+    b = schema.ballots.c
+    p = schema.paths.c
     query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
     query = query.join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
     if vehicle is not None:
@@ -294,6 +299,7 @@ def _line(store: Store, path: I64, ground: Callable[[TileIndex], F32]) -> list[l
     known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
     first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
     height = np.where(known >= 0, z[known], first)
-    x, y = store.lattice.x0 + (cols + 0.5) * CELL_SIZE, store.lattice.y0 + (rows + 0.5) * CELL_SIZE
+    x = store.lattice.x0 + (cols + 0.5) * CELL_SIZE
+    y = store.lattice.y0 + (rows + 0.5) * CELL_SIZE
     line: list[list[float]] = np.round(np.column_stack([x, y, height]), 2).tolist()
     return line

@@ -97,7 +97,8 @@ class RoundNow:
     def catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
         """Read what has changed of the map and the policy."""
         if policy != self._policy:
-            self._policy, self._asked = policy, policy_in(connection).round
+            self._policy = policy
+            self._asked = policy_in(connection).round
             self._cast_by = self._asked.cast_by
         if newest != self.newest:
             touched = tiles_set_between(connection, self.newest, newest) if self.newest else None
@@ -108,7 +109,8 @@ class RoundNow:
 
     def refusal(self, one: Incoming | Examination, now_ns: int) -> MapvoteError | None:
         """The reason why an envelope does not fit the round, the clock or the map; None if it does."""
-        ballot, asked = one.ballot, self._asked
+        ballot = one.ballot
+        asked = self._asked
         mend = "Vote again with the fleet's configuration (mapvote config)"
         if self._cast_by != one.cast_by:
             accepted = f"the current round accepts only {self._cast_by}"
@@ -153,7 +155,8 @@ class Intake:
     """Admits ballots to a store, one batch at a time. ``quota``: what one vehicle may leave there; None: no limit."""
 
     def __init__(self, store: Store, quota: Quota | None = None) -> None:
-        self._store, self._quota = store, quota
+        self._store = store
+        self._quota = quota
         self._used: dict[str, _Used] = {}
         self._round = RoundNow(store)
         """State of the thread that writes."""
@@ -235,7 +238,8 @@ class Intake:
 
     def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
-        ballot, tiles = one.ballot, self._round.tiles
+        ballot = one.ballot
+        tiles = self._round.tiles
         refused = self._round.refusal(one, now) or refuse_out_of_reach(one.votes, tiles.keys())
         refused = refused or self._out_of_height(connection, one.votes)
         if refused is not None:
@@ -314,7 +318,8 @@ class Intake:
             used = self._used[vehicle] = _count(connection, vehicle, now)
         refused = self._over_quota(one, used)
         if refused is None:
-            used.ballots, used.size = used.ballots + 1, used.size + one.size
+            used.ballots = used.ballots + 1
+            used.size = used.size + one.size
         return refused
 
 
@@ -374,7 +379,8 @@ _SAME_TIME = Question(
 
 def elsewhere(connection: sa.Connection, one: Incoming, beside: Sequence[Incoming]) -> list[str]:
     """Drives of the same vehicle at another place at the same time: in the store, or ``beside`` it in its batch."""
-    ballot, window_ns = one.ballot, round(TWO_PLACES.window_s * 1e9)
+    ballot = one.ballot
+    window_ns = round(TWO_PLACES.window_s * 1e9)
     span = {"after_ns": ballot.start_ns - window_ns, "before_ns": ballot.end_ns + window_ns}
     rows = _SAME_TIME.ask(connection, vehicle=ballot.vehicle, drive=ballot.drive, **span).all()
     others = [(row.drive, row.start_ns, row.end_ns, _tiles_of_ballot(connection, row.seq)) for row in rows]

@@ -262,7 +262,8 @@ class Remembered:
     leave it first. Thread-safe; it ends with the process."""
 
     def __init__(self, most_bytes: int) -> None:
-        self.most_bytes, self.bytes = most_bytes, 0
+        self.most_bytes = most_bytes
+        self.bytes = 0
         self._planes: OrderedDict[str, Planes] = OrderedDict()
         self._lock = Lock()
 

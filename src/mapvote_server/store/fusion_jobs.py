@@ -208,7 +208,8 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open
         return recent_votes(connection, tile, task.asked, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
-    rule, settings = rule_named(cast.method), task.asked.settings
+    rule = rule_named(cast.method)
+    settings = task.asked.settings
     barred = [cells for _, cells in polled.bars[tile.index]]
     reviewed = np.logical_or.reduce(barred) if barred else None
     falling = Falling(reviewed, task.fallen)
@@ -263,11 +264,13 @@ def standings_of(
     seqs = {(voter_of(one.stored, settings), one.stored.digest): one.stored.seq for one in judged}
     found = []
     for one in judged:
-        why, alike = one.why, 0
+        why = one.why
+        alike = 0
         voter = voter_of(one.stored, settings)
         copy = copied.get((voter, one.stored.digest))
         if copy is not None:
-            why, alike = "copy", seqs[copy.heard_vehicle, copy.heard_digest]
+            why = "copy"
+            alike = seqs[copy.heard_vehicle, copy.heard_digest]
         elif not why and voter not in heard:
             why = "opposes"
         found.append(Standing(one.stored.seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike))
@@ -382,15 +385,18 @@ def _remains_after(before: Tile, fused: Fused, record: Record) -> Remains:
 
 def _solid() -> Remains:
     """The remains of a tile that cannot be read: what reaches into it stays."""
-    every, none = np.full((TILE_CELLS, TILE_CELLS), EVERY_BIT), np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
+    every = np.full((TILE_CELLS, TILE_CELLS), EVERY_BIT)
+    none = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
     return Remains(every, every, none, np.zeros(every.shape, dtype=np.int32))
 
 
 def edited_tile(fused: Fused, before: Tile) -> Tile:
     """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
-    hashes, planes = fused.hashes, fused.planes
+    hashes = fused.hashes
+    planes = fused.planes
     assert hashes is not None
-    ground, free = before.ground_z, before.free
+    ground = before.ground_z
+    free = before.free
     if hashes.ground in planes:
         ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
     if hashes.free is not None and hashes.free in planes:

@@ -45,7 +45,9 @@ def restore_plane(store: Store, digest: str, raw: bytes, *, by: str) -> bool:
     """
     if hashlib.sha256(raw).hexdigest() != digest:
         raise MapvoteError(f"plane {digest[:12]}: the bytes sent are not what this hash says")
-    b, q, t = schema.blobs, schema.quarantine, schema.version_tiles
+    b = schema.blobs
+    q = schema.quarantine
+    t = schema.version_tiles
     with store.database.writing() as connection:
         shows = sa.or_(*(t.c[name] == digest for name in schema.TILE_PLANES))
         if connection.execute(sa.select(t.c.version).where(shows).limit(1)).first() is None:
@@ -85,7 +87,8 @@ def _wrong(digest: str, data: bytes) -> str:
 
 def _chain(connection: sa.Connection) -> Iterator[Damage]:
     """Versions follow each other, and every plane is there that a kept version or a replay needs."""
-    v, t = schema.versions, schema.version_tiles
+    v = schema.versions
+    t = schema.version_tiles
     last = None
     for number, parent in connection.execute(sa.select(v.c.number, v.c.parent).order_by(v.c.number)):
         if parent != last or (last is not None and number != last + 1):
@@ -116,7 +119,10 @@ def _rows(connection: sa.Connection) -> Iterator[Damage]:
 
 def _ends(connection: sa.Connection) -> Iterator[Damage]:
     """Every row that was replaced, withdrawn or deleted names an existing event that is later than the row itself."""
-    b, r, v, e = schema.ballots.c, schema.reviews.c, schema.versions.c, schema.events.c
+    b = schema.ballots.c
+    r = schema.reviews.c
+    v = schema.versions.c
+    e = schema.events.c
     for kind, name, came, ended in (
         ("ballot", b.seq, b.seq, b.gone_seq), ("review", r.seq, r.seq, r.gone_seq),
         ("version", v.number, v.mark, v.cleared_seq),
@@ -185,7 +191,8 @@ def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, b
 
 def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex]:
     """Tiles that may be fused otherwise since an event: a ballot there was set aside, or one of their planes mended."""
-    t, v = schema.ballot_tiles.c, schema.version_tiles
+    t = schema.ballot_tiles.c
+    v = schema.version_tiles
     aside = _SET_ASIDE.ask(connection, since=since).scalars()
     ballots = {int(name.split()[0]) for name in aside}
     planes = {detail.removeprefix("plane ") for detail in _MENDED.ask(connection, since=since).scalars()}

@@ -82,7 +82,8 @@ def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float
         valid = [key for key in _keys_of(connection, name) if key.valid_at(now)]
         if not valid:
             raise NotFound(f"{name!r} has no valid key to take the place of; issue one")
-        last, end = valid[-1], now + round(overlap_days * DAY_NS)
+        last = valid[-1]
+        end = now + round(overlap_days * DAY_NS)
         later = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > end))
         connection.execute(k.update().where(later).values(expires_ns=end))
         days = None if last.expires_ns is None else (last.expires_ns - last.created_ns) / DAY_NS
@@ -95,7 +96,8 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
     Revoking a key also withdraws its holder's unpublished ballots, unless ``keep_votes``. Published votes stay
     (:func:`mapvote_server.store.rollback.replay` removes them too).
     """
-    k, now = schema.keys, store.clock()
+    k = schema.keys
+    now = store.clock()
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
     with store.database.writing() as connection:
         done = connection.execute(k.update().where(valid).values(revoked_ns=now))

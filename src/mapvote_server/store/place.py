@@ -129,7 +129,8 @@ TWO_PLACES = TwoPlaces()
 
 def apart_m(one: Sequence[TileIndex], other: Sequence[TileIndex]) -> float:
     """The least distance between two groups of tiles, metres."""
-    first, second = np.array(one, dtype=np.int64), np.array(other, dtype=np.int64)
+    first = np.array(one, dtype=np.int64)
+    second = np.array(other, dtype=np.int64)
     gaps = np.maximum(np.abs(first[:, None] - second[None]) - 1, 0) * _TILE_M
     return float(np.hypot(gaps[..., 0], gaps[..., 1]).min())
 

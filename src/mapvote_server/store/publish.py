@@ -120,7 +120,8 @@ def publish(
     if outcome.held and not override:
         raise Held(list(outcome.held))
     why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
-    newest, made_by = found.newest.number, policy.model_dump(mode="json")
+    newest = found.newest.number
+    made_by = policy.model_dump(mode="json")
     version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
     tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
     write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused, doubts=outcome.doubts)
@@ -139,11 +140,14 @@ def _outcome(
 ) -> tuple[Round, Outcome]:
     """The round, and what a publish of it would be."""
     found = round_at(store, now, settings, executor)
-    newest, changed = found.newest.number, found.changed
+    newest = found.newest.number
+    changed = found.changed
     if parent is not None and parent != newest:
         raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
-    held, fused = reasons_to_hold(store, found, gate), list(found.decided.values())
-    added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
+    held = reasons_to_hold(store, found, gate)
+    fused = list(found.decided.values())
+    added = sum(f.added for f in changed)
+    deleted = sum(f.deleted for f in changed)
     doubts = doubts_of(store, found).told(found.asked.settings)
     return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused, doubts)
 
@@ -300,7 +304,8 @@ def _decide(
         missing = [index for index in wanted if index not in found]
         hashes = tiles_of(connection, newest.number, missing)
         until = next_ripe_ns(connection, asked)
-    made, url = newest.number + 1, address_of(store.database.url)
+    made = newest.number + 1
+    url = address_of(store.database.url)
     tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
     alone = found | {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
 
@@ -357,7 +362,8 @@ def _still_true(
 
 def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
     """The reasons of the policy, and of its gate, against the version that a round would make."""
-    changed, asked = found.changed, found.asked.policy.gate
+    changed = found.changed
+    asked = found.asked.policy.gate
     held = hold_reasons(changed, found.asked.settings)
     held += doubts_of(store, found).holding(found.asked.settings)
     if gate is None or not asked.drive or not changed:
@@ -409,7 +415,8 @@ def areas_m2(rows: I64, cols: I64) -> np.ndarray:
         return np.empty(0)
     keys = (rows << 32) + cols
     order = np.argsort(keys)
-    ordered, pairs = keys[order], []
+    ordered = keys[order]
+    pairs = []
     for step in (1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1):
         near = np.searchsorted(ordered, keys + step)
         near[near == len(keys)] = 0

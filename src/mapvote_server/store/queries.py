@@ -66,7 +66,8 @@ def shows_in_target(oldest: int) -> sa.ColumnElement[bool]:
 def _shown_by(number: sa.ColumnElement[int], *beside: sa.FromClause) -> sa.ColumnElement[bool]:
     """For a row of version_tiles: whether it is the last one of its tile up to version ``number``, a column of
     ``beside``."""
-    t, later = schema.version_tiles, schema.version_tiles.alias()
+    t = schema.version_tiles
+    later = schema.version_tiles.alias()
     same = (later.c.row == t.c.row) & (later.c.col == t.c.col) & (later.c.version > t.c.version)
     return (t.c.version <= number) & ~sa.exists().where(same, later.c.version <= number).correlate(t, *beside)
 
@@ -100,7 +101,8 @@ def _hashes(row: Any) -> TileHashes:
 
 def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) -> dict[TileIndex, int]:
     """Number of points of each tile, read from the head of its plane: no plane is unpacked."""
-    b, found = schema.blobs.c, dict[str, int]()
+    b = schema.blobs.c
+    found = dict[str, int]()
     digests = sorted({hashes.points for hashes in tiles.values()})
     for start in range(0, len(digests), DATABASE_SIZES.variables):
         some = b.hash.in_(digests[start : start + DATABASE_SIZES.variables])
@@ -132,7 +134,8 @@ def tiles_that_differ(
     for number in (old, new):
         version_of(connection, number)
     touched = tiles_set_between(connection, min(old, new), max(old, new))
-    before, after = tiles_of(connection, old, touched), tiles_of(connection, new, touched)
+    before = tiles_of(connection, old, touched)
+    after = tiles_of(connection, new, touched)
     pairs = [(index, before.get(index), after.get(index)) for index in sorted(before.keys() | after.keys())]
     return [(index, was, is_) for index, was, is_ in pairs if was is None or is_ is None or was.points != is_.points]
 

@@ -49,11 +49,16 @@ class Cleared:
 def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleared:
     """Delete what the policy does not keep, in one transaction; with ``dry_run`` only count it."""
     with store.database.reading() if dry_run else store.database.writing() as connection:
-        v, d, b, t = schema.versions, schema.decisions, schema.ballots, schema.ballot_tiles
-        keep, oldest = policy_in(connection).keep.versions, oldest_kept(connection)
+        v = schema.versions
+        d = schema.decisions
+        b = schema.ballots
+        t = schema.ballot_tiles
+        keep = policy_in(connection).keep.versions
+        oldest = oldest_kept(connection)
         if keep:  # the first of the last so many versions; one that was not cleared yet if none may go
             oldest = max(oldest, current_number(connection) - keep + 1)
-        old_planes, old_ballots = _planes(connection, oldest), _ballots(connection, oldest)
+        old_planes = _planes(connection, oldest)
+        old_ballots = _ballots(connection, oldest)
         length = (sa.func.length(d.c.states) + sa.func.length(d.c.tally)).label("size")
         decided = sa.select(d.c.version, d.c.row, d.c.col, length).where(d.c.version < oldest)
         old_decisions = list(connection.execute(decided).all())
@@ -90,7 +95,9 @@ _CLEARED = Question(
 
 def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
     """Planes that no version from ``oldest`` on shows, and no version to which one of these went back."""
-    t, b, planes = schema.version_tiles, schema.blobs, schema.TILE_PLANES
+    t = schema.version_tiles
+    b = schema.blobs
+    planes = schema.TILE_PLANES
     shown = shows_in_kept(oldest) | shows_in_target(oldest)
     needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shown) for name in planes))
     unused = sa.select(b.c.hash, sa.func.length(b.c.data).label("size")).where(b.c.hash.not_in(needed))
@@ -101,7 +108,9 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     """Votes on a tile that no version after ``oldest`` has counted or can count: withdrawn or replaced before it, or
     older than every window of the policies since, counted from the newest vote on the tile that stood then and still
     does."""
-    t, b, then = schema.ballot_tiles, schema.ballots, version_of(connection, oldest)
+    t = schema.ballot_tiles
+    b = schema.ballots
+    then = version_of(connection, oldest)
     newest = (
         sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns).label("end_ns"))
         .join(b, b.c.seq == t.c.ballot)

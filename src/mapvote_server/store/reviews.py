@@ -94,7 +94,9 @@ def _take_back(connection: sa.Connection, reviews: list[int], seq: int) -> None:
 
 
 def _standing(connection: sa.Connection) -> list[tuple[Review, dict[TileIndex, Bool]]]:
-    r, e, c = schema.reviews, schema.events, schema.review_cells
+    r = schema.reviews
+    e = schema.events
+    c = schema.review_cells
     cells: dict[int, dict[TileIndex, Bool]] = {}
     about = sa.select(c).join(r, r.c.seq == c.c.review).where(r.c.gone_seq.is_(None))
     for row in connection.execute(about):

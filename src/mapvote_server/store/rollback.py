@@ -54,12 +54,15 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
         if to == newest.number:
             raise Conflict(f"version {to} is the newest: there is nothing to roll back")
         number = newest.number + 1
-        now, then = tiles_of(connection, newest.number), tiles_of(connection, to)
-        tiles, planes = {}, []
+        now = tiles_of(connection, newest.number)
+        then = tiles_of(connection, to)
+        tiles = {}
+        planes = []
         for index in sorted(now.keys() | then.keys()):
             if now.get(index) != then.get(index):
                 window = store.lattice.tile(index)
-                old, new = tile_as_of(connection, window, newest.number), load_tile(connection, window, then.get(index))
+                old = tile_as_of(connection, window, newest.number)
+                new = load_tile(connection, window, then.get(index))
                 digest, plane = pack_memory(turned_back(number, old, new))
                 tiles[index] = structs.replace(then.get(index) or TileHashes.none(), memory=digest)
                 planes.append(plane)
@@ -70,7 +73,8 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
 
 def turned_back(version: int, now: Tile, then: Tile) -> Memory:
     """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
-    differ, none = np.flatnonzero(differing(now, then)), Memory.none()
+    differ = np.flatnonzero(differing(now, then))
+    none = Memory.none()
     return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
 
 
@@ -108,7 +112,8 @@ def replay(
     NotFound if it never voted, Conflict if another version is published meanwhile.
     """
     history = store.versions()
-    newest, number = history[-1], history[-1].number + 1
+    newest = history[-1]
+    number = history[-1].number + 1
     out = {v.policy["unvoted"]: v.number for v in history if v.kind == "replay"} | {vehicle: number}
     with store.database.reading() as connection:
         b = schema.ballots
@@ -179,7 +184,8 @@ def _fused(store: Store, version: Version, before: _State, history: _History, ex
 
     def task_of(index: TileIndex) -> Task:
         with store.database.reading() as connection:
-            tile, misread = _content(store, connection, before, index).tile, history.misread.get(index, {})
+            tile = _content(store, connection, before, index).tile
+            misread = history.misread.get(index, {})
         return Task(url, tile.window, version.number, tile, asked, misread)
 
     alone = {fused.index: fused for fused in fuse_round(list(map(task_of, standing)), store.database, executor)}
@@ -191,7 +197,8 @@ def _fused(store: Store, version: Version, before: _State, history: _History, ex
 def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, _Content, _Content]]:
     """Tiles in which two states may differ, with both of their contents."""
     with store.database.reading() as connection:
-        old, new = tiles_of(connection, a.root), tiles_of(connection, b.root)
+        old = tiles_of(connection, a.root)
+        new = tiles_of(connection, b.root)
         candidates = {i for i in old.keys() | new.keys() if old.get(i) != new.get(i)} | set(a.edited) | set(b.edited)
         for index in sorted(candidates):
             yield index, _content(store, connection, a, index), _content(store, connection, b, index)

@@ -148,7 +148,8 @@ class Store:
 
     def policy_changes(self) -> list[PolicyChange]:
         """Every change of the policy, oldest first."""
-        p, e = schema.policies, schema.events
+        p = schema.policies
+        e = schema.events
         rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
         with self.database.reading() as connection:
             found = connection.execute(rows.order_by(p.c.seq)).all()
@@ -189,7 +190,8 @@ class Store:
             if since is not None:
                 version_of(connection, since, cleared=True)
             if since is None:
-                tiles, removed = tiles_of(connection, number), list[TileIndex]()
+                tiles = tiles_of(connection, number)
+                removed = list[TileIndex]()
                 self._digests[number] = _digests_of(tiles)
             else:
                 tiles, removed = self._changed(connection, since, number)
@@ -216,7 +218,8 @@ class Store:
     ) -> tuple[dict[TileIndex, TileHashes], list[TileIndex]]:
         """(tiles of ``number`` that are otherwise than in ``since``, tiles that only ``since`` has)."""
         touched = tiles_set_between(connection, min(since, number), max(since, number))
-        then, now = tiles_of(connection, since, touched), tiles_of(connection, number, touched)
+        then = tiles_of(connection, since, touched)
+        now = tiles_of(connection, number, touched)
         changed = {index: hashes for index, hashes in now.items() if then.get(index) != hashes}
         return changed, sorted(then.keys() - now.keys())
 

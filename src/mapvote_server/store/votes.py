@@ -134,7 +134,8 @@ class Polled:
 def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
     """All that :func:`judged_on` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
     then."""
-    standing, bars = _standing_on(connection, row, cols, asked.mark), defaultdict[TileIndex, list[Any]](list)
+    standing = _standing_on(connection, row, cols, asked.mark)
+    bars = defaultdict[TileIndex, list[Any]](list)
     reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
     for col, seq, verdict, cells in reviewed:
         bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
@@ -335,7 +336,8 @@ class StoredVote:
 def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
     """The stored votes on tiles of a ``row``, each with its column."""
     found: dict[tuple[int, int, int], Any] = {}
-    cols, ballots = sorted({col for col, _ in votes}), sorted({vote.seq for _, vote in votes})
+    cols = sorted({col for col, _ in votes})
+    ballots = sorted({vote.seq for _, vote in votes})
     for start in range(0, len(ballots), DATABASE_SIZES.variables):
         asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + DATABASE_SIZES.variables]}
         rows = connection.execute(_PLANES_OF, asked_of).all()

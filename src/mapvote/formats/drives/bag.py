@@ -127,7 +127,8 @@ def static_frames(bag: Bag) -> Edges:
         for _, message in bag.messages(topic):
             for t in message.transforms:
                 T = matrix_in(bag, topic, t.transform.translation, t.transform.rotation)
-                parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
+                parent = t.header.frame_id.strip("/")
+                child = t.child_frame_id.strip("/")
                 edges.setdefault(parent, []).append((child, T))
                 edges.setdefault(child, []).append((parent, geometry.inverse(T)))
     return edges

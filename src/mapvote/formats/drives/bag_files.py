@@ -127,7 +127,8 @@ def _wrong_in_metadata(about: Path) -> str:
     such a file is left to the reader."""
     try:
         table = read_yaml(about)["rosbag2_bagfile_information"]
-        storage, listed = table["storage_identifier"], table["relative_file_paths"]
+        storage = table["storage_identifier"]
+        listed = table["relative_file_paths"]
         names = [plain_name(PurePath(name).name, about) for name in listed]  # of which the reader takes no more either
         missing = [name for name in names if not (about.parent / name).is_file()]
         table["topics_with_message_count"], table["version"]
@@ -206,7 +207,9 @@ class _Completed(io.RawIOBase):
     """The first ``end`` bytes of a file, and ``tail`` after them."""
 
     def __init__(self, stream: BinaryIO, end: int, tail: bytes) -> None:
-        self._stream, self._end, self._tail = stream, end, tail
+        self._stream = stream
+        self._end = end
+        self._tail = tail
         self._at = 0
 
     def readable(self) -> bool:
@@ -239,7 +242,9 @@ class _Completed(io.RawIOBase):
 def _whole_records(file: Path) -> StorageFile:
     """A cut-off MCAP file up to its last whole record, with an index of its chunks, an empty count of its messages and
     a footer behind it. MapvoteError if no record of it is whole."""
-    index, chunk, offsets = b"", b"", b""
+    index = b""
+    chunk = b""
+    offsets = b""
     chunk_start = chunk_end = 0
     with file.open("rb") as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
@@ -253,12 +258,14 @@ def _whole_records(file: Path) -> StorageFile:
             # Another record, even one that is cut off: they are complete.
             elif opcode != Opcode.MESSAGE_INDEX:
                 index += _chunk_index(chunk, offsets, start - chunk_end)
-                chunk, offsets = b"", b""
+                chunk = b""
+                offsets = b""
             if stop > size:
                 break
             if opcode == Opcode.CHUNK:
                 chunk = _chunk_head(stream, start, stop)
-                chunk_start, chunk_end = start, stop
+                chunk_start = start
+                chunk_end = stop
             end = stop
     if end == len(_MAGIC):
         raise MapvoteError(f"{file}: cut off before its first whole record; nothing of it can be read")

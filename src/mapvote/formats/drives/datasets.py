@@ -310,7 +310,10 @@ def _oxford_rows(file: Path) -> NDArray[np.void]:
         raise MapvoteError(f"{file}: {len(data)} bytes are no four rows of float32: the scan is cut off; copy it again")
     rows = np.frombuffer(data, dtype="<f4").reshape(4, -1)
     table = np.empty(rows.shape[1], dtype=[(n, "<f4") for n in ("x", "y", "z", "intensity")])
-    table["x"], table["y"], table["z"], table["intensity"] = rows[0], -rows[1], -rows[2], rows[3]
+    table["x"] = rows[0]
+    table["y"] = -rows[1]
+    table["z"] = -rows[2]
+    table["intensity"] = rows[3]
     return table
 
 
@@ -329,7 +332,8 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
     name = options.topic or there[0]
     if name not in there:
         raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
-    mount, T_base_lidar = entry(path, f"extrinsics/{name}.txt"), None
+    mount = entry(path, f"extrinsics/{name}.txt")
+    T_base_lidar = None
     if mount.is_file():
         T_base_lidar = _OXFORD_AXES @ motions_of_rpy(read_numbers(mount, 6))[0] @ _OXFORD_AXES
     elif options.mount is None and options.T_base_lidar is None:

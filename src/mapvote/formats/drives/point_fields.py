@@ -221,7 +221,8 @@ class PointReader:
 def _attributes(where: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:
     """The attributes of the kept points that the table (n,) has. MapvoteError if one holds what it cannot be."""
     names = table.dtype.names or ()
-    known, spelled = known_fields(names), {plain(name): name for name in reversed(names)}
+    known = known_fields(names)
+    spelled = {plain(name): name for name in reversed(names)}
     attributes = {}
     for name, row in point_fields().items():
         column = next((spelled[other] for other in (plain(name), *row.spellings) if other in spelled), None)
@@ -248,9 +249,13 @@ def _sort_out(
 ) -> tuple[int, int, int]:
     """(how many of the points (n, 3) are usable, how many were measured, how many of these are no measurements). The
     indices of the usable ones come into ``kept`` (n,), they themselves into ``copied`` (n, 3)."""
-    n, measured, bad = 0, 0, 0
+    n = 0
+    measured = 0
+    bad = 0
     for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        x = np.float64(points[i, 0])
+        y = np.float64(points[i, 1])
+        z = np.float64(points[i, 2])
         squared = x * x + y * y + z * z
         if zero_is_no_return and (squared == 0.0 or not np.isfinite(squared)):
             continue
@@ -259,7 +264,9 @@ def _sort_out(
             bad += 1
         elif squared >= near_m * abs(near_m):
             kept[n] = i
-            copied[n, 0], copied[n, 1], copied[n, 2] = x, y, z
+            copied[n, 0] = x
+            copied[n, 1] = y
+            copied[n, 2] = z
             n += 1
     return n, measured, bad
 
@@ -302,7 +309,8 @@ def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F
     for start in range(0, len(points), _AZIMUTHS_AT_ONCE):
         n = min(_AZIMUTHS_AT_ONCE, len(points) - start)
         for i in range(n):
-            x[i], y[i] = points[start + i, 0], points[start + i, 1]
+            x[i] = points[start + i, 0]
+            y[i] = points[start + i, 1]
         for i in range(n):
             out[start + i] = azimuth(y[i], x[i]) / turn_per_s
 

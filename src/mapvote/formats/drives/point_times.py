@@ -322,7 +322,8 @@ def _counts(steps: F64, kind: np.dtype[Any]) -> bool:
 def _unit_of(spread: float, turn: float | None, rate_hz: float) -> str | None:
     """The unit in which a revolution takes what a LiDAR's takes, or in which a scan lasts nearest to a revolution."""
     if turn is not None:
-        shortest, longest = JUDGEMENT.shortest_turn_s, JUDGEMENT.longest_turn_s
+        shortest = JUDGEMENT.shortest_turn_s
+        longest = JUDGEMENT.longest_turn_s
         return next((u for u, ns in UNITS_NS.items() if shortest <= turn * ns * 1e-9 <= longest), None)
     return min(UNITS_NS, key=lambda u: abs(float(np.log(spread * UNITS_NS[u] * 1e-9 * rate_hz))))
 

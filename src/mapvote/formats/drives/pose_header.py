@@ -143,7 +143,8 @@ def _role(name: str) -> tuple[str, str]:
     if (not unit and last[0] and last[2] in _UNITS_OF_POSES and last[2] not in ("s", "m")) or re.fullmatch(
         r".+_[ms]", word
     ):
-        word, unit = last[0], last[2]
+        word = last[0]
+        unit = last[2]
     if _NOT_A_POSE.search(word):
         return "", ""
     return next((role for role, pattern in _ROLES if re.fullmatch(pattern, word)), ""), unit

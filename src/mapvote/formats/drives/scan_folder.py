@@ -111,7 +111,8 @@ class ScanFolder:
 
 def _tell_unread(files: Sequence[Path]) -> None:
     """A message on scans of another format beside the ``files`` that are read."""
-    room, taken = files[0].parent, files[0].suffix.lower()
+    room = files[0].parent
+    taken = files[0].suffix.lower()
     for suffix in (".pcd", *_SUFFIXES):
         others = [] if suffix == taken else files_like(room, f"*{suffix}")
         others = [file for file in others if file not in files]
@@ -158,7 +159,8 @@ class BinLayout:
 
     def read(self, file: Path) -> NDArray[np.void]:
         """A .bin file as it stands, (n,); MapvoteError if it is cut off or missing."""
-        data, record = read_bytes(file), np.dtype([(name, self.dtype) for name in self.columns])
+        data = read_bytes(file)
+        record = np.dtype([(name, self.dtype) for name in self.columns])
         size = record.itemsize
         if len(data) % size:
             columns = ", ".join(self.columns)
@@ -217,7 +219,8 @@ def _said(columns: str, dtype: str) -> BinLayout:
 def open_kitti(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; KITTI odometry's sequences as they come, their camera poses converted with calib.txt."""
     files = scan_files(path / "velodyne", ".bin")
-    read, stamps_ns = layout_of(files, options).read, read_stamps(path, files, options)
+    read = layout_of(files, options).read
+    stamps_ns = read_stamps(path, files, options)
     return open_scan_folder(path, options, ScanFolder(files, stamps_ns, read, zero_is_no_return=False))
 
 

@@ -236,7 +236,8 @@ def _nearest(levels: F64, values: F64) -> F64:
     """The level (descending) nearest to each value."""
     up = levels[::-1]
     after = np.clip(np.searchsorted(up, values), 1, max(len(up) - 1, 1))
-    below, above = up[after - 1], up[np.minimum(after, len(up) - 1)]
+    below = up[after - 1]
+    above = up[np.minimum(after, len(up) - 1)]
     return np.where(np.abs(values - below) <= np.abs(values - above), below, above)
 
 

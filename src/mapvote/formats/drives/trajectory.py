@@ -252,7 +252,8 @@ def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
                 "qx, qy, qz, qw (or roll, pitch, yaw), or latitude, longitude"
             )
         rows = read_numbers(file, 8)
-        T, times_ns = _motions_of_quaternions(file, _in_tum_order(file, rows[:, 1:])), _ns(file, rows[:, 0])
+        T = _motions_of_quaternions(file, _in_tum_order(file, rows[:, 1:]))
+        times_ns = _ns(file, rows[:, 0])
         check_equal_times(file, times_ns, T)
         return sorted_trajectory(times_ns, T, of_vehicle=False, frame=MapFrame())
     times_ns, columns = read_columns(file)

@@ -106,7 +106,8 @@ class MapFrame:
         parts = []
         for east, north in ((step_deg, 0.0), (0.0, step_deg)):
             wide = east / np.cos(np.radians(lonlat[:, 1]))
-            ahead, behind = lonlat.astype(np.float64).copy(), lonlat.astype(np.float64).copy()
+            ahead = lonlat.astype(np.float64).copy()
+            behind = lonlat.astype(np.float64).copy()
             ahead[:, 0] += wide
             behind[:, 0] -= wide
             ahead[:, 1] += north
@@ -301,7 +302,8 @@ def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
         raise MapvoteError(f"{where}: unknown projector_type {kind!r}; one of {', '.join(TYPES)}")
     try:
         origin = about["map_origin"]
-        latitude, longitude = float(origin["latitude"]), float(origin["longitude"])
+        latitude = float(origin["latitude"])
+        longitude = float(origin["longitude"])
         altitude = float(origin.get("altitude") or 0.0)
         scale = float(about.get("scale_factor", 0.9996))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -349,7 +351,8 @@ def autoware_frame(frame: MapFrame, points: NDArray[np.floating], wanted: str | 
         return read_projector(str(wanted))
     if frame.is_local or (frame.projector and wanted is None):
         return frame
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    low = points.min(axis=0).astype(np.float64)
+    high = points.max(axis=0).astype(np.float64)
     corners = frame.to_lonlat(np.array([low, high, (low + high) / 2.0]))
     library = require("mgrs", "geo", "map_projector_info.yaml").MGRS()
     squares = {str(library.toMGRS(float(lat), float(lon), MGRSPrecision=0)) for lon, lat, _ in corners}

@@ -24,7 +24,8 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
     Coordinates are those of the frame's coordinate system (its offset added back). A local map is written in metres
     under the name "local map metres"; a map in an ENU plane, which no GIS supports, is a MapvoteError.
     """
-    shapely, pyogrio = require("shapely", "geo", str(path)), require("pyogrio.raw", "geo", str(path))
+    shapely = require("shapely", "geo", str(path))
+    pyogrio = require("pyogrio.raw", "geo", str(path))
     if frame.crs.startswith(ENU):
         raise MapvoteError(f"{path}: no GIS supports this map's plane ({frame.told()}); write .geojson instead")
     offset = np.array(frame.offset_m[:2])

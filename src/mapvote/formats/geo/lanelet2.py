@@ -127,13 +127,15 @@ _BOUND_TYPES = ("line_thin", "line_thick", "virtual", "")
 
 def _all_parts(root: ElementTree.Element, lines: Mapping[str, F64], bounds: set[str]) -> Iterator[MapPart]:
     for relation in _there(root, "relation"):
-        tags, name = _tags(relation), str(relation.get("id"))
+        tags = _tags(relation)
+        name = str(relation.get("id"))
         if tags.get("type") == "lanelet":
             yield MapPart("lanelet", tags.get("subtype", ""), name, _lanelet(relation, lines), relation)
         elif tags.get("type") == "multipolygon":
             yield MapPart("area", tags.get("subtype", ""), name, _area(relation, lines), relation)
     for way in _there(root, "way"):
-        tags, name = _tags(way), str(way.get("id"))
+        tags = _tags(way)
+        name = str(way.get("id"))
         kind = tags.get("type", "")
         if name not in lines or (name in bounds and kind in _BOUND_TYPES):
             continue

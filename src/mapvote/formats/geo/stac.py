@@ -51,7 +51,8 @@ def name_of_item(number: int) -> str:
 
 def stac_item(version: MapVersion) -> dict[str, Any]:
     """The item of a version. One whose place on Earth is unknown has no geometry, as STAC allows."""
-    name, frame = name_of_item(version.number), version.frame
+    name = name_of_item(version.number)
+    frame = version.frame
     properties: dict[str, Any] = {
         "datetime": version.created,
         "title": f"version {version.number}",
@@ -94,7 +95,8 @@ def _place(version: MapVersion) -> dict[str, Any]:
     (x0, y0, z0), (x1, y1, z1) = version.corners.tolist()
     corners = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z1], [x0, y1, z1], [x0, y0, z0]])
     degrees = version.frame.to_lonlat(corners).round(8)
-    low, high = degrees.min(axis=0).tolist(), degrees.max(axis=0).tolist()
+    low = degrees.min(axis=0).tolist()
+    high = degrees.max(axis=0).tolist()
     return {"geometry": {"type": "Polygon", "coordinates": [degrees[:, :2].tolist()]}, "bbox": [*low, *high]}
 
 

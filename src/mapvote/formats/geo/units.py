@@ -178,7 +178,8 @@ def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         return
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     radius_m = float(np.linalg.norm(points.astype(np.float64), axis=1).mean())
     if (
         EARTH_SIZE.radius_m[0] < radius_m < EARTH_SIZE.radius_m[1]

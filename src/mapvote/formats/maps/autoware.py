@@ -193,7 +193,8 @@ def laid_version(folder: Path) -> int | None:
     history = _history(folder)
     if not history or not is_autoware(folder):
         return None
-    newest, tiles = history[-1], folder / TILES
+    newest = history[-1]
+    tiles = folder / TILES
     present = {file.name for file in tiles.iterdir()} if tiles.is_dir() else set()
     shown = (folder / METADATA).read_bytes() == _metadata(_corners(newest.tiles)).encode()
     return newest.version if shown and present.issuperset(newest.tiles) else None

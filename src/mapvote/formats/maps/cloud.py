@@ -89,7 +89,8 @@ class CloudPieces:
     def gathered(cls, pieces: Callable[[], Iterator[Cloud]], frame: MapFrame) -> CloudPieces:
         """Goes through all pieces once."""
         n = 0
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        low = np.full(3, np.inf)
+        high = np.full(3, -np.inf)
         kinds: dict[str, np.dtype[Any]] = {}
         brightness: dict[str, Brightness] = {}
         gps_times = ""

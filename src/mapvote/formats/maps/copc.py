@@ -89,7 +89,8 @@ def write_copc(path: Path, cloud: Cloud | CloudPieces) -> None:
 
     MapvoteError if its coordinates are degrees: the cubes of COPC have one unit along x, y and z.
     """
-    laspy, lazrs = require("laspy", "las", str(path)), require("lazrs", "las", str(path))
+    laspy = require("laspy", "las", str(path))
+    lazrs = require("lazrs", "las", str(path))
     clouds = CloudPieces.of(cloud)
     header, shift = las_header(laspy, path, clouds)
     if np.ptp(header.scales) > 0:
@@ -196,7 +197,8 @@ def _write(laspy: Any, lazrs: Any, header: Any, root: _Root, cubes: _Spill, stre
         for node, start, size, count in zip(chunks.nodes, starts, sizes, chunks.points, strict=True)
     }
     hierarchy, root_place, root_size = _pages(root, entries, stream.seek(0, 2) + 60)
-    header.start_of_first_evlr, header.number_of_evlrs = stream.tell(), 1
+    header.start_of_first_evlr = stream.tell()
+    header.number_of_evlrs = 1
     stream.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(hierarchy), b"copc hierarchy") + hierarchy)
     half = 2.0 ** (root.bits - 1) * float(header.scales[0])
     center = (root.corner * header.scales + header.offsets + half).tolist()
@@ -210,7 +212,8 @@ def _write(laspy: Any, lazrs: Any, header: Any, root: _Root, cubes: _Spill, stre
 def _compressed(laspy: Any, lazrs: Any, header: Any, root: _Root, cubes: _Spill, laz: Any, stream: BinaryIO) -> _Chunks:
     """One chunk for each node. Nodes coarser than the cubes of memory gather in a second file, and come last."""
     dtype = header.point_format.dtype()
-    compressor, chunks = lazrs.LasZipCompressor(stream, laz), _Chunks()
+    compressor = lazrs.LasZipCompressor(stream, laz)
+    chunks = _Chunks()
 
     def add(node: Node, points: NDArray[np.void]) -> None:
         if chunks.nodes:  # the end finishes the last one

@@ -67,7 +67,8 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
         )
     if not code:
         return MapFrame()
-    vertical, text = keys.get(GeoKey.VERTICAL, 0), f"EPSG:{code}"
+    vertical = keys.get(GeoKey.VERTICAL, 0)
+    text = f"EPSG:{code}"
     if 0 < vertical < _USER_DEFINED:
         try:  # files often hold a code of a vertical datum, or of an ellipsoid, where that of a vertical CRS belongs
             text += f"+{vertical}" if read_crs(f"EPSG:{vertical}").is_vertical else ""
@@ -120,10 +121,12 @@ def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
     others = tuple(name for name in other_fields(head.dimensions) if name not in (*FLAGS, *"XYZ"))
     times = "" if "gps_time" not in head.dimensions else "adjusted standard" if head.adjusted_time else "week"
     done = 0
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
     for points, fields in pieces:
         done += len(points)
-        low, high = np.fmin(low, points.min(axis=0, initial=np.inf)), np.fmax(high, points.max(axis=0, initial=-np.inf))
+        low = np.fmin(low, points.min(axis=0, initial=np.inf))
+        high = np.fmax(high, points.max(axis=0, initial=-np.inf))
         yield Cloud(points, others, frame, fields, times)
     _check_whole(path, head.promised, done)
     beside = beside_its_box(path, low, high)
@@ -147,7 +150,8 @@ def beside_its_box(path: Path, low: F64, high: F64) -> str:
     if len(numbers) < layout.size or not np.isfinite(low).all():
         return ""
     box = np.array(layout.unpack(numbers)).reshape(3, 2)
-    stated_high, stated_low = box[:, 0], box[:, 1]
+    stated_high = box[:, 0]
+    stated_low = box[:, 1]
     stated = bool(np.isfinite(box).all()) and bool((stated_high > stated_low).any())
     margin_m = 1.0 + (high - low)
     if not stated or not ((low > stated_high + margin_m) | (high < stated_low - margin_m)).any():
@@ -207,7 +211,8 @@ def _pieces_of(stream: io.BufferedReader, head: Head) -> Iterator[Piece]:
         n = int(line)
         if n == 0:
             return
-        points, fields = np.empty((n, 3)), {name: np.empty(n, dtype=kind) for name, kind in head.fields.items()}
+        points = np.empty((n, 3))
+        fields = {name: np.empty(n, dtype=kind) for name, kind in head.fields.items()}
         for column in (points.reshape(-1), *fields.values()):
             if stream.readinto(column.data.cast("B")) != column.nbytes:
                 raise ValueError("the LAZ reader stopped half way; is there enough memory?")
@@ -225,7 +230,8 @@ def _check_counts(path: Path) -> bool:
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(375).ljust(375, b"\0")
-    version, compressed = header[25], bool(header[104] & 0xC0)
+    version = header[25]
+    compressed = bool(header[104] & 0xC0)
     scales = struct.unpack_from("<3d", header, 131)
     if header[:4] == b"LASF" and not all(0.0 < abs(scale) < 1e6 for scale in scales):
         raise MapvoteError(f"{path}: its header scales x, y, z by {scales}: no coordinates; export the file again")

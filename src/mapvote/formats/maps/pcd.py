@@ -211,7 +211,8 @@ def _parsed(where: str, lines: list[bytes], dtype: np.dtype[np.void]) -> NDArray
         return np.atleast_1d(np.loadtxt(lines, dtype, comments=None))
     except (ValueError, OverflowError):
         pass
-    width, rows = _elements(dtype), np.empty((len(lines), _elements(dtype)))
+    width = _elements(dtype)
+    rows = np.empty((len(lines), _elements(dtype)))
     path, _, start = where.rpartition(":")
     for number, line in enumerate(lines):
         words = line.split()

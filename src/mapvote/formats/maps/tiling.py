@@ -234,7 +234,8 @@ class _Parts:
     def __init__(self, lattice: Lattice, spill: Spill) -> None:
         self.points: dict[TileIndex, int] = {}
         """How many each tile holds."""
-        self._lattice, self._spill = lattice, spill
+        self._lattice = lattice
+        self._spill = spill
         self._blocks: dict[TileIndex, list[int]] = {}
         self._grounded: set[TileIndex] = set()
 
@@ -272,7 +273,8 @@ class _Asked(Mapping[TileIndex, Heights]):
     """A mapping that computes a value at every access."""
 
     def __init__(self, keys: Collection[TileIndex], ask: Callable[[TileIndex], Heights]) -> None:
-        self._keys, self._ask = keys, ask
+        self._keys = keys
+        self._ask = ask
 
     def __getitem__(self, index: TileIndex) -> Heights:
         return self._ask(index)
