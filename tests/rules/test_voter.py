@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.rules import voter
-from mapvote.rules.voter import REACH_M, NewPoints, _beyond, points_in, select
+from mapvote.rules.voter import REACH_M, NewPoints, NewPointsRule, _beyond, points_in, select
 
 LATTICE = Lattice()
 
@@ -45,11 +43,9 @@ def voxels(points: F64) -> set[tuple[int, int, int]]:
 def test_of_each_voxel_the_first_point_that_was_offered_is_kept_whenever_points_are_sorted(seed: int, at: int) -> None:
     rng = np.random.default_rng(seed)
     offered = [rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 3.0), (20, 3)) for _ in range(6)]
-    new = NewPoints(LATTICE)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(voter, "_COMPACT_AT", at)
-        for points in offered:
-            new.offer(points)
+    new = NewPoints(LATTICE, numbers=NewPointsRule(sorted_together=at))
+    for points in offered:
+        new.offer(points)
     assert (len(new._runs[0, 0]) > 1) == (at == 30)
     kept = np.concatenate([new.by_tile()(tile) for tile in ((-1, -1), (-1, 0), (0, -1), (0, 0))])
     everything = np.concatenate(offered)

@@ -159,13 +159,20 @@ def _beyond(
 class NewPoints:
     """One point per 0.3 m voxel, the first one offered: candidates for changed-occupied cells."""
 
-    def __init__(self, lattice: Lattice, beyond: bool = True, names: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        lattice: Lattice,
+        beyond: bool = True,
+        names: Sequence[str] = (),
+        numbers: NewPointsRule = NEW_POINTS_RULE,
+    ) -> None:
         """``beyond``: also take points outside the local grid. The paper takes none, and the filter of moving objects
         does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``names``:
         attributes that are kept with each point."""
         self.lattice = lattice
         self.beyond = beyond
         self.names = tuple(names)
+        self._numbers = numbers
         self._shelf = Shelf()
         self._runs = defaultdict[TileIndex, list[Slot]](list)
         """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
@@ -212,13 +219,13 @@ class NewPoints:
             sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
             self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
             self._count += len(points_map)
-            if self._count > NEW_POINTS_RULE.sorted_together:
+            if self._count > self._numbers.sorted_together:
                 self._compact()
 
     def _compact(self) -> None:
         """Sort the points since the last run into a new run, together with the last run if that is still small."""
         run = self._one_a_voxel([*self._short(), *self._waiting])
-        self._last = run if len(run) < NEW_POINTS_RULE.sorted_together else None
+        self._last = run if len(run) < self._numbers.sorted_together else None
         if self._last is None:
             for tile, points in self._of_tiles(run).items():
                 self._runs[tile].append(self._shelf.put(points.tobytes()))
