@@ -222,8 +222,10 @@ def end_by_ctrl_c(words: list[str], folder: Path, once: str) -> tuple[int, str]:
             mapvote(*words), cwd=folder, stdout=out, stderr=subprocess.STDOUT, start_new_session=True, env=environment
         )
         try:
+            end = time.monotonic() + 120.0
             while once not in log.read_text():
                 assert process.poll() is None, log.read_text()
+                assert time.monotonic() < end, log.read_text()
                 time.sleep(0.05)
             os.killpg(process.pid, signal.SIGINT)
             return process.wait(30), log.read_text()
@@ -236,7 +238,7 @@ def test_an_autoware_service_ends_on_ctrl_c_with_how_much_it_answered(tmp_path: 
     """It runs until it is stopped, so that this is no failure; the server may be away."""
     pytest.importorskip("cyclonedds")
     words = ["autoware", "http://127.0.0.1:9", "map", "--every", "0.1", "--domain", str(own_domain())]
-    code, said = end_by_ctrl_c(words, tmp_path, "the map stays as it is")
+    code, said = end_by_ctrl_c(words, tmp_path, "the folder stays as it is")
     assert (code, said.splitlines()[-1]) == (0, "0 requests answered"), said
 
 
