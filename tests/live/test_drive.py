@@ -64,7 +64,7 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
     player = subprocess.Popen([sys.executable, "-m", "mapvote", "play", str(bag), *options])
     try:
         said = type_in(
-            f"mapvote drive --map {tmp_path}/map --sensor hdl32e --vehicle car --name day --every-m 12 --idle 60 "
+            f"mapvote drive --map {tmp_path}/map --sensor hdl32e --vehicle car --name day --every-m 12 --idle 20 "
             f"--out {folder} --domain {domain}"
         )
     finally:
@@ -108,7 +108,7 @@ def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_
     player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
     drive = f"--map {tmp_path}/map --vehicle car --name day --every-m 12"
     try:
-        said = type_in(f"mapvote drive {drive} --idle 60 --out {tmp_path}/live --domain {domain}")
+        said = type_in(f"mapvote drive {drive} --idle 20 --out {tmp_path}/live --domain {domain}")
     finally:
         player.wait(120)
     offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
@@ -150,7 +150,7 @@ def test_a_vehicle_with_satellite_fixes_and_an_imu_alone_votes_with_every_scan_l
     player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
     drive = f"--map {tmp_path}/map --vehicle car --name day --sensor hdl32e --every-m 12"
     try:
-        said = type_in(f"mapvote drive {drive} --odometry /fix --idle 60 --out {tmp_path}/live --domain {domain}")
+        said = type_in(f"mapvote drive {drive} --odometry /fix --idle 20 --out {tmp_path}/live --domain {domain}")
     finally:
         player.wait(120)
     offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
