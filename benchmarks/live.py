@@ -113,7 +113,8 @@ def kills(drive: str, map_path: str, n: int, longest_s: float) -> None:
     )
     url = f"http://127.0.0.1:{server.port}"
     options = ["--map", map_path, "--send", url, "--vehicle", "car", "--name", "day", "--every-m", 150]
-    command = mapvote("drive", *options, "--domain", domain, "--sensor", "hdl32e")
+    # Each lap begins with a leap back to the start, for which the check of places would keep its ballot.
+    command = mapvote("drive", *options, "--domain", domain, "--sensor", "hdl32e", "--unchecked")
     killed_ns = []
     """(stamp when it began to listen, stamp when it was killed) of each."""
     with log.open("w") as out:

@@ -31,6 +31,7 @@ from mapvote.doctor.scans import Looking
 from mapvote.formats.drives.point_fields import PointReader, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
+from mapvote.fusion.gravity import Remains, fall_within
 from mapvote.matching.localiser import GivenPoses
 from mapvote.rules.packed_tiles import PackedTiles
 from mapvote.survey.build import build_map
@@ -76,6 +77,7 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a drive that votes by surfaces", vote("surfaces")),
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
+        ("what falls with a demolished object", _let_fall),
         ("a drive and a map looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
     ]
     with seldom_collecting():
@@ -102,6 +104,7 @@ def compile_for_votes() -> None:
         by_case = [choose_case(Settings(), rule) for rule in RULES]
         ballots = [vote_drive(drive, point_map, settings, localise=given)[0] for settings in by_case]
         _fuse(point_map, ballots, Settings())
+        _let_fall()
         vote_drive(drive, point_map, Settings())
 
 
@@ -112,6 +115,14 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
         same = [decode(encode(structs.replace(ballot, vehicle=name))) for name in ("a", "b", "c")]
         for least in (settings.fuse.min_difference, 0.0):
             update_map(point_map, same, settings.fuse.model_copy(update={"min_difference": least}))
+
+
+def _let_fall() -> None:
+    """Compile what falls inside a demolished object: a block of 5 m, of which a voxel of the roof remains."""
+    planes = {name: np.zeros((TILE_CELLS, TILE_CELLS), np.uint64) for name in ("rest", "holds", "deleted")}
+    planes["deleted"][100:116, 100:116] = 0xFFFF
+    planes["rest"][108, 108] = 1 << 20
+    fall_within((0, 0), Remains(**planes, base=np.zeros((TILE_CELLS, TILE_CELLS), np.int32)))
 
 
 def _go_far(drive: Drive) -> None:
