@@ -94,11 +94,13 @@ def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_befor
 
 @pytest.mark.slow
 def test_of_many_starts_and_kills_none_empties_a_client(tmp_path: Path, store: Store, domain: int) -> None:
-    """`STARTS=50 pytest -m slow` tries so many. Every fifth start has a fresh folder, every third no server, every seventh a new version on the way. Half are
-    killed as soon as they serve or within 2 s, the others at any moment of their start."""
+    """Every fifth start has a fresh folder, every third no server, every seventh a new version on the way. Half are
+    killed as soon as they serve or within 2 s, the others at any moment of their start. `STARTS=50 pytest -m slow`
+    makes so many."""
     from live.foreign_client import ForeignClient
 
     client, dice = ForeignClient(domain, OLD), random.Random(7)
+    starts = int(os.environ.get("STARTS", "12"))
     fewest, ended = [len(OLD)], threading.Event()
 
     def drive() -> None:
@@ -111,7 +113,7 @@ def test_of_many_starts_and_kills_none_empties_a_client(tmp_path: Path, store: S
     answered = 0
     try:
         with serving(tmp_path / "fleet.db", log=tmp_path / "serve.log") as (url, _):
-            for k in range(int(os.environ.get("STARTS", "12"))):
+            for k in range(starts):
                 before = client.replies
                 log = tmp_path / "autoware.log"
                 told = log.read_text().count("serving") if log.exists() else 0
@@ -129,7 +131,7 @@ def test_of_many_starts_and_kills_none_empties_a_client(tmp_path: Path, store: S
         ended.set()
         vehicle.join()
     assert fewest[0] > 0
-    assert answered > 20, "the kills were to meet services that answer"
+    assert answered > 0.4 * starts, "the kills were to meet services that answer"
 
 
 @pytest.mark.slow
