@@ -79,6 +79,7 @@ MAPS: dict[str, MapFormat] = {
     "PCD file": MapFormat(_file(".pcd"), pcd.stream_pcd),
     "folder of PCD tiles": MapFormat(pcd.is_pcd_tiles, pcd.stream_pcd_tiles),
     "LAS or LAZ file": MapFormat(_file(".las", ".laz"), las.stream_las),
+    "folder of LAS or LAZ tiles": MapFormat(las.is_las_tiles, las.stream_las_tiles),
     "PLY file": MapFormat(_file(".ply"), ply.stream_ply),
     "E57 file": MapFormat(_file(".e57"), e57.stream_e57),
 }

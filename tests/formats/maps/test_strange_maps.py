@@ -12,6 +12,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.formats import import_cloud
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
+from mapvote.formats.maps.las import write_las
 from mapvote.formats.registry import WRITERS
 
 POINTS = np.random.default_rng(8).uniform([0, 0, 0], [30, 30, 4], (2000, 3))
@@ -61,3 +62,15 @@ def test_a_text_file_is_called_no_ballot(tmp_path: Path) -> None:
     file.write_text("1 2 3\n")
     (finding,) = diagnose(file).findings
     assert "of no known kind (.xyz)" in finding.what
+
+
+def test_a_folder_of_las_tiles_is_one_map_and_a_folder_of_las_scans_is_none(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    tile = rng.uniform(0.0, 30.0, (4_000, 3)) * [1.0, 1.0, 0.001]
+    for folder, step_m in (("tiles", 30.0), ("scans", 1.0)):
+        (tmp_path / folder).mkdir()
+        for k, name in enumerate(("r0_c0.las", "r0_c1.laz", "r1_c0.LAS")):
+            write_las(tmp_path / folder / name, Cloud(tile + np.array([step_m * k, 0.0, 0.0])))
+    assert import_cloud(tmp_path / "tiles")[0].n_points == 12_000
+    with pytest.raises(MapvoteError):
+        import_cloud(tmp_path / "scans")

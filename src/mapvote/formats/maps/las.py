@@ -28,10 +28,12 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
+from mapvote.formats.listing import entry, files_like
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import kept_fields, known_fields, other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, FLAGS, Head, Piece, read_head, read_pieces
+from mapvote.formats.maps.pcd import TILE_RULE, TileRule, hardly_overlap
 from mapvote.formats.reading import FILE_LIMITS, reading
 
 log = logging.getLogger("mapvote.formats")
@@ -96,6 +98,34 @@ def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
             pieces = _beside(laspy, path, extra=extra or bool(brought))
         for piece in pieces:
             yield piece if extra else _only(piece, brought)
+
+
+def is_las_tiles(path: Path, rule: TileRule = TILE_RULE) -> bool:
+    """A folder of LAS or LAZ files whose boxes, by their headers, lie side by side; with stamps or poses a drive."""
+    files = tile_files(path)
+    recorded = any(entry(path, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
+    if len(files) < 2 or recorded:
+        return False
+    laspy = require("laspy", "las", str(path))
+    boxes = []
+    for file in files[: rule.tiles + 1]:
+        try:
+            with laspy.open(file) as reader:
+                boxes.append((np.array(reader.header.mins[:2]), np.array(reader.header.maxs[:2])))
+        except Exception:  # a reader says why the file cannot be read
+            return False
+    return hardly_overlap(boxes, rule)
+
+
+def tile_files(path: Path) -> list[Path]:
+    """The LAS and LAZ files of a folder, by name."""
+    return sorted([*files_like(path, "*.las"), *files_like(path, "*.laz")])
+
+
+def stream_las_tiles(path: Path) -> Iterator[Cloud]:
+    """The points of all tiles, one file after the other, each in the coordinates that its file names."""
+    for file in tile_files(path):
+        yield from stream_las(file)
 
 
 def _only(piece: Cloud, brought: Sequence[str]) -> Cloud:

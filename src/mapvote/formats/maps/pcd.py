@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice, pairwise
 from pathlib import Path
@@ -84,6 +84,11 @@ def _lie_side_by_side(files: list[Path], rule: TileRule = TILE_RULE) -> bool:
         points = points[np.isfinite(points).all(axis=1)]
         if len(points):
             boxes.append((points.min(axis=0), points.max(axis=0)))
+    return hardly_overlap(boxes, rule)
+
+
+def hardly_overlap(boxes: Sequence[tuple[F64, F64]], rule: TileRule = TILE_RULE) -> bool:
+    """Whether boxes in turn, each its lowest and its highest (x, y), have little in common: scans of a drive have."""
     common = []
     for (low_a, high_a), (low_b, high_b) in pairwise(boxes):
         both = np.maximum(np.minimum(high_a, high_b) - np.maximum(low_a, low_b), 0.0).prod()
