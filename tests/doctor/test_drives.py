@@ -159,9 +159,9 @@ metres, only the unit."""
 
 
 SOME_KINDS = [
-    kind for k, kind in enumerate(kinds_of("drives")) if k % 3 == 0 or kind in FAST or os.environ.get("FAULTS") == "all"
+    kind for k, kind in enumerate(kinds_of("drives")) if k % 6 == 0 or kind in FAST or os.environ.get("FAULTS") == "all"
 ]
-"""A third of them, for CI has twenty minutes; `FAULTS=all pytest -m slow` and benchmarks/doctor.py take all."""
+"""A sixth of them, for CI has twenty minutes; `FAULTS=all pytest -m slow` and benchmarks/doctor.py take all."""
 
 
 @pytest.mark.parametrize(
