@@ -28,7 +28,7 @@ _BOUND = "-dac_override,-dac_read_search"
 @pytest.mark.slow
 def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
-    assert len(told) == 6
+    assert len(told) == 7
     assert all(seconds > 0 for _, seconds in told)
     for kernel in (align, count_states, look, _grow, contradicts, find_alike):
         assert kernel.signatures
