@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapvote.cli.door import all_changes, api_at, is_store, is_url, map_at
 from mapvote.cli.terminal import waiting
+from mapvote.core.times import utc
 from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
         raise MapvoteError(f"{folder}: holds other files; name a new folder, or one that export --stac has written")
     if not (is_url(source) or is_store(source)):
         with map_at(source, key_file) as point_map:
-            _write(folder, point_map, {"number": 1, "created": _now(), "parent": None}, has_changes=False)
+            _write(folder, point_map, {"number": 1, "created": utc(time.time_ns()), "parent": None}, has_changes=False)
             write_catalog(folder, point_map.map_id, [1])
         return
     with api_at(source, key_file) as server:
@@ -68,7 +69,3 @@ def _write(folder: Path, point_map: PointMap, about: Mapping[str, Any], *, has_c
         created = about["created"]
         version = MapVersion(about["number"], created, about["parent"], point_map.n_points, corners, frame, has_changes)
         write_item(folder, version)
-
-
-def _now() -> str:
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

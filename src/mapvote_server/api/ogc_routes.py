@@ -7,16 +7,18 @@ unknown parameter is 400, as Part 1 has it.
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlencode
 
 import msgspec
 from fastapi import APIRouter, Request, Response
 
-from mapvote_server.api.schemas import LEAST, MOST
+from mapvote.core.times import utc
+from mapvote_server.api.lanes import on
+from mapvote_server.api.schemas import LEAST, MOST, as_json
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import BadRequest, Forbidden, NotFound
 from mapvote_server.questions.desk import desk
@@ -31,6 +33,8 @@ from mapvote_server.questions.features import (
     placed,
     within,
 )
+from mapvote_server.store.store import Store
+from mapvote_server.work import count_rows
 
 CONFORMANCE = [
     *(
@@ -82,7 +86,8 @@ async def documentation(request: Request) -> Response:
 
 
 @router.get("/ogc/collections")
-async def collections(request: Request, parts: Parts, known: Known) -> Response:
+@on("questions")
+def collections(request: Request, parts: Parts, known: Known) -> Response:
     """All that the key may see."""
     _check(request)
     place = OnEarth.of(parts.store)
@@ -95,10 +100,15 @@ async def collections(request: Request, parts: Parts, known: Known) -> Response:
 @router.get("/ogc/collections/{name}")
 async def collection(request: Request, parts: Parts, known: Known, name: str) -> Response:
     """One of them, with its extent."""
+    pending = await _pending(parts, _named(name, known))
+    return await parts.questions.run(_collection, request, parts.store, known, name, pending)
+
+
+def _collection(request: Request, store: Store, known: bool, name: str, pending: Features | None) -> Response:
     _check(request)
-    kind = _named(name, known)
-    place = OnEarth.of(parts.store)
-    box = extent(await _features(parts, name, kind, known, request), place)
+    kind = COLLECTIONS[name]
+    place = OnEarth.of(store)
+    box = extent(_features(store, kind, known, request, pending), place)
     about = _described(request, name, kind, place)
     if box is not None:
         about["extent"] = {"spatial": {"bbox": [box], "crs": CRS84}}
@@ -108,10 +118,15 @@ async def collection(request: Request, parts: Parts, known: Known, name: str) ->
 @router.get("/ogc/collections/{name}/items")
 async def items(request: Request, parts: Parts, known: Known, name: str) -> Response:
     """Its features: those that meet ``bbox`` and ``datetime``, ``limit`` of them after ``offset``."""
-    kind = _named(name, known)
-    place = OnEarth.of(parts.store)
+    pending = await _pending(parts, _named(name, known))
+    return await parts.questions.run(_items, request, parts.store, known, name, pending)
+
+
+def _items(request: Request, store: Store, known: bool, name: str, pending: Features | None) -> Response:
+    kind = COLLECTIONS[name]
+    place = OnEarth.of(store)
     asked = _Asked.of(request, kind, place)
-    features = await _features(parts, name, kind, known, request)
+    features = _features(store, kind, known, request, pending)
     features = within(features, asked.box, place, asked.box_crs) if asked.box and features else features
     features = during(features, asked.datetime) if asked.datetime else features
     shown = [placed(feature, place, asked.crs) for feature in features[asked.offset : asked.offset + asked.limit]]
@@ -128,7 +143,7 @@ async def items(request: Request, parts: Parts, known: Known, name: str) -> Resp
     if asked.offset > 0:
         before = query | {"offset": str(max(asked.offset - asked.limit, 0))}
         links.append(_link(request, path, "prev", _GEOJSON, "the page before", before))
-    counts = {"numberMatched": len(features), "numberReturned": len(shown), "timeStamp": _now()}
+    counts = {"numberMatched": len(features), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
     found = {"type": "FeatureCollection", "features": shown, "links": links} | counts
     return _answer(request, found, _GEOJSON, {"Content-Crs": f"<{asked.crs}>"})
 
@@ -136,10 +151,17 @@ async def items(request: Request, parts: Parts, known: Known, name: str) -> Resp
 @router.get("/ogc/collections/{name}/items/{feature_id}")
 async def item(request: Request, parts: Parts, known: Known, name: str, feature_id: str) -> Response:
     """One feature."""
-    kind = _named(name, known)
-    place = OnEarth.of(parts.store)
+    pending = await _pending(parts, _named(name, known))
+    return await parts.questions.run(_item, request, parts.store, known, name, feature_id, pending)
+
+
+def _item(
+    request: Request, store: Store, known: bool, name: str, feature_id: str, pending: Features | None
+) -> Response:
+    kind = COLLECTIONS[name]
+    place = OnEarth.of(store)
     asked = _Asked.of(request, kind, place, ("crs",))
-    features = await _features(parts, name, kind, known, request)
+    features = _features(store, kind, known, request, pending)
     found = next((feature for feature in features if feature["id"] == feature_id), None)
     if found is None:
         raise NotFound(f"{name} has no feature {feature_id[:80]!r}")
@@ -207,15 +229,22 @@ def _named(name: str, known: bool) -> Collection:
     return kind
 
 
-async def _features(parts: Services, name: str, kind: Collection, known: bool, request: Request) -> Features:
-    """All features of a collection, in map metres."""
+async def _pending(parts: Services, kind: Collection) -> Features | None:
+    """The features of the desk, whose work has a lane of its own; None for every other collection."""
+    if kind.features is not None:
+        return None
+    pending: Features = (await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)).pending["features"]
+    return pending
+
+
+def _features(store: Store, kind: Collection, known: bool, request: Request, pending: Features | None) -> Features:
+    """All features of a collection, in map metres; of the desk those ``pending``."""
     if kind.features is None:
-        pending: Features = (await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)).pending["features"]
-        return pending
-    newest = parts.store.current() if kind.of_versions else 1
+        return pending or []
+    newest = store.current() if kind.of_versions else 1
     new = _integer(request.query_params, "to", newest, LEAST)
     old = _integer(request.query_params, "from", max(new - 1, LEAST), LEAST)
-    return await parts.questions.run(kind.features, parts.store, known, old, new)
+    return kind.features(store, known, old, new)
 
 
 def _described(request: Request, name: str, kind: Collection, place: OnEarth) -> dict[str, Any]:
@@ -249,8 +278,11 @@ def _answer(
     first = request.headers.get("accept", "").partition(",")[0].partition(";")[0].strip()
     wanted = request.query_params.get("f") or ("html" if first == _HTML else "json")
     if wanted == "html":
+        count_rows(1 + len(content.get("features", ())))
         return _page(str(content.get("title", request.url.path)), content)
-    return Response(msgspec.json.encode(content), media_type=kind, headers=dict(headers or {}))
+    answer = as_json(content, kind)
+    answer.headers.update(headers or {})
+    return answer
 
 
 def _page(title: str, content: Mapping[str, Any]) -> Response:
@@ -274,10 +306,6 @@ def _as_html(value: Any) -> str:
     if isinstance(value, list):
         return "".join(f"<div>{_as_html(one)}</div>" for one in value)
     return html.escape(str(value))
-
-
-def _now() -> str:
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _openapi(request: Request) -> dict[str, Any]:

@@ -407,12 +407,12 @@ def sends_bytes(*codes: int) -> dict[str, Any]:
     return {"responses": problems(*codes) | AS_BYTES, "response_class": Response}
 
 
-def as_json(content: object) -> Response:
+def as_json(content: object, media_type: str = "application/json") -> Response:
     """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
     all others. The members of its lists are counted as rows."""
     members = content.values() if isinstance(content, Mapping) else ()
     count_rows(1 + sum(len(member) for member in members if isinstance(member, list)))
-    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type="application/json")
+    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type=media_type)
 
 
 def _plain(model: Any) -> Any:
