@@ -21,7 +21,7 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
     """A catalogue in ``folder``: of all versions that are kept, or of one. Items that are there already stay as they
     are, so that the same command adds what is new."""
     from mapvote.core.extras import require
-    from mapvote.formats.geo.stac import CHANGES, name_of_item, write_catalog
+    from mapvote.formats.geo.stac import CHANGES, file_of_item, write_catalog
 
     require("laspy", "las", "export --stac")
     if folder.exists() and any(folder.iterdir()) and not (folder / "catalog.json").is_file():
@@ -42,12 +42,13 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
         for about in versions:
             number = about["number"]
             parent = about["parent"] if about["parent"] in numbers else None
-            if number not in numbers or (folder / name_of_item(number) / f"{name_of_item(number)}.json").is_file():
+            item = file_of_item(folder, number)
+            if number not in numbers or item.is_file():
                 continue
-            (folder / name_of_item(number)).mkdir(parents=True, exist_ok=True)
+            item.parent.mkdir(parents=True, exist_ok=True)
             if parent is not None:
                 found = all_changes(server, f"from={parent}&to={number}&lonlat=true")
-                (folder / name_of_item(number) / CHANGES).write_text(json.dumps(found, indent=1) + "\n")
+                (item.parent / CHANGES).write_text(json.dumps(found, indent=1) + "\n")
             with map_at(source, key_file, number) as point_map:
                 _write(folder, point_map, dict(about) | {"parent": parent}, has_changes=parent is not None)
         write_catalog(folder, map_id, numbers)
@@ -58,9 +59,9 @@ def _write(folder: Path, point_map: PointMap, about: Mapping[str, Any], *, has_c
     """The cloud and the item of one version."""
     from mapvote.formats import box_of, export_map
     from mapvote.formats.geo.frame import frame_of
-    from mapvote.formats.geo.stac import CLOUD_ASSET, MapVersion, name_of_item, write_item
+    from mapvote.formats.geo.stac import CLOUD_ASSET, MapVersion, file_of_item, write_item
 
-    home = folder / name_of_item(about["number"])
+    home = file_of_item(folder, about["number"]).parent
     home.mkdir(parents=True, exist_ok=True)
     with waiting(f"writing version {about['number']}"):
         export_map(point_map, home / CLOUD_ASSET)

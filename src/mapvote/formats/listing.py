@@ -43,6 +43,11 @@ def entry(folder: Path, name: str) -> Path:
     return folder
 
 
+def is_recording(folder: Path) -> bool:
+    """Whether stamps, poses or a description of a drive lie in ``folder``: its clouds are scans, not tiles of a map."""
+    return any(entry(folder, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
+
+
 def files_like(folder: Path, pattern: str) -> list[Path]:
     """The files that match ``pattern`` ("*.pcd", "lidar/*.bin") below ``folder``, by name; hidden files are none. A
     link to nothing is one, which its reader reports."""

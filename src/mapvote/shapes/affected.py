@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
 import shapely
 from shapely.geometry import shape
 
@@ -68,11 +68,7 @@ def read_changes(file: Path, frame: MapFrame | None = None) -> ChangedPlaces:
     if shapes and frame.is_local:
         longitude, latitude = shapely.get_coordinates(shapes[0])[0].tolist()
         frame = MapFrame(utm_of(longitude, latitude))
-    return ChangedPlaces(ids, kinds, [_in_metres(one, frame) for one in shapes], frame)
-
-
-def _in_metres(degrees: Any, frame: MapFrame) -> Any:
-    return shapely.transform(degrees, lambda xy: frame.from_lonlat(np.column_stack([xy, np.zeros(len(xy))]))[:, :2])
+    return ChangedPlaces(ids, kinds, [shapely.transform(one, frame.plane_from_lonlat) for one in shapes], frame)
 
 
 def affected_parts(parts: Sequence[MapPart], changes: ChangedPlaces, within_m: float) -> list[Affected]:
@@ -110,18 +106,12 @@ def affected_geojson(affected: Sequence[Affected], changes: ChangedPlaces) -> di
     frame = changes.frame
     features = []
     for one, row in zip(affected, affected_rows(affected, changes), strict=True):
-        geometry = one.part.shape if frame.is_local else _in_degrees(one.part.shape, frame)
+        metres = one.part.shape
+        geometry = metres if frame.is_local else shapely.transform(metres, frame.plane_to_lonlat)
         about = {"type": "Feature", "id": row.pop("id"), "geometry": json.loads(shapely.to_geojson(geometry))}
         features.append(about | {"properties": row})
     lies = f"{MAP_METRES}: {frame.told()}" if frame.is_local else "WGS 84 longitude, latitude"
     return {"type": "FeatureCollection", "frame": lies, "features": features}
-
-
-def _in_degrees(metres: Any, frame: MapFrame) -> Any:
-    """1e-8 degrees are a millimetre."""
-    return shapely.transform(
-        metres, lambda xy: np.round(frame.to_lonlat(np.column_stack([xy, np.zeros(len(xy))]))[:, :2], 8)
-    )
 
 
 def marked_osm(
@@ -149,7 +139,5 @@ _MOST_SIGNS = 255
 
 def summary(affected: Sequence[Affected]) -> str:
     """How many parts of each kind are affected."""
-    counts: dict[str, int] = {}
-    for one in affected:
-        counts[one.part.kind] = counts.get(one.part.kind, 0) + 1
-    return ", ".join(f"{count} {kind}" for kind, count in cast(Mapping[str, int], counts).items())
+    counts = Counter(one.part.kind for one in affected)
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items())

@@ -55,12 +55,11 @@ def to_geojson(
 
 
 def rings_to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
-    """Rings in map metres to degrees, in place; 1e-8 degrees are a millimetre. The sense of the rings stays."""
+    """Rings in map metres to degrees, in place. The sense of the rings stays."""
     polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
     for polygon in polygons:
         for i, ring in enumerate(polygon):
-            corners = np.column_stack([np.array(ring), np.zeros(len(ring))])
-            polygon[i] = np.round(frame.to_lonlat(corners)[:, :2], 8).tolist()
+            polygon[i] = frame.plane_to_lonlat(np.array(ring)).tolist()
 
 
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -101,15 +101,14 @@ class OnEarth:
 
     def out(self, xy: F64, crs: str) -> F64:
         """(n, 2) coordinates in a system of map metres (n, 2), in the order of its axes."""
-        flat = np.column_stack([xy, np.zeros(len(xy))])
         if crs == CRS84:
-            return np.round(self.frame.to_lonlat(flat)[:, :2], 8)
-        return np.round((flat + np.array(self.frame.offset_m))[:, :2], 3)[:, self._axes]
+            return self.frame.plane_to_lonlat(xy)
+        return np.round(xy + np.array(self.frame.offset_m)[:2], 3)[:, self._axes]
 
     def into(self, xy: F64, crs: str) -> F64:
         """(n, 2) map metres of coordinates (n, 2) in a system."""
         if crs == CRS84:
-            return self.frame.from_lonlat(np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
+            return self.frame.plane_from_lonlat(xy)
         return xy[:, self._axes] - np.array(self.frame.offset_m)[:2]
 
     @property

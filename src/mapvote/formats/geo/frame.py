@@ -96,6 +96,14 @@ class MapFrame:
         out: F64 = _through(self._transformer(), lonlat, inverse=False) - np.array(self.offset_m)
         return out
 
+    def plane_to_lonlat(self, xy: NDArray[np.floating]) -> F64:
+        """(n, 2) longitude and latitude, degrees to 1e-8 (a millimetre), of places (n, 2) in map metres at height 0."""
+        return np.round(self.to_lonlat(_at_height_0(xy))[:, :2], 8)
+
+    def plane_from_lonlat(self, lonlat: NDArray[np.floating]) -> F64:
+        """(n, 2) map metres of longitude and latitude (n, 2), degrees, at height 0."""
+        return self.from_lonlat(_at_height_0(lonlat))[:, :2]
+
     def axes_at(self, lonlat: NDArray[np.floating]) -> F64:
         """(n, 3, 3) rotations whose columns are east, north and up at longitude, latitude, height, in map axes.
 
@@ -125,6 +133,10 @@ class MapFrame:
                 "or with --projector map_projector_info.yaml"
             )
         return _transformer(self.crs)
+
+
+def _at_height_0(xy: NDArray[np.floating]) -> F64:
+    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 def enu_frame(latitude: float, longitude: float, height: float) -> MapFrame:

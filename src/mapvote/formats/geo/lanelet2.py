@@ -98,7 +98,7 @@ def _positions(root: ElementTree.Element, frame: MapFrame, file: Path) -> dict[s
             f"{file}: a coordinate of node {ids[int(np.argmin(np.isfinite(xy).all(axis=1)))]} is not finite"
         )
     if not frame.is_local and len(xy):
-        xy = frame.from_lonlat(np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
+        xy = frame.plane_from_lonlat(xy)
     return dict(zip(ids, xy, strict=True))
 
 

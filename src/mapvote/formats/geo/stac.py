@@ -45,8 +45,14 @@ class MapVersion:
 
 
 def name_of_item(number: int) -> str:
-    """Its folder, its id, and its file without the ending."""
+    """Its id, and the name of its folder."""
     return f"v{number}"
+
+
+def file_of_item(folder: Path, number: int) -> Path:
+    """The item's file in the catalogue's folder; its assets lie beside it."""
+    name = name_of_item(number)
+    return folder / name / f"{name}.json"
 
 
 def stac_item(version: MapVersion) -> dict[str, Any]:
@@ -112,8 +118,7 @@ def stac_catalog(map_id: str, numbers: Sequence[int]) -> dict[str, Any]:
 
 def write_item(folder: Path, version: MapVersion) -> None:
     """The item's file, beside its assets."""
-    name = name_of_item(version.number)
-    write_whole(folder / name / f"{name}.json", json.dumps(stac_item(version), indent=1) + "\n")
+    write_whole(file_of_item(folder, version.number), json.dumps(stac_item(version), indent=1) + "\n")
 
 
 def write_catalog(folder: Path, map_id: str, numbers: Sequence[int]) -> None:

@@ -28,7 +28,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
-from mapvote.formats.listing import entry, files_like
+from mapvote.formats.listing import files_like, is_recording
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import kept_fields, known_fields, other_fields
@@ -103,8 +103,7 @@ def stream_las(path: Path, *, extra: bool = False) -> Iterator[Cloud]:
 def is_las_tiles(path: Path, rule: TileRule = TILE_RULE) -> bool:
     """A folder of LAS or LAZ files whose boxes, by their headers, lie side by side; with stamps or poses a drive."""
     files = tile_files(path)
-    recorded = any(entry(path, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
-    if len(files) < 2 or recorded:
+    if len(files) < 2 or is_recording(path):
         return False
     laspy = require("laspy", "las", str(path))
     boxes = []

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.listing import entry, files_like
+from mapvote.formats.listing import files_like, is_recording
 from mapvote.formats.maps.cloud import (
     READ_SIZES,
     Cloud,
@@ -64,8 +64,7 @@ def is_pcd_tiles(path: Path) -> bool:
     their points lie side by side.
     """
     names = [file.stem for file in files_like(path, "*.pcd")]
-    recorded = any(entry(path, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
-    if not names or recorded:
+    if not names or is_recording(path):
         return False
     if all(_GRID_TILE.fullmatch(name) for name in names):
         return True
