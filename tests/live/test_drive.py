@@ -51,6 +51,25 @@ def record(
     recorder.bag.close()
 
 
+def assert_live_and_recorded_alike(home: Path, domain: int, both: str = "", live: str = "") -> None:
+    """Play ``home``/bag for a live drive on ``home``/map: every scan votes, and the ballots are those of `vote --cuts`.
+    Options of ``both``, and of the ``live`` drive alone."""
+    for folder in ("live", "offline"):
+        (home / folder).mkdir()
+    play = f"play {home}/bag --domain {domain} --rate 0.2 --wait 600"
+    player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
+    drive = f"--map {home}/map --vehicle car --name day {both} --every-m 12"
+    try:
+        said = type_in(f"mapvote drive {drive} {live} --idle 20 --out {home}/live --domain {domain}")
+    finally:
+        player.wait(120)
+    offline = type_in(f"mapvote vote {home}/bag {drive} --cuts --out {home}/offline")
+    ballots = {folder: {f.name: f.read_bytes() for f in (home / folder).iterdir()} for folder in ("live", "offline")}
+    assert f"{SCANS} of {SCANS} scans voted" in said, said + offline
+    assert len(ballots["live"]) >= 2
+    assert ballots["live"] == ballots["offline"], said + offline
+
+
 @pytest.mark.slow
 def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_for_bit(
     tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
@@ -102,22 +121,7 @@ def test_vote_on_a_bag_with_no_option_chooses_what_a_live_drive_chooses_and_the_
                 recorder.write_raw("/lidar", CLOUD, ns, cloud_message(Scan(ns, points.astype(np.float32)), "lidar"))
     recorder.bag.close()
     write_map(map_from_points(street(1)), tmp_path / "map")
-    for folder in ("live", "offline"):
-        (tmp_path / folder).mkdir()
-    play = f"play {tmp_path}/bag --domain {domain} --rate 0.2 --wait 600"
-    player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
-    drive = f"--map {tmp_path}/map --vehicle car --name day --every-m 12"
-    try:
-        said = type_in(f"mapvote drive {drive} --idle 20 --out {tmp_path}/live --domain {domain}")
-    finally:
-        player.wait(120)
-    offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
-    ballots = {
-        folder: {f.name: f.read_bytes() for f in (tmp_path / folder).iterdir()} for folder in ("live", "offline")
-    }
-    assert f"{SCANS} of {SCANS} scans voted" in said, said + offline
-    assert len(ballots["live"]) >= 2
-    assert ballots["live"] == ballots["offline"], said + offline
+    assert_live_and_recorded_alike(tmp_path, domain)
 
 
 @pytest.mark.slow
@@ -144,22 +148,7 @@ def test_a_vehicle_with_satellite_fixes_and_an_imu_alone_votes_with_every_scan_l
     recorder.bag.close()
     town = replace(map_from_points(street(1)), georeference=frame.georeference())
     write_map(town, tmp_path / "map")
-    for folder in ("live", "offline"):
-        (tmp_path / folder).mkdir()
-    play = f"play {tmp_path}/bag --domain {domain} --rate 0.2 --wait 600"
-    player = subprocess.Popen([sys.executable, "-m", "mapvote", *play.split()])
-    drive = f"--map {tmp_path}/map --vehicle car --name day --sensor hdl32e --every-m 12"
-    try:
-        said = type_in(f"mapvote drive {drive} --odometry /fix --idle 20 --out {tmp_path}/live --domain {domain}")
-    finally:
-        player.wait(120)
-    offline = type_in(f"mapvote vote {tmp_path}/bag {drive} --cuts --out {tmp_path}/offline")
-    ballots = {
-        folder: {f.name: f.read_bytes() for f in (tmp_path / folder).iterdir()} for folder in ("live", "offline")
-    }
-    assert f"{SCANS} of {SCANS} scans voted" in said, said + offline
-    assert len(ballots["live"]) >= 2
-    assert ballots["live"] == ballots["offline"], said + offline
+    assert_live_and_recorded_alike(tmp_path, domain, "--sensor hdl32e", live="--odometry /fix")
 
 
 @pytest.mark.slow
