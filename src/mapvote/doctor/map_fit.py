@@ -25,6 +25,7 @@ from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding, Progress, Severity
 from mapvote.doctor.drive_evidence import find_road
 from mapvote.doctor.prior import Similarity, fit_similarity
+from mapvote.doctor.prior_fit import FEET_M
 from mapvote.matching.global_search import GlobalSearch
 from mapvote.matching.matcher import likeliest, likelihood_at
 from mapvote.matching.ndt_map import MapWindow, NdtMap
@@ -89,13 +90,12 @@ _YAWS = np.radians([0.0, -3.0, 3.0])
 _FINER = 0.01
 _SCALES = 1.0 + _FINER * np.arange(-9, 10)
 """A scan fits at no more than one step beside the right one."""
-_FEET_M = 0.3048
 _BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
 _UNITS = (
     *((f"in {name}", metres, _BY.format(metres)) for name, metres in (
-        ("feet", _FEET_M), ("centimetres", 0.01), ("millimetres", 0.001), ("inches", 0.0254), ("kilometres", 1000.0)
+        ("feet", FEET_M), ("centimetres", 0.01), ("millimetres", 0.001), ("inches", 0.0254), ("kilometres", 1000.0)
     )),
-    ("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
+    ("in metres that were converted as if they were feet", 1.0 / FEET_M, "import it without converting feet"),
 )  # fmt: skip
 """Units that the map's numbers may have instead of metres: (name, metres, mend)."""
 

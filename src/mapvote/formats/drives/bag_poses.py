@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -195,8 +196,8 @@ def _ways_to_map(bag: Bag, frame: str) -> list[tuple[int, F64]]:
 
 def _way_at(ways: list[tuple[int, F64]], received_ns: int) -> F64:
     """The newest of ``ways`` at this time; the first one before it came."""
-    times = [time_ns for time_ns, _ in ways]
-    return ways[max(int(np.searchsorted(times, received_ns, side="right")) - 1, 0)][1]
+    after = bisect_right(ways, received_ns, key=lambda way: way[0])
+    return ways[max(after - 1, 0)][1]
 
 
 def _order_of_poses(bag: Bag, topic: str, times_ns: list[int], received_ns: list[int]) -> StampOrder:
