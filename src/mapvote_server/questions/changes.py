@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from threading import Lock
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
@@ -30,7 +29,7 @@ from mapvote_server.questions.explain import seen, sound_votes
 from mapvote_server.store.integrity import hurt_or_mended_since
 from mapvote_server.store.queries import load_tile, newest_seq, records_of, tile_of, tiles_that_differ, version_of
 from mapvote_server.store.retention import cleared_since
-from mapvote_server.store.store import Store
+from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import StoredVote
 from mapvote_server.work import check_time
 
@@ -102,8 +101,7 @@ class _Kept:
         return len(self._pairs) > KEPT_CHANGES.pairs or cells > KEPT_CHANGES.cells
 
 
-_kept: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
-_lock = Lock()
+_kept = PerStore(_Kept)
 
 
 def compare_versions(store: Store, old: int, new: int) -> Comparison:
@@ -111,8 +109,7 @@ def compare_versions(store: Store, old: int, new: int) -> Comparison:
 
     NotFound if one of the versions does not exist.
     """
-    with _lock:
-        kept = _kept.setdefault(store, _Kept())
+    kept = _kept.of(store)
     with store.database.reading() as connection:
         for number in (old, new):
             version_of(connection, number)

@@ -6,9 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from threading import Lock
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import sqlalchemy as sa
@@ -26,7 +24,7 @@ from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.database import Question
 from mapvote_server.store.queries import tile_as_of, version_of
-from mapvote_server.store.store import Store
+from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import Electorate, electorate_now, from_sound_ballots, judged_on
 
 
@@ -62,8 +60,7 @@ class _Kept:
         self.every: KeptTiles[_Tile] = KeptTiles()
 
 
-_kept: WeakKeyDictionary[Store, _Kept] = WeakKeyDictionary()
-_lock = Lock()
+_kept = PerStore(_Kept)
 
 
 @record()
@@ -80,14 +77,9 @@ class CoverageSizes:
 COVERAGE_SIZES = CoverageSizes()
 
 
-def _kept_of(store: Store) -> _Kept:
-    with _lock:
-        return _kept.setdefault(store, _Kept())
-
-
 def waiting_votes(store: Store) -> Waiting | None:
     """The changes that lack only the quorum; None if there are none. Tiles on which the quorum votes are not read."""
-    tiles = _kept_of(store).few
+    tiles = _kept.of(store).few
     with tiles.lock:
         with store.database.reading() as connection:
             now_ns = store.clock()
@@ -167,7 +159,7 @@ def wanted_passes(store: Store) -> dict[str, Any]:
     Besides, "cells" that one more vote would decide; "without_path", those of them that no drive with a path saw;
     "waits", text: what lacks only the quorum; "damaged" tiles, which are left out.
     """
-    tiles = _kept_of(store).every
+    tiles = _kept.of(store).every
     with tiles.lock:
         with store.database.reading() as connection:
             now_ns = store.clock()

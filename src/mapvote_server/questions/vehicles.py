@@ -13,9 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import chain
-from threading import Lock
 from typing import Any, Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
@@ -34,7 +32,7 @@ from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.policy import policy_in
 from mapvote_server.store.queries import load_blob, tiles_of, version_of
-from mapvote_server.store.store import Store
+from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import FOREVER, Electorate
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
@@ -77,8 +75,7 @@ def vehicle_standings(store: Store) -> list[VehicleStanding]:
 
     The state of the world (occupied or empty now) is compared, so votes on an older base count too.
     """
-    with _lock:
-        kept = _compared.setdefault(store, _AllCompared())
+    kept = _compared.of(store)
     with kept.tiles.lock:
         with store.database.reading() as connection:
             asked = Electorate(FOREVER, policy_in(connection), FOREVER)
@@ -132,8 +129,7 @@ class _AllCompared:
         self._sums[entry.vehicle] = Compared(entry.vehicle, *sums)
 
 
-_compared: WeakKeyDictionary[Store, _AllCompared] = WeakKeyDictionary()
-_lock = Lock()
+_compared = PerStore(_AllCompared)
 
 
 def standings_of(

@@ -48,7 +48,7 @@ from mapvote_server.store.queries import (
     version_of,
 )
 from mapvote_server.store.retention import clear
-from mapvote_server.store.store import Store
+from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
 
 _MOST_DETAIL = 400
@@ -259,13 +259,7 @@ class _Latest:
     judged: tuple[Round, Sequence[str]] | None = None
 
 
-_latest: WeakKeyDictionary[Store, _Latest] = WeakKeyDictionary()
-_lock = Lock()
-
-
-def _latest_of(store: Store) -> _Latest:
-    with _lock:
-        return _latest.setdefault(store, _Latest())
+_latest = PerStore(_Latest)
 
 
 def round_at(
@@ -278,7 +272,7 @@ def round_at(
     """
     if settings is not None:
         return _decide(store, now, settings, executor, every, None)
-    latest = _latest_of(store)
+    latest = _latest.of(store)
     with latest.deciding:
         known = latest.round
         if known is None or not _holds(store, known, now) or (every and not known.every):
@@ -368,7 +362,7 @@ def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
     held += doubts_of(store, found).holding(found.asked.settings)
     if gate is None or not asked.drive or not changed:
         return held
-    latest = _latest_of(store)
+    latest = _latest.of(store)
     with latest.judging:
         if latest.judged is None or latest.judged[0] is not found:
             old = store.point_map(found.newest.number)

@@ -14,7 +14,9 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 import sqlalchemy as sa
 
@@ -44,6 +46,8 @@ from mapvote_server.store.queries import (
     tiles_set_between,
     version_of,
 )
+
+Kept = TypeVar("Kept")
 
 
 def _digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
@@ -265,3 +269,20 @@ class Store:
     def _load(self, index: TileIndex, hashes: TileHashes) -> Tile:
         with self.database.reading() as connection:
             return load_tile(connection, self.lattice.tile(index), hashes)
+
+
+class PerStore(Generic[Kept]):
+    """One object for each open store, made when it is first needed and gone with the store; thread-safe."""
+
+    def __init__(self, make: Callable[[], Kept]) -> None:
+        self._make = make
+        self._lock = Lock()
+        self._of: WeakKeyDictionary[Store, Kept] = WeakKeyDictionary()
+
+    def of(self, store: Store) -> Kept:
+        """The object of a store."""
+        with self._lock:
+            kept = self._of.get(store)
+            if kept is None:
+                kept = self._of[store] = self._make()
+            return kept
