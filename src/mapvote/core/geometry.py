@@ -118,6 +118,11 @@ def interpolate(T_0: F64, T_1: F64, alpha: float) -> F64:
     return T_0 @ exp(alpha * log(inverse(T_0) @ T_1))
 
 
+def wrapped(angles_rad: F64) -> F64:
+    """(n,) the same angles between -pi and pi."""
+    return np.asarray((angles_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
 def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> F64:
     """Metres and radians; R = Rz(yaw) Ry(pitch) Rx(roll)."""
     cr = np.cos(roll)

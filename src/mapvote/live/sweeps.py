@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.core.record import record
-from mapvote.formats.drives.packets import Packets, direction_of
+from mapvote.formats.drives.packets import SWEEP_RULE, Packets, direction_of
 from mapvote.formats.drives.point_fields import point_cloud_table
 
 
@@ -25,18 +24,6 @@ class Cloud:
     """Stamp of the first of several packets."""
     packets: tuple[Cloud, ...] = ()
     """The packets in the order of their stamps; () if it came whole."""
-
-
-@record()
-@dataclass(frozen=True, slots=True)
-class SweepRule:
-    """Numbers by which clouds are joined to a revolution."""
-
-    revolutions: float = 0.55
-    """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
-
-
-SWEEP_RULE = SweepRule()
 
 
 class Revolutions:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy
 
-from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.geometry import from_xyz_rpy, wrapped
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError, PosePrior
 from mapvote.formats.geo.frame import MapFrame
@@ -60,11 +60,6 @@ class FixRules:
 FIX_RULES = FixRules()
 UNKNOWN_RAD = float(np.pi)
 """Standard deviation of a heading of which nothing is known."""
-
-
-def wrapped(angle_rad: F64) -> F64:
-    """(n,) the same angles between -pi and pi."""
-    return np.asarray(np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi)
 
 
 def _none() -> F64:

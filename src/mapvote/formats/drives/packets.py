@@ -9,8 +9,9 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import wrapped
 from mapvote.core.record import record
-from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.point_fields import PointReader
 
 Cloud = TypeVar("Cloud")
@@ -40,6 +41,18 @@ class PacketRule:
 
 
 PACKET_RULE = PacketRule()
+
+
+@record()
+@dataclass(frozen=True, slots=True)
+class SweepRule:
+    """How the clouds of several LiDARs are joined to one scan."""
+
+    revolutions: float = 0.55
+    """Revolutions within which they are one scan, live and recorded: the LiDARs may turn at opposite phases."""
+
+
+SWEEP_RULE = SweepRule()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +107,7 @@ class Packets(Generic[Cloud]):
         if not whole and len(self._held) < rule.looked_at:
             return []
         # Packets turn on, by much the same angle each.
-        turns = _wrapped(np.diff([one.middle_rad for one in self._held]))
+        turns = wrapped(np.diff([one.middle_rad for one in self._held]))
         step_rad = float(np.median(turns)) if len(turns) else 0.0
         one_way = float((np.sign(turns) == np.sign(step_rad)).mean()) if len(turns) else 0.0
         self.is_packets = not whole and abs(step_rad) >= rule.least_turn_rad and one_way >= rule.same_way
@@ -109,7 +122,7 @@ class Packets(Generic[Cloud]):
         """The revolution that is whole before this packet, if it is."""
         out: list[list[Cloud]] = []
         if self._open:
-            turn = float(_wrapped(np.array([packet.middle_rad - self._open[-1].middle_rad]))[0])
+            turn = float(wrapped(np.array([packet.middle_rad - self._open[-1].middle_rad]))[0])
             self._turned_rad += abs(turn) if turn * self._step_rad > 0.0 else 0.0
             full = self._turned_rad >= 2.0 * np.pi - 0.5 * abs(self._step_rad)
             if full or packet.stamp_ns - self._open[0].stamp_ns > self._rule.longest_ns:
@@ -146,8 +159,3 @@ def scan_of_packets(stamp_ns: int, stamps_ns: Sequence[int], reader: PointReader
             if number + 1 == len(stamps_ns) and not scans:
                 raise
     return replace(Scan.sweep(stamp_ns, scans), others=())
-
-
-def _wrapped(angles: F64) -> F64:
-    """Angles between -pi and pi."""
-    return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)

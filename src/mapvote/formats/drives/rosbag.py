@@ -21,12 +21,9 @@ from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.frames import T_from
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
-from mapvote.formats.drives.packets import PACKET_RULE, Packets, direction_of, scan_of_packets
+from mapvote.formats.drives.packets import PACKET_RULE, SWEEP_RULE, Packets, direction_of, scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, log
 from mapvote.formats.drives.stamp_order import in_order_of_stamps
-
-_SWEEP = 0.55
-"""Revolutions within which the scans of several LiDARs are one sweep: they may turn at opposite phases."""
 
 
 def open_rosbag(path: Path, options: DriveOptions) -> Drive:
@@ -130,7 +127,7 @@ def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     if len(topics) == 1:
         return [[message] for message in found]
     first_ns = np.array([message.stamp_ns for message in found if message.topic == 0])
-    reach_ns = _SWEEP * float(np.median(np.diff(first_ns))) if len(first_ns) > 1 else 0.0
+    reach_ns = SWEEP_RULE.revolutions * float(np.median(np.diff(first_ns))) if len(first_ns) > 1 else 0.0
     sweeps: list[list[_Message]] = []
     for message in sorted(found, key=lambda m: (m.stamp_ns, m.topic)):
         last = sweeps[-1] if sweeps else []
