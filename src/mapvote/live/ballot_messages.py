@@ -20,7 +20,8 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, I8, NO_VOTE, U8, CellState, MapvoteError
+from mapvote.core.types import F64, I8, U8, CellState, MapvoteError
+from mapvote.core.voting import plurality
 from mapvote.live.messages import CLOUD, MAP_FRAME, POSE, blank_message, cloud_of, header_of, to_cdr, typestore
 
 
@@ -117,11 +118,11 @@ def changes_cloud(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME, v
 
 
 def _states(planes: Planes) -> U8:
-    """(256, 256) the state of each cell; of a tally the one with most votes."""
+    """(256, 256) the state of each cell; of a tally the one with most votes, a tie is undetermined."""
     if planes.states is not None:
         return planes.states
     assert planes.tally is not None
-    return np.where(planes.tally.any(axis=-1), planes.tally.argmax(axis=-1), NO_VOTE).astype(np.uint8)
+    return plurality(planes.tally.astype(np.int32))
 
 
 def _coming(planes: Planes, window: Grid) -> F64:
