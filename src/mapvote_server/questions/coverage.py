@@ -157,7 +157,7 @@ def wanted_passes(store: Store) -> dict[str, Any]:
     metres, each in the direction to drive, with its decisions there; at most ``CoverageSizes.stretches``.
 
     Besides, "cells" that one more vote would decide; "without_path", those of them that no drive with a path saw;
-    "waits", text: what lacks only the quorum; "damaged" tiles, which are left out.
+    "waits", text: what lacks only the quorum; "damaged": tiles with standing ballots that cannot be read.
     """
     tiles = _kept.of(store).every
     with tiles.lock:
@@ -171,6 +171,8 @@ def wanted_passes(store: Store) -> dict[str, Any]:
                 return _driven(connection, store, ballot)
 
             def look(index: TileIndex) -> _Tile | None:
+                if not _vehicles_on(connection, index):
+                    return None
                 return _look(connection, newest, asked, store.lattice.tile(index), path_of)
 
             tiles.refresh(connection, asked, now_ns, look)

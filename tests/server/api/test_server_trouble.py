@@ -24,6 +24,7 @@ from live_server import mapvote, serving
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
+from mapvote_server.api.probe import PROBING
 from mapvote_server.store import schema
 from mapvote_server.store.store import Store
 from postgres_cluster import PostgresCluster
@@ -164,6 +165,7 @@ def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
         finally:
             postgres_cluster.start()
         assert put(http, "v1", "after").status_code == 201
+        time.sleep(PROBING.kept_s)  # a probe's answer holds for that long
         for path in ("/healthz", "/readyz"):
             assert http.get(path).status_code == 200
     assert standing(postgres_url) == {"before", "after"}

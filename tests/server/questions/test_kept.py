@@ -270,6 +270,7 @@ MATTER: dict[str, tuple[list[Step], Step]] = {
     "a damaged ballot": ([LACKS_ONE], ("spoil_ballot", 0)),
     "a damaged ballot that counted": (GONE, ("spoil_ballot", 0)),
     "a plane put back": ([LACKS_ONE, ("lose_plane", 0)], ("mend",)),
+    "a withdrawal where a plane is lost": ([LACKS_ONE, ("lose_plane", 0)], ("withdraw", "a")),
     "a ballot cleared away": (
         [("vote", "a", "d1", FIRST, "nothing", 1_000), ("vote", "b", "d1", FIRST, "wall gone"),
          ("vote", "b", "d2", [(0, 2)], "wall gone"), ("vote", "c", "d2", [(0, 2)], "wall gone"), ("publish",)],
