@@ -32,6 +32,19 @@ MOST_MODULE_NAMES = 1020
 """Names bound at the top level of modules, without functions and classes."""
 MOST_LOOSE_NUMBERS = 140
 """Numbers among them: those that kernels read, sizes of formats, bits and codes."""
+MOST_LOOSE_CONSTANTS = 552
+"""Constants at the top level of modules that are no part of a record; it may only fall."""
+TYPE_MAKERS = {"TypeVar", "ParamSpec", "NewType"}
+GENERICS = {
+    "Annotated", "Callable", "Iterable", "Iterator", "Literal", "Mapping", "NDArray", "Optional", "Sequence", "Union",
+    "dict", "frozenset", "list", "set", "tuple",
+}  # fmt: skip
+OBJECTS = {
+    "getLogger", "get_logger", "Decoder", "Encoder", "Table", "MetaData", "Question", "APIRouter", "Typer",
+    "ContextVar", "Lock", "local", "WeakKeyDictionary", "PerStore",
+}  # fmt: skip
+"""Objects that a module makes when it is loaded: loggers, decoders, tables of a database, prepared queries, routers,
+state of a thread or a store. They are no constants."""
 MOST_NAMES_WITH_SEVERAL_VALUES = 4
 MOST_PACKED_SHARE = 0.01
 """Share of assignments that pack several statements into one line."""
@@ -237,6 +250,50 @@ def unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[str, ast.expr]
             yield from unpacked(name, one)
 
 
+def top_level(module: ast.Module) -> Iterator[tuple[ast.expr, ast.expr]]:
+    """Target and value of every assignment at the top level of a module."""
+    for node in module.body:
+        if isinstance(node, ast.Assign):
+            yield node.targets[0], node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            yield node.target, node.value
+
+
+def last_name(called: ast.expr) -> str:
+    return ast.unparse(called).rsplit(".", maxsplit=1)[-1]
+
+
+def is_type(name: str, value: ast.expr) -> bool:
+    """An alias of a type, or a type variable."""
+    if isinstance(value, ast.Call):
+        return last_name(value.func) in TYPE_MAKERS
+    if isinstance(value, ast.Subscript):
+        return last_name(value.value) in GENERICS
+    is_union = isinstance(value, ast.BinOp) and isinstance(value.op, ast.BitOr)
+    return (is_union or isinstance(value, ast.Name)) and re.fullmatch(r"_?[A-Z][a-z]\w*", name) is not None
+
+
+def loose_constants(module: ast.Module) -> list[str]:
+    """Statements that bind a constant: no type, no object, no default instance of a record, no name of its field."""
+    records = {
+        node.name
+        for node in module.body
+        if isinstance(node, ast.ClassDef) and any(ast.unparse(d).startswith("record(") for d in node.decorator_list)
+    }
+    instances: set[str] = set()
+    loose = []
+    for target, value in top_level(module):
+        name = ast.unparse(target)
+        called = last_name(value.func) if isinstance(value, ast.Call) else ""
+        if called in records:
+            instances.add(name)
+        elif isinstance(value, ast.Attribute) and ast.unparse(value.value) in instances:
+            continue  # a kernel takes no record: its name is bound to the field
+        elif name != "__all__" and called not in OBJECTS and not is_type(name, value):
+            loose.append(name)
+    return loose
+
+
 def is_number(value: ast.expr) -> bool:
     if isinstance(value, ast.BinOp):
         return is_number(value.left) and is_number(value.right)
@@ -271,6 +328,32 @@ def test_numbers_lie_in_records() -> None:
     constants = [constant for source in SOURCES for constant in module_constants(source)]
     assert len(constants) <= MOST_MODULE_NAMES
     assert sum(is_number(value) for _, value in constants) <= MOST_LOOSE_NUMBERS
+
+
+def test_few_constants_are_loose() -> None:
+    loose = {str(source.relative_to(SRC)): loose_constants(parsed(source)) for source in SOURCES}
+    assert sum(map(len, loose.values())) <= MOST_LOOSE_CONSTANTS, {
+        room: names for room, names in loose.items() if names
+    }
+
+
+def test_records_types_and_objects_are_no_loose_constants() -> None:
+    """The check above can fail."""
+    told = """
+@record(votes=True)
+class Rule: side_m: float = 2.0
+RULE = Rule()
+SIDE_M = RULE.side_m
+Box = tuple[float, float]
+Word = str | int
+log = logging.getLogger("a")
+_ROWS = {1: "a"}
+_NAME = re.compile("a")
+_A, _B = 1, 2
+MASK = 1 | 2
+OTHER_M = OTHER.side_m
+"""
+    assert loose_constants(ast.parse(told)) == ["_ROWS", "_NAME", "(_A, _B)", "MASK", "OTHER_M"]
 
 
 def test_few_names_have_several_values() -> None:
