@@ -142,7 +142,8 @@ def with_changed(tiles: Mapping[TileIndex, Tile], changed: Mapping[TileIndex, Ti
     """``tiles`` with some in the place of theirs, or beside them; the others stay the objects that they are."""
     if not isinstance(tiles, LazyTiles):
         return dict(sorted({**tiles, **changed}.items()))
-    points = tiles.points_of | {index: len(tile.points) for index, tile in changed.items()}
+    counts = changed.points_of if isinstance(changed, LazyTiles) else {i: len(t.points) for i, t in changed.items()}
+    points = tiles.points_of | counts
     return LazyTiles(lambda index: changed[index] if index in changed else tiles[index], points, tiles.kept_points)
 
 

@@ -9,8 +9,6 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
 from mapvote.codec.ballot import tile_key
-from mapvote.codec.manifest import TileHashes
-from mapvote.core.tile import Tile
 from mapvote.shapes.geojson import feature_rows
 from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
@@ -30,7 +28,7 @@ from mapvote_server.api.schemas import (
     sends_bytes,
 )
 from mapvote_server.api.services import Parts, Reviewer, Services
-from mapvote_server.questions.desk import Desk, desk, review, verdict_of
+from mapvote_server.questions.desk import Desk, Proposed, desk, review, verdict_of
 from mapvote_server.store.reviews import undo
 
 router = APIRouter()
@@ -68,7 +66,7 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
             "waits": found.waits,
             "pending": found.pending,
         }
-        tiles = {tile_key(index): _hashes(*made) for index, made in found.edited.items()}
+        tiles = {tile_key(index): _hashes(made) for index, made in found.edited.items()}
         return as_json(answer | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
     listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
@@ -80,14 +78,14 @@ async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Respon
     return packed(request, (await _look(parts)).clouds, "no-store")
 
 
-def _hashes(hashes: TileHashes, tile: Tile) -> dict[str, str] | None:
-    return {"points": hashes.points, "ground": hashes.ground} if len(tile.points) else None
+def _hashes(made: Proposed) -> dict[str, str] | None:
+    return {"points": made.hashes.points, "ground": made.hashes.ground} if made.points else None
 
 
 async def _look(parts: Services) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
     found = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
-    parts.clouds.propose(found.edited.values())
+    parts.clouds.propose((made.hashes, made.make) for made in found.edited.values())
     return found
 
 

@@ -77,11 +77,11 @@ class Clouds:
         self._overview: tuple[int, bytes] = 0, b""
         self._coarse: dict[_Drawn, Levels] = {}
         """The tiles of the overview."""
-        self._proposed: Mapping[TileHashes, Tile] = {}
+        self._proposed: Mapping[TileHashes, Callable[[], Tile]] = {}
 
-    def propose(self, tiles: Iterable[tuple[TileHashes, Tile]]) -> None:
+    def propose(self, tiles: Iterable[tuple[TileHashes, Callable[[], Tile]]]) -> None:
         """Tiles of no version yet, as a publish would make them; :meth:`levels` serves them until the next call."""
-        self._proposed = {_drawn(hashes): tile for hashes, tile in tiles}
+        self._proposed = {_drawn(hashes): make for hashes, make in tiles}
 
     def levels(self, hashes: TileHashes) -> Levels:
         """The levels of one tile; NotFound if no version ever held it and none is proposed."""
@@ -91,7 +91,7 @@ class Clouds:
                 self._made.move_to_end(hashes)
                 return known
         proposed = self._proposed.get(hashes)
-        (tile,) = self._load(hashes) if proposed is None else (proposed,)
+        (tile,) = self._load(hashes) if proposed is None else (proposed(),)
         made = make_levels(tile.points, tile.ground_z, bright=self._bright(hashes, tile))
         with self._lock:
             if hashes not in self._made:

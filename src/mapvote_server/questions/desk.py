@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -18,7 +18,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
 from mapvote.fusion.loss_budget import PendingDeletions
-from mapvote.shapes.change_objects import ChangeObject, change_objects, changed_cells
+from mapvote.shapes.change_objects import ChangedCells, ChangeObject, change_objects, changed_cells
 from mapvote.shapes.geojson import to_geojson
 from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
@@ -31,6 +31,16 @@ from mapvote_server.store.store import Store
 
 _OF_REVIEW = "verdict."
 _lock = Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Proposed:
+    """A tile as a publish would make it."""
+
+    hashes: TileHashes
+    points: int
+    make: Callable[[], Tile]
+    """The tile itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +61,9 @@ class Desk:
     """Deletions beyond the policy's budget of false deletions, GeoJSON features."""
     reviewed: list[Review]
     """Held and rejected changes, which a publish leaves out."""
-    cells: Mapping[str, Mapping[TileIndex, Bool]]
-    """The cells of every change, by the change's id."""
-    edited: Mapping[TileIndex, tuple[TileHashes, Tile]]
+    objects: Mapping[str, ChangeObject]
+    """Pending changes by their ids."""
+    edited: Mapping[TileIndex, Proposed]
     """Tiles as a publish would make them."""
     clouds: bytes
     """Points that would be added and deleted, as :meth:`mapvote.shapes.packed_cloud.Clouds.changed` gives them."""
@@ -77,33 +87,40 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 def _desk_of(store: Store, found: Round) -> Desk:
     version = found.newest.number
     budget = found.asked.settings.false_deletions
-    before = [_tile(store, version, fused.index) for fused in found.changed]
-    tiles = [(tile, edited_tile(fused, tile)) for fused, tile in zip(found.changed, before, strict=True)]
-    decided = [fused.record for fused in found.changed if fused.record is not None]
-    objects = change_objects(
-        [changed_cells(*pair, [(record, ())]) for pair, record in zip(tiles, decided, strict=True)]
-    )
+    looked = [_look_at(store, version, fused) for fused in found.changed]
+    objects = change_objects([cells for cells, _ in looked])
     pending = to_geojson(
         objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
     )
     reviews = standing(store)
-    cells = {o.id: _cells_of(o) for o in objects}
+    known = {one.id: one for one in objects}
     for feature in pending["features"]:
-        mine = cells[feature["id"]]
+        mine = _cells_of(known[feature["id"]]) if reviews else {}
         feature["properties"]["verdict"] = next(
             (_verdict_json(r) for r, theirs in reviews if _meet(mine, theirs)), None
         )
-    cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
-    edited = {
-        new.index: (fused.hashes, new) for fused, (_, new) in zip(found.changed, tiles, strict=True) if fused.hashes
-    }
-    clouds = b"".join(came_and_went(old, new) for old, new in tiles)
+    edited = {fused.index: _proposed(store, version, fused) for fused in found.changed}
+    clouds = b"".join(cloud for _, cloud in looked)
     waiting = _waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
     lacking = None if found.changed else waiting_votes(store)
     waits = "" if lacking is None else str(lacking)
     doubts = doubts_of(store, found).told(found.asked.settings)
-    return Desk(version, [], doubts, waits, pending, waiting, left_out, cells, edited, clouds)
+    return Desk(version, [], doubts, waits, pending, waiting, left_out, known, edited, clouds)
+
+
+def _look_at(store: Store, version: int, fused: Fused) -> tuple[ChangedCells, bytes]:
+    """(changed cells of a tile that a publish would change, the points that would come and go)."""
+    before = _tile(store, version, fused.index)
+    after = edited_tile(fused, before)
+    record = fused.record
+    return changed_cells(before, after, [] if record is None else [(record, ())]), came_and_went(before, after)
+
+
+def _proposed(store: Store, version: int, fused: Fused) -> Proposed:
+    assert fused.hashes is not None
+    points = fused.points + fused.added - fused.deleted
+    return Proposed(fused.hashes, points, lambda: edited_tile(fused, _tile(store, version, fused.index)))
 
 
 def review(
@@ -126,7 +143,13 @@ def review(
     if change not in features:
         raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
     feature = features[change] | {"properties": features[change]["properties"] | {"verdict": None}}
-    return decide(store, verdict, feature, now.cells[change], by=by, comment=comment, after=after)
+    cells = _cells_of(now.objects[change]) if change in now.objects else _cells_of_review(store, change)
+    return decide(store, verdict, feature, cells, by=by, comment=comment, after=after)
+
+
+def _cells_of_review(store: Store, change: str) -> Mapping[TileIndex, Bool]:
+    """The cells of a change that was reviewed, by the id of its verdict."""
+    return next(cells for one, cells in standing(store) if f"{_OF_REVIEW}{one.seq}" == change)
 
 
 def verdict_of(review: Review) -> dict[str, Any]:

@@ -127,10 +127,11 @@ def _on_tile(
     fused: Fused, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings, known: _KnownVehicles
 ) -> Doubts:
     """The doubts about one tile. ``drives``: all that count there, of every vehicle and of a longer time."""
-    assert fused.record is not None
-    states = fused.record.states.reshape(-1)
+    record = fused.record
+    assert record is not None
+    states = record.states.reshape(-1)
     cells = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
-    tally = fused.record.tally.reshape(len(states), -1)[cells] // VOTE_UNIT
+    tally = record.tally.reshape(len(states), -1)[cells] // VOTE_UNIT
     votes_for = tally[np.arange(len(cells)), states[cells]]
     # The last word of every voter, also of those that are no more among the latest.
     named = by_voter(drives, settings)

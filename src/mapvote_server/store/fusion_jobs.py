@@ -11,7 +11,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import accumulate, groupby
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import sqlalchemy as sa
@@ -46,6 +46,7 @@ from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, address_of
 from mapvote_server.store.integrity import Damage, DamagedBallots
 from mapvote_server.store.queries import load_tile, tile_as_of
+from mapvote_server.store.spill import Bulk, Spill, Spilled
 from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
 
 
@@ -60,8 +61,8 @@ class JobSizes:
     """Groups of a round with an executor, at least: all its workers have work, and a round can be cancelled between
     groups."""
     sites: int = 32
-    """Tiles that are kept while groups are followed, at most, 2 MB each; and tiles that are kept open, about 6 MB
-    each."""
+    """Tiles that are kept while groups are followed, at most, 2 MB each; tiles that are kept open, about 6 MB each; and
+    tiles of which the large parts stay in memory, up to 2 MB each. Those of further tiles of a round lie on disk."""
 
 
 JOB_SIZES = JobSizes()
@@ -91,8 +92,8 @@ class Fused:
     """The result of fusing one tile."""
 
     index: TileIndex
-    record: Record | None
-    """The decision; None if the tile itself could not be read."""
+    bulk: Bulk | Spilled
+    """Its large parts, in memory or on disk."""
     vehicles: int
     points: int
     """Number of points before the edit."""
@@ -100,7 +101,6 @@ class Fused:
     deleted: int
     hashes: TileHashes | None
     """Hashes of the edited tile; None if the tile does not change."""
-    planes: Mapping[str, bytes]
     cells_gone: I64
     """Flat cells whose last obstacle was deleted."""
     cells_new: I64
@@ -118,14 +118,32 @@ class Fused:
     fell: Fallen = field(default_factory=Fallen.none)
     """Points that fell with a demolished object, see :class:`mapvote.fusion.fuse.Decision`; so are the next three."""
     waits: I64 = field(default_factory=lambda: _NO_CELLS)
-    undecided: Remains | None = None
+    is_undecided: bool = False
     noise: tuple[I64, U8] = field(default_factory=lambda: (_NO_CELLS, np.empty(0, np.uint8)))
     """(flat cells (n,), states by which their points come and go (n,)) where these are not the decided ones."""
 
     @classmethod
     def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
         """The result for a tile that cannot be read."""
-        return cls(index, None, 0, 0, 0, 0, None, {}, _NO_CELLS, _NO_CELLS, 0, None, damaged)
+        return cls(index, Bulk(), 0, 0, 0, 0, None, _NO_CELLS, _NO_CELLS, 0, None, damaged)
+
+    @property
+    def record(self) -> Record | None:
+        """The decision; None if the tile itself could not be read."""
+        return self._read().record
+
+    @property
+    def planes(self) -> Mapping[str, bytes]:
+        """Planes that the edited tile does not share with the one before, by hash."""
+        return self._read().planes or {}
+
+    @property
+    def undecided(self) -> Remains | None:
+        """Its remains, if tiles around it decide what falls in it."""
+        return self._read().undecided if self.is_undecided else None
+
+    def _read(self) -> Bulk:
+        return self.bulk if isinstance(self.bulk, Bulk) else self.bulk.read()
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +167,8 @@ class Open:
     def undecided(self) -> Remains | None:
         """Its remains."""
         return self.decision.undecided
+
+    is_undecided: ClassVar[bool] = True
 
     def packed(self) -> Fused:
         """The tile as it is."""
@@ -226,23 +246,23 @@ def _packed(task: Task, tile: Tile, edited: Tile, decision: Decision, standings:
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
     held, holds = (tile.obstacle_words, edited.obstacle_words) if hashes else (_NOWHERE, _NOWHERE)
     emptied, filled = emptied_and_filled(held.reshape(-1), holds.reshape(-1))
+    record = Record(
+        0,
+        pack_plane(decision.states, 1),  # quick rather than small
+        pack_tally(decision.tally),
+        pack_agreed(decision.odds, decision.states),
+        standings,
+        pack_edit_votes(decision.edit_votes),
+        pack_fell(decision.fell),
+    )
     return Fused(
         index=tile.index,
-        record=Record(
-            0,
-            pack_plane(decision.states, 1),  # quick rather than small
-            pack_tally(decision.tally),
-            pack_agreed(decision.odds, decision.states),
-            standings,
-            pack_edit_votes(decision.edit_votes),
-            pack_fell(decision.fell),
-        ),
+        bulk=Bulk(record, planes, decision.undecided),
         vehicles=decision.vehicles,
         points=len(tile.points),
         added=decision.added,
         deleted=decision.deleted,
         hashes=hashes,
-        planes=planes,
         cells_gone=emptied,
         cells_new=filled,
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
@@ -251,7 +271,7 @@ def _packed(task: Task, tile: Tile, edited: Tile, decision: Decision, standings:
         pending=decision.pending,
         fell=decision.fell,
         waits=decision.waits,
-        undecided=decision.undecided,
+        is_undecided=decision.undecided is not None,
         noise=(noise, decision.edits.reshape(-1)[noise]),
     )
 
@@ -310,19 +330,26 @@ class Watched(Executor):
 
 
 def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused | Open]:
-    """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another."""
+    """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another.
+
+    The first ``JobSizes.sites`` tiles stay in memory whole, the large parts of all others lie on disk.
+    """
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
     rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
     size = min(JOB_SIZES.group, max(1, len(tasks) // JOB_SIZES.round_groups)) if executor else JOB_SIZES.group
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
+    spill = Spill() if len(tasks) > JOB_SIZES.sites else None
     done: list[Fused | Open] = []
     unpacked = 0
     for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
         if isinstance(fused, Open):
             unpacked += 1
-        done.append(fused.packed() if isinstance(fused, Open) and unpacked > JOB_SIZES.sites else fused)
+        small = fused.packed() if isinstance(fused, Open) and unpacked > JOB_SIZES.sites else fused
+        if spill is not None and len(done) >= JOB_SIZES.sites and isinstance(small, Fused):
+            small = replace(small, bulk=spill.put(small.bulk)) if isinstance(small.bulk, Bulk) else small
+        done.append(small)
     return done
 
 
@@ -345,7 +372,7 @@ def settled(
 
     ``task_of`` gives the task of any tile: those around the round's tiles are fused too where they decide.
     """
-    undecided = {index: fused.undecided for index, fused in alone.items() if fused.undecided is not None}
+    undecided = _RemainsOf({index: fused for index, fused in alone.items() if fused.is_undecided})
 
     @lru_cache(maxsize=JOB_SIZES.sites)
     def remains_at(index: TileIndex) -> Remains:
@@ -354,8 +381,9 @@ def settled(
         if fused.undecided is not None:
             return fused.undecided
         assert isinstance(fused, Fused)
+        record = fused.record
         with database.reading() as connection:
-            return _solid() if fused.record is None else _remains_after(_tile(connection, task), fused, fused.record)
+            return _solid() if record is None else _remains_after(_tile(connection, task), fused, record)
 
     fallen = fall_across(undecided, remains_at)
     packed = {index: fused for index, fused in alone.items() if isinstance(fused, Fused)}
@@ -366,6 +394,24 @@ def settled(
         after_fall = one.after(more) if isinstance(one, Open) else None
         tiles[index] = after_fall or _fused_with(more, task_of(index), database)
     return Settled(tiles, packed, fallen.keys())
+
+
+class _RemainsOf(Mapping[TileIndex, Remains]):
+    """The remains of undecided tiles, each read when it is asked for."""
+
+    def __init__(self, fused: Mapping[TileIndex, Fused | Open]) -> None:
+        self._fused = fused
+
+    def __getitem__(self, index: TileIndex) -> Remains:
+        remains = self._fused[index].undecided
+        assert remains is not None
+        return remains
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        return iter(self._fused)
+
+    def __len__(self) -> int:
+        return len(self._fused)
 
 
 def _fused_with(fallen: Fallen, task: Task, database: Database) -> Fused:

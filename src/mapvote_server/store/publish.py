@@ -8,10 +8,12 @@ that writes it. If several publish at once, exactly one wins; the others get Con
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from threading import Lock
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,7 +25,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
-from mapvote.core.point_map import PointMap, with_changed
+from mapvote.core.point_map import LazyTiles, PointMap, with_changed
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, MapvoteError
 from mapvote.fusion.decision_record import Record
@@ -53,6 +55,9 @@ from mapvote_server.store.votes import Electorate, electorate_now, next_ripe_ns,
 
 _MOST_DETAIL = 400
 """Characters of an event."""
+_TILES_AT_ONCE = 32
+"""Tiles of which the planes are in memory while a version is written."""
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +129,7 @@ def publish(
     made_by = policy.model_dump(mode="json")
     version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
     tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
-    write_version(store, version, tiles, [f.planes for f in outcome.fused], outcome.fused, doubts=outcome.doubts)
+    write_version(store, version, tiles, (f.planes for f in outcome.fused), outcome.fused, doubts=outcome.doubts)
     if policy.keep.automatic:
         clear(store, by=by, dry_run=False)
     return replace(outcome, version=version.number, published=True)
@@ -189,16 +194,25 @@ def write_version(
                 told = f"v{version.number}: {doubt}"
                 log_event(connection, version.created_ns, "doubt", version.published_by, told[:_MOST_DETAIL])
             connection.execute(schema.versions.insert().values(**asdict(version)))
-            add_blobs(connection, {digest: data for some in planes for digest, data in some.items()})
+            for some in _parts(planes):
+                add_blobs(connection, {digest: data for one in some for digest, data in one.items()})
             set_tiles(connection, version.number, tiles)
-            rows = [_decision_row(version.number, one, one.record) for one in decided if one.record is not None]
-            if rows:
-                insert_rows(connection, schema.decisions, rows)
+            for fused in _parts(decided):
+                rows = [_decision_row(version.number, one, record) for one in fused if (record := one.record)]
+                if rows:
+                    insert_rows(connection, schema.decisions, rows)
             if unvoted is not None:
                 end_votes(connection, unvoted, seq)
     except IntegrityError as error:
         raise late from error
     return version
+
+
+def _parts(items: Iterable[Part]) -> Iterator[list[Part]]:
+    """The items, as many at a time as are written together."""
+    rest = iter(items)
+    while some := list(islice(rest, _TILES_AT_ONCE)):
+        yield some
 
 
 def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
@@ -366,12 +380,19 @@ def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
     with latest.judging:
         if latest.judged is None or latest.judged[0] is not found:
             old = store.point_map(found.newest.number)
-            edited = {
-                f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index)))
-                for f in changed
-            }
-            latest.judged = found, gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))
+            latest.judged = found, gate(asked, old, _after(store, old, changed))
         return [*held, *latest.judged[1]]
+
+
+def _after(store: Store, old: PointMap, changed: Sequence[Fused]) -> PointMap:
+    """The map as a publish would make it; its tiles are made when they are used."""
+    of = {fused.index: fused for fused in changed}
+
+    def edited(index: TileIndex) -> Tile:
+        return edited_tile(of[index], old.tiles.get(index) or Tile.empty(store.lattice.tile(index)))
+
+    points = {fused.index: fused.points + fused.added - fused.deleted for fused in changed}
+    return replace(old, tiles=with_changed(old.tiles, LazyTiles(edited, points)))
 
 
 def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
