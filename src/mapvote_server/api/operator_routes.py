@@ -52,11 +52,11 @@ from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Servic
 from mapvote_server.errors import Held, Unavailable
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.explain import CellStory, explain_cell
+from mapvote_server.questions.freshness import tiles_seen
 from mapvote_server.questions.history import Info, Log, log_of, overview
 from mapvote_server.questions.vehicles import (
     contradictions,
     standing_rows,
-    tiles_seen,
     vehicle_standings,
 )
 from mapvote_server.store import keys

@@ -35,8 +35,9 @@ from mapvote_server.errors import (
     Unavailable,
 )
 from mapvote_server.questions.explain import FARTHEST_M
+from mapvote_server.questions.freshness import CoveredTile
 from mapvote_server.questions.history import DatedVersion
-from mapvote_server.questions.vehicles import CoveredTile, VehicleStanding
+from mapvote_server.questions.vehicles import VehicleStanding
 from mapvote_server.store import keys
 from mapvote_server.store.integrity import Damage
 from mapvote_server.store.policy import Policy, names_in

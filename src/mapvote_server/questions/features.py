@@ -21,7 +21,7 @@ from mapvote.shapes.geojson import tile_squares
 from mapvote_server.errors import BadRequest
 from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.coverage import wanted_passes
-from mapvote_server.questions.vehicles import tiles_seen
+from mapvote_server.questions.freshness import tiles_seen
 from mapvote_server.store.store import Store
 
 CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"

@@ -25,9 +25,8 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.times import utc
 from mapvote.core.types import F32, I64
 from mapvote.shapes.geojson import collection
-from mapvote_server.answers import answer
 from mapvote_server.questions.contradictions import CONTRADICTIONS, Compared, Objects, compare, over_borders
-from mapvote_server.questions.explain import seen, votes_on
+from mapvote_server.questions.explain import votes_on
 from mapvote_server.questions.kept import KeptTiles
 from mapvote_server.store import schema
 from mapvote_server.store.policy import policy_in
@@ -208,35 +207,6 @@ def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
 def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
     """A row per vehicle, without the places."""
     return [{f.name: getattr(s, f.name) for f in fields(s) if f.name != "evidence"} for s in standings]
-
-
-@answer
-@dataclass(frozen=True, slots=True)
-class CoveredTile:
-    """Row and column of a tile, how many vehicles saw it, and when the last did."""
-
-    row: int
-    col: int
-    vehicles: int
-    last_seen: str | None
-
-
-def tiles_seen(store: Store, known: bool) -> list[CoveredTile]:
-    """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
-    ``known``, see :func:`mapvote_server.questions.explain.seen`."""
-    b = schema.ballots
-    t = schema.ballot_tiles
-    last = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
-    last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
-    with store.database.reading() as connection:
-        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
-            tiles_of(connection, version_of(connection).number), (None, 0)
-        )
-        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
-    return [
-        CoveredTile(row=index[0], col=index[1], vehicles=vehicles, last_seen=utc(seen(last_ns, known)))
-        for index, (last_ns, vehicles) in sorted(tiles.items())
-    ]
 
 
 MOST_PATHS = 500

@@ -27,6 +27,7 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
+from mapvote_server.questions.freshness import tiles_seen
 from mapvote_server.questions.vehicles import vehicle_standings
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import check, restore_plane
@@ -54,6 +55,8 @@ def oldest_of(store: Store) -> int:
 
 QUESTIONS: dict[str, Callable[[Store], object]] = {
     "vehicles": vehicle_standings,
+    "coverage": lambda store: tiles_seen(store, True),
+    "coverage by days": lambda store: tiles_seen(store, False),
     "waiting votes": waiting_votes,
     "wanted passes": wanted_passes,
     "changes": lambda store: changes_between(store, oldest_of(store), store.current()),

@@ -1,0 +1,120 @@
+"""When a vehicle last passed each tile: worked out once, then only for tiles that an event touched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.core.grid import TileIndex
+from mapvote.core.times import utc
+from mapvote_server.answers import answer
+from mapvote_server.questions.explain import seen
+from mapvote_server.store import schema
+from mapvote_server.store.database import DATABASE_SIZES, Question
+from mapvote_server.store.queries import newest_seq, tile_of, tiles_of, tiles_set_between, version_of
+from mapvote_server.store.retention import cleared_since
+from mapvote_server.store.store import PerStore, Store
+from mapvote_server.store.votes import standing_tiles
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class CoveredTile:
+    """Row and column of a tile, how many vehicles saw it, and when the last did."""
+
+    row: int
+    col: int
+    vehicles: int
+    last_seen: str | None
+
+
+def tiles_seen(store: Store, known: bool) -> list[CoveredTile]:
+    """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
+    ``known``, see :func:`mapvote_server.questions.explain.seen`."""
+    kept = _kept.of(store)
+    with kept.lock:
+        with store.database.reading() as connection:
+            kept.refresh(connection)
+        return kept.told(known)
+
+
+class _Seen:
+    """The tiles of one store as of the last event that they know of."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        """To be held while they are used."""
+        self._mark: int | None = None
+        self._version = 0
+        self._tiles: dict[TileIndex, tuple[int, int | None]] = {}
+        """(vehicles, end of the last drive)."""
+        self._rows: dict[bool, dict[TileIndex, CoveredTile]] = {True: {}, False: {}}
+        """What was told, by whether the asker may know exact times; without tiles that have changed since."""
+
+    def refresh(self, connection: sa.Connection) -> None:
+        """Read the tiles on which ballots came or went, or which a version set: all of them at first, and once ballots
+        were cleared away."""
+        mark = newest_seq(connection)
+        last = self._mark
+        newest = version_of(connection).number
+        if last is None or cleared_since(connection, last):
+            touched = None
+        elif last == mark:
+            return
+        else:
+            touched = {*standing_tiles(connection, mark, last), *tiles_set_between(connection, self._version, newest)}
+        if touched is None or len(touched) > DATABASE_SIZES.one_by_one:
+            self._put_all(connection, newest)
+        else:
+            self._put(connection, newest, touched)
+        self._version = newest
+        self._mark = mark
+
+    def _put_all(self, connection: sa.Connection, newest: int) -> None:
+        found: dict[TileIndex, tuple[int, int | None]] = dict.fromkeys(tiles_of(connection, newest), (0, None))
+        found |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(_ON_EVERY)}
+        for rows in self._rows.values():
+            for index in [index for index in rows if found.get(index) != self._tiles.get(index)]:
+                del rows[index]
+        self._tiles = dict(sorted(found.items()))
+
+    def _put(self, connection: sa.Connection, newest: int, touched: Iterable[TileIndex]) -> None:
+        count = len(self._tiles)
+        for index in touched:
+            vehicles, last_ns = tuple(_ON_ONE.ask(connection, row=index[0], col=index[1]).one())
+            for rows in self._rows.values():
+                rows.pop(index, None)
+            if vehicles or tile_of(connection, newest, index) is not None:
+                self._tiles[index] = vehicles, last_ns
+            else:
+                self._tiles.pop(index, None)
+        if len(self._tiles) != count:
+            self._tiles = dict(sorted(self._tiles.items()))
+
+    def told(self, known: bool) -> list[CoveredTile]:
+        """All of them, in ascending order."""
+        rows = self._rows[known]
+        for index, (vehicles, last_ns) in self._tiles.items():
+            if index not in rows:
+                rows[index] = CoveredTile(*index, vehicles, utc(seen(last_ns, known)))
+        return [rows[index] for index in self._tiles]
+
+
+_kept = PerStore(_Seen)
+_B, _T = schema.ballots.c, schema.ballot_tiles.c
+_VEHICLES: sa.ColumnElement[Any] = sa.func.count(sa.distinct(_B.vehicle))
+_ON_ONE = Question(
+    sa.select(_VEHICLES, sa.func.max(_B.end_ns))
+    .join(schema.ballot_tiles, _T.ballot == _B.seq)
+    .where(_B.gone_seq.is_(None), _T.row == sa.bindparam("row"), _T.col == sa.bindparam("col"))
+)
+_ON_EVERY = (
+    sa.select(_T.row, _T.col, _VEHICLES, sa.func.max(_B.end_ns))
+    .join(schema.ballots, _T.ballot == _B.seq)
+    .where(_B.gone_seq.is_(None))
+    .group_by(_T.row, _T.col)
+)
