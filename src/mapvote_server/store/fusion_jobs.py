@@ -329,7 +329,9 @@ class Watched(Executor):
             self._report(done, sum(sizes))
 
 
-def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused | Open]:
+def fuse_round(
+    tasks: Sequence[Task], database: Database, executor: Executor | None = None, sizes: JobSizes = JOB_SIZES
+) -> list[Fused | Open]:
     """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another.
 
     The first ``JobSizes.sites`` tiles stay in memory whole, the large parts of all others lie on disk.
@@ -337,17 +339,17 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
     rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
-    size = min(JOB_SIZES.group, max(1, len(tasks) // JOB_SIZES.round_groups)) if executor else JOB_SIZES.group
+    size = min(sizes.group, max(1, len(tasks) // sizes.round_groups)) if executor else sizes.group
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
-    spill = Spill() if len(tasks) > JOB_SIZES.sites else None
+    spill = Spill() if len(tasks) > sizes.sites else None
     done: list[Fused | Open] = []
     unpacked = 0
     for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
         if isinstance(fused, Open):
             unpacked += 1
-        small = fused.packed() if isinstance(fused, Open) and unpacked > JOB_SIZES.sites else fused
-        if spill is not None and len(done) >= JOB_SIZES.sites and isinstance(small, Fused):
+        small = fused.packed() if isinstance(fused, Open) and unpacked > sizes.sites else fused
+        if spill is not None and len(done) >= sizes.sites and isinstance(small, Fused):
             small = replace(small, bulk=spill.put(small.bulk)) if isinstance(small.bulk, Bulk) else small
         done.append(small)
     return done

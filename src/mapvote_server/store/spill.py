@@ -35,7 +35,7 @@ class Spill:
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
         self._lock = Lock()
         self._end = 0
         weakref.finalize(self, self._file.close)
@@ -46,15 +46,13 @@ class Spill:
         with self._lock:
             start = self._end
             self._end += len(data)
-            try:
-                self._file.seek(start)
-                self._file.write(data)
-                self._file.flush()
-            except OSError as error:
-                mend = "free space there, or set TMPDIR to a larger disk"
-                raise Unavailable(
-                    f"no room for a round in {tempfile.gettempdir()} ({error.strerror}): {mend}"
-                ) from error
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.pwrite(self._file.fileno(), rest, start + len(data) - len(rest)) :]
+        except OSError as error:
+            mend = "free space there, or set TMPDIR to a larger disk"
+            raise Unavailable(f"no room for a round in {tempfile.gettempdir()} ({error.strerror}): {mend}") from error
         return Spilled(self, start, len(data))
 
     def read(self, start: int, size: int) -> Bulk:
