@@ -46,7 +46,7 @@ from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, address_of
 from mapvote_server.store.integrity import Damage, DamagedBallots
 from mapvote_server.store.queries import load_tile, tile_as_of
-from mapvote_server.store.spill import Bulk, Spill, Spilled
+from mapvote_server.store.round_file import Bulk, OnDisk, RoundFile
 from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
 
 
@@ -92,7 +92,7 @@ class Fused:
     """The result of fusing one tile."""
 
     index: TileIndex
-    bulk: Bulk | Spilled
+    bulk: Bulk | OnDisk
     """Its large parts, in memory or on disk."""
     vehicles: int
     points: int
@@ -342,15 +342,15 @@ def fuse_round(
     size = min(sizes.group, max(1, len(tasks) // sizes.round_groups)) if executor else sizes.group
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
-    spill = Spill() if len(tasks) > sizes.sites else None
+    file = RoundFile() if len(tasks) > sizes.sites else None
     done: list[Fused | Open] = []
     unpacked = 0
     for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
         if isinstance(fused, Open):
             unpacked += 1
         small = fused.packed() if isinstance(fused, Open) and unpacked > sizes.sites else fused
-        if spill is not None and len(done) >= sizes.sites and isinstance(small, Fused):
-            small = replace(small, bulk=spill.put(small.bulk)) if isinstance(small.bulk, Bulk) else small
+        if file is not None and len(done) >= sizes.sites and isinstance(small, Fused):
+            small = replace(small, bulk=file.put(small.bulk)) if isinstance(small.bulk, Bulk) else small
         done.append(small)
     return done
 

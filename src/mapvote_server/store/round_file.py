@@ -28,7 +28,7 @@ class Bulk:
     """Its remains, if tiles around it decide what falls in it."""
 
 
-class Spill:
+class RoundFile:
     """A file without a name that ends with its last reader; thread-safe.
 
     It lies in the folder for temporary files (``TMPDIR``).
@@ -40,7 +40,7 @@ class Spill:
         self._end = 0
         weakref.finalize(self, self._file.close)
 
-    def put(self, bulk: Bulk) -> Spilled:
+    def put(self, bulk: Bulk) -> OnDisk:
         """Write one tile's parts. Unavailable if the disk is full."""
         data = compress(pickle.dumps(bulk, protocol=5), 1)
         with self._lock:
@@ -53,7 +53,7 @@ class Spill:
         except OSError as error:
             mend = "free space there, or set TMPDIR to a larger disk"
             raise Unavailable(f"no room for a round in {tempfile.gettempdir()} ({error.strerror}): {mend}") from error
-        return Spilled(self, start, len(data))
+        return OnDisk(self, start, len(data))
 
     def read(self, start: int, size: int) -> Bulk:
         """Parts that were written there."""
@@ -62,13 +62,13 @@ class Spill:
 
 
 @dataclass(frozen=True, slots=True)
-class Spilled:
+class OnDisk:
     """The place of one tile's large parts."""
 
-    spill: Spill
+    file: RoundFile
     start: int
     size: int
 
     def read(self) -> Bulk:
         """The parts, read again at each call."""
-        return self.spill.read(self.start, self.size)
+        return self.file.read(self.start, self.size)

@@ -13,7 +13,7 @@ from hand_made import make_map, make_tile, wall
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import address_of
 from mapvote_server.store.fusion_jobs import JOB_SIZES, Fused, Task, fuse_round
-from mapvote_server.store.spill import Bulk, Spill, Spilled
+from mapvote_server.store.round_file import Bulk, OnDisk, RoundFile
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import electorate_now
 from stores import WALL, vote_gone
@@ -39,18 +39,18 @@ def test_a_round_on_disk_decides_what_it_decides_in_memory(tmp_path: Path) -> No
         assert one.deleted == other.deleted == 2 * len(WALL)
         assert one.planes == other.planes != {}
         assert one.record == other.record is not None
-    assert [isinstance(one.bulk, Spilled) for one in there if isinstance(one, Fused)] == [False, True, True]
-    assert not any(isinstance(one.bulk, Spilled) for one in here if isinstance(one, Fused))
+    assert [isinstance(one.bulk, OnDisk) for one in there if isinstance(one, Fused)] == [False, True, True]
+    assert not any(isinstance(one.bulk, OnDisk) for one in here if isinstance(one, Fused))
 
 
 def test_a_full_disk_is_named_with_its_folder(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(small_disk))
-    spill = Spill()
+    file = RoundFile()
     noise = np.random.default_rng(1)
 
     def fill() -> None:
         for _ in range(20):
-            spill.put(Bulk(planes={"a": noise.bytes(1 << 20)}))
+            file.put(Bulk(planes={"a": noise.bytes(1 << 20)}))
 
     with pytest.raises(Unavailable, match=f"no room for a round in {small_disk} .*TMPDIR"):
         fill()
