@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any
 
 import sqlalchemy as sa
 
@@ -75,8 +74,12 @@ class _Seen:
         self._mark = mark
 
     def _put_all(self, connection: sa.Connection, newest: int) -> None:
+        b = schema.ballots.c
+        t = schema.ballot_tiles.c
+        passed = sa.select(t.row, t.col, sa.func.count(sa.distinct(b.vehicle)), sa.func.max(b.end_ns))
+        passed = passed.join(schema.ballots, t.ballot == b.seq).where(b.gone_seq.is_(None)).group_by(t.row, t.col)
         found: dict[TileIndex, tuple[int, int | None]] = dict.fromkeys(tiles_of(connection, newest), (0, None))
-        found |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(_ON_EVERY)}
+        found |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(passed)}
         for rows in self._rows.values():
             for index in [index for index in rows if found.get(index) != self._tiles.get(index)]:
                 del rows[index]
@@ -105,16 +108,9 @@ class _Seen:
 
 
 _kept = PerStore(_Seen)
-_B, _T = schema.ballots.c, schema.ballot_tiles.c
-_VEHICLES: sa.ColumnElement[Any] = sa.func.count(sa.distinct(_B.vehicle))
 _ON_ONE = Question(
-    sa.select(_VEHICLES, sa.func.max(_B.end_ns))
-    .join(schema.ballot_tiles, _T.ballot == _B.seq)
-    .where(_B.gone_seq.is_(None), _T.row == sa.bindparam("row"), _T.col == sa.bindparam("col"))
-)
-_ON_EVERY = (
-    sa.select(_T.row, _T.col, _VEHICLES, sa.func.max(_B.end_ns))
-    .join(schema.ballots, _T.ballot == _B.seq)
-    .where(_B.gone_seq.is_(None))
-    .group_by(_T.row, _T.col)
+    sa.select(sa.func.count(sa.distinct(schema.ballots.c.vehicle)), sa.func.max(schema.ballots.c.end_ns))
+    .join(schema.ballot_tiles, schema.ballot_tiles.c.ballot == schema.ballots.c.seq)
+    .where(schema.ballots.c.gone_seq.is_(None), schema.ballot_tiles.c.row == sa.bindparam("row"))
+    .where(schema.ballot_tiles.c.col == sa.bindparam("col"))
 )

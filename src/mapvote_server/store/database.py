@@ -127,7 +127,7 @@ class Question:
     """A statement without lists, asked for every tile or in every publish: made into SQL once for each kind of
     database, for SQLAlchemy's own work takes longer than the database's."""
 
-    def __init__(self, statement: sa.Select[Any] | sa.CompoundSelect[Any]) -> None:
+    def __init__(self, statement: sa.Select[*tuple[Any, ...]] | sa.CompoundSelect[*tuple[Any, ...]]) -> None:
         self._statement = statement
         self._made: dict[str, SQLCompiler] = {}
 

@@ -33,7 +33,7 @@ from mapvote_server.errors import Conflict, Held
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of, insert_rows
 from mapvote_server.store.doubts import Doubts, doubts_about
-from mapvote_server.store.fusion_jobs import Fused, Task, edited_tile, fuse_round, settled
+from mapvote_server.store.fusion_jobs import JOB_SIZES, Fused, Task, edited_tile, fuse_round, settled
 from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote_server.store.policy import GatePolicy
 from mapvote_server.store.queries import (
@@ -55,8 +55,6 @@ from mapvote_server.store.votes import Electorate, electorate_now, next_ripe_ns,
 
 _MOST_DETAIL = 400
 """Characters of an event."""
-_TILES_AT_ONCE = 32
-"""Tiles of which the planes are in memory while a version is written."""
 Part = TypeVar("Part")
 
 
@@ -209,9 +207,9 @@ def write_version(
 
 
 def _parts(items: Iterable[Part]) -> Iterator[list[Part]]:
-    """The items, as many at a time as are written together."""
+    """The items, ``JobSizes.sites`` at a time."""
     rest = iter(items)
-    while some := list(islice(rest, _TILES_AT_ONCE)):
+    while some := list(islice(rest, JOB_SIZES.sites)):
         yield some
 
 
