@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-_SOON_S = 0.05
-
 
 def main() -> None:
     """Run the command line. Ctrl-C ends it with one line and exit code 130, also while it still imports."""
@@ -32,7 +30,8 @@ def _interrupt_again(lost: UnraisableHookArgs) -> None:
     """Python drops what is raised while it takes an object away: a Ctrl-C that comes just then is sent once more."""
     if issubclass(lost.exc_type, KeyboardInterrupt):
         main_thread = threading.main_thread().ident or 0
-        again = threading.Timer(_SOON_S, signal.pthread_kill, (main_thread, signal.SIGINT))  # here it would be lost too
+        soon_s = 0.05  # at once, it would be lost too
+        again = threading.Timer(soon_s, signal.pthread_kill, (main_thread, signal.SIGINT))
         again.daemon = True
         again.start()
     else:

@@ -325,9 +325,6 @@ CASES: dict[str, dict[str, bool]] = {
 """The paper's five cases as settings of the one rule (paper V)."""
 
 
-ENV_PREFIX = "MAPVOTE_"
-
-
 def did_you_mean(key: str, known: Iterable[str]) -> str:
     """ "; did you mean 'x'?" for the known name nearest to ``key``, or "" if none is near."""
     near = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
@@ -401,9 +398,10 @@ def _from_file(path: Path | str | None) -> Iterable[tuple[str, str, Any, str]]:
 
 def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
     """Variables MAPVOTE_SECTION__KEY; pydantic turns their text into numbers."""
+    prefix = "MAPVOTE_"
     for name in sorted(env):
-        section, found, key = name.removeprefix(ENV_PREFIX).lower().partition("__")
-        if name.startswith(ENV_PREFIX) and found:
+        section, separator, key = name.removeprefix(prefix).lower().partition("__")
+        if name.startswith(prefix) and separator:
             yield section, key, env[name], name
 
 

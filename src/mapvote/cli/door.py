@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from mapvote.formats.maps.tiling import Look, Pieces
     from mapvote.perception.frontend import DriveReport
 
-_SQLITE = b"SQLite format 3\0"
-
 
 def is_url(name: str) -> bool:
     """Whether this is a server's address."""
@@ -46,9 +44,10 @@ def is_store(name: str) -> bool:
     """Whether this is a database's address, or an SQLite file."""
     if name == "-" or ("://" in name and not is_url(name)):
         return True
+    magic = b"SQLite format 3\0"
     try:
         with Path(name).open("rb") as file:
-            return file.read(len(_SQLITE)) == _SQLITE
+            return file.read(len(magic)) == magic
     except OSError:
         return False
 

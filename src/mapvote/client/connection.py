@@ -12,9 +12,6 @@ import httpx2
 
 from mapvote.core.types import MapvoteError
 
-_PASSING = {429, 500, 502, 503, 504}
-"""Answers that may be better next time."""
-
 
 class Unreachable(MapvoteError):
     """The server did not answer, or not now."""
@@ -26,6 +23,11 @@ class Refused(MapvoteError):
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
         self.status = status
+
+    @property
+    def of_key(self) -> bool:
+        """Whether the key is missing, unknown or not allowed to do this: a new key mends it."""
+        return self.status in (401, 403)
 
 
 class Connection:
@@ -80,7 +82,7 @@ class Connection:
                 continue
             except (httpx2.InvalidURL, httpx2.UnsupportedProtocol) as error:
                 raise MapvoteError(f"{self.url}: is no address of a server ({error})") from error
-            if answer.status_code in _PASSING:
+            if answer.status_code in (429, 500, 502, 503, 504):  # the next answer may be better
                 trouble = detail_of(answer)
                 wait_s = _asked_to_wait_s(answer)
                 if wait_s > self._longest_wait_s:

@@ -34,8 +34,6 @@ from mapvote.formats.reading import first_bytes, read_whole
 Sent = Literal["created", "replaced", "repeated", "spooled"]
 Region = tuple[float, float, float, float]
 """x and y of the lower left corner, x and y of the upper right one, map metres."""
-_KEEP_WAITING = {401, 403}
-"""Refusals that a new key mends."""
 
 
 _DECODER = msgspec.json.Decoder(Manifest)  # made when the module is loaded: see codec/ballot.py
@@ -173,12 +171,12 @@ class MapClient:
         except Unreachable:
             return "spooled"
         except Refused as error:
-            if error.status in _KEEP_WAITING:
-                told = f"{error}; the ballot waits in {waiting}: it is sent with the next one, by a key that may"
-                raise Refused(told, error.status) from error
+            if error.of_key:
+                mend = f"the ballot waits in {waiting}: it is sent with the next one, by a key that may"
+                raise Refused(f"{error}; {mend}", error.status) from error
             kept = self._spool.set_aside(waiting)
-            told = f"{error}; the ballot is kept in {kept}" + (_VOTE_AGAIN if error.status == 409 else "")
-            raise Refused(told, error.status) from error
+            mend = ": fetch the map and vote again with that drive" if error.status == 409 else ""
+            raise Refused(f"{error}; the ballot is kept in {kept}{mend}", error.status) from error
         self._spool.sent(waiting)
         result: Sent = answer.json()["result"]
         return result
@@ -257,9 +255,6 @@ class MapClient:
                 return
             (self._planes / name).unlink(missing_ok=True)
             size -= others[name].st_size
-
-
-_VOTE_AGAIN = ": fetch the map and vote again with that drive"
 
 
 def _meets(window: Grid, region: Region) -> bool:

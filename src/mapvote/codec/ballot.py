@@ -300,7 +300,6 @@ def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
 PLACES = 32
 """Places along a voxel's side that a point may have."""
 _POINT_BYTES = 9
-_MAX_POINT_BYTES = CELLS * BALLOT_LIMITS.points_per_cell * _POINT_BYTES
 _TOP_M = 1e5
 
 
@@ -314,7 +313,8 @@ def pack_points(points: F32) -> bytes:
 def unpack_points(data: bytes) -> F32:
     """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite, outside the tile, or if one cell
     holds more than it may."""
-    raw = np.frombuffer(unpack_bytes(data, _MAX_POINT_BYTES, "ballot: new_points"), dtype=np.uint8)
+    most_bytes = CELLS * BALLOT_LIMITS.points_per_cell * _POINT_BYTES
+    raw = np.frombuffer(unpack_bytes(data, most_bytes, "ballot: new_points"), dtype=np.uint8)
     if len(raw) % _POINT_BYTES:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
     points = np.empty((len(raw) // _POINT_BYTES, 3), dtype=np.float32)
@@ -401,7 +401,6 @@ MOST_STEPS = 127
 """31.75 nats: beyond all that anybody can know."""
 UNSAID = -128
 """Where no confidence is stated; no ballot holds it."""
-_CO, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)  # against a CellState numpy compares in int64
 
 
 def in_steps(log_odds: F64) -> I8:
@@ -416,7 +415,10 @@ def in_nats(steps: I8) -> F64:
 
 def changed_cells_of(states: U8) -> I64:
     """(m,) flat cells that the states (256, 256) call changed, ascending."""
-    return np.flatnonzero((states == _CO) | (states == _CE))
+    # Against a CellState numpy compares in int64.
+    occupied = int(CellState.CHANGED_OCCUPIED)
+    empty = int(CellState.CHANGED_EMPTY)
+    return np.flatnonzero((states == occupied) | (states == empty))
 
 
 def pack_odds(steps: I8) -> bytes:

@@ -29,7 +29,6 @@ else:
 FRAME_HEAD = 18
 """Bytes of the longest header of a zstd frame (RFC 8878, 3.1.1.1)."""
 _own = threading.local()
-_QUICK = 3
 _WAY, _WORD = 2, 8
 """Bytes of the way to a cell, and of its word."""
 _BITS = np.arange(64, dtype=np.uint64)
@@ -41,10 +40,10 @@ gain nothing above level 3."""
 def compress(raw: bytes | memoryview, level: int = ZSTD_LEVEL) -> bytes:
     """One zstd frame that states the size of its content.
 
-    Each thread keeps one compressor for each quick level: making one takes as long as packing a small plane. Those of
-    high levels hold tens of megabytes, and are made in a hundredth of the time that a plane takes them.
+    Each thread keeps one compressor for each quick level, up to 3: making one takes as long as packing a small plane.
+    Those of high levels hold tens of megabytes, and are made in a hundredth of the time that a plane takes them.
     """
-    if level > _QUICK:
+    if level > 3:
         return zstd.compress(raw, level)
     own: dict[int, zstd.ZstdCompressor] = _own.__dict__.setdefault("compressors", {})
     if level not in own:

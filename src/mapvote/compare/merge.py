@@ -29,9 +29,6 @@ from mapvote.survey.clean_map import specks, strays
 from mapvote.survey.driven_road import road_under
 from mapvote.survey.pose_graph import Anchors, Links, optimise
 
-_MOST_MAPS = 64
-"""Bits of a point's sources."""
-
 
 @record()
 @dataclass(frozen=True, slots=True)
@@ -72,8 +69,9 @@ def merge_maps(maps: Sequence[PointMap], *, most_apart_m: float = MERGING.most_a
     MapvoteError, with figures, if a map overlaps no other one, is bent, or lies more than ``most_apart_m`` off another
     (median of the patches).
     """
-    if not 2 <= len(maps) <= _MOST_MAPS:
-        raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
+    most = 64  # bits of a point's sources
+    if not 2 <= len(maps) <= most:
+        raise MapvoteError(f"merge: give 2 to {most} maps, not {len(maps)}; merge more in steps")
     clouds = [all_points(one) for one in maps]
     pairs = {}
     reasons = {}

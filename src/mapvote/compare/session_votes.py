@@ -35,9 +35,6 @@ from mapvote.perception.raycast import CLEARANCE_M
 from mapvote.rules.voter import NewPoints, TileVotes
 from mapvote.vehicle import write_ballot
 
-_LOW = np.uint64(0b11) | BAND
-"""Voxels that are deleted with an object in BAND, and above them those that hang together with it."""
-
 
 @record(votes=True)
 @dataclass(frozen=True, slots=True)
@@ -166,7 +163,7 @@ def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
 def _hanging_together(words: U64) -> U64:
     """(n,) the lowest voxels of each column, and those above them without a gap of two: a car, not the crown of the
     tree that it stood under."""
-    out = words & _LOW
+    out = words & (np.uint64(0b11) | BAND)
     while True:
         more = words & ((out << np.uint64(1)) | (out << np.uint64(2)))
         if not (more & ~out).any():

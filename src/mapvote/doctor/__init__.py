@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from mapvote.core.types import F64, MapvoteError
 
 Severity = Literal["error", "warning", "note"]
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, in all)."""
-_ORDER = {"error": 0, "warning": 1, "note": 2}
 
 
 Rule = Callable[[F64], F64]
@@ -58,7 +57,7 @@ def any_error(found: Iterable[Finding]) -> bool:
 
 def in_order(found: Iterable[Finding]) -> list[Finding]:
     """Errors first; duplicates once."""
-    return sorted(dict.fromkeys(found), key=lambda f: _ORDER[f.severity])
+    return sorted(dict.fromkeys(found), key=lambda finding: get_args(Severity).index(finding.severity))
 
 
 def usable(path: str, found: list[Finding]) -> list[Finding]:

@@ -32,9 +32,6 @@ from mapvote.formats import is_cloud, open_drive_on
 from mapvote.formats.drives.rosbag import open_rosbag
 from mapvote.formats.registry import drive_format
 
-_CHANGED = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
-_DETERMINED = (CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY, *_CHANGED)
-
 
 @record()
 @dataclass(frozen=True, slots=True)
@@ -195,8 +192,8 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     except MapvoteError as error:
         yield Finding("error", str(error), "cast it again from the drive, or copy it again")
         return
-    changed = int(counts[list(_CHANGED)].sum())
-    determined = int(counts[list(_DETERMINED)].sum())
+    changed = int(counts[[CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]].sum())
+    determined = changed + int(counts[[CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY]].sum())
     if not ballot.tiles:
         what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
         yield Finding("error", what, "see mapvote doctor DRIVE --map MAP")

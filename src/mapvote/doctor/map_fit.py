@@ -81,23 +81,17 @@ class MapFitRule:
     """Greatest part of such a shift across the road, as a share of that along it."""
     least_rows: int = 2
     """Rows that a shift of time is at least."""
+    scale_step: float = 0.01
+    """Step of the scales that are tried: a scan fits at no more than one step beside the right one."""
+    scale_steps: int = 9
+    """Steps up and down that are tried."""
+    grid_m: float = 6.0
+    """Half a side of the grid of places around a guess that does not fit, metres; its step is 1 m."""
+    grid_deg: float = 3.0
+    """Turn to either side that each place of the grid is tried with, degrees."""
 
 
 MAP_FIT_RULE = MapFitRule()
-_MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
-_OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
-_YAWS = np.radians([0.0, -3.0, 3.0])
-_FINER = 0.01
-_SCALES = 1.0 + _FINER * np.arange(-9, 10)
-"""A scan fits at no more than one step beside the right one."""
-_BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
-_UNITS = (
-    *((f"in {name}", metres, _BY.format(metres)) for name, metres in (
-        ("feet", FEET_M), ("centimetres", 0.01), ("millimetres", 0.001), ("inches", 0.0254), ("kilometres", 1000.0)
-    )),
-    ("in metres that were converted as if they were feet", 1.0 / FEET_M, "import it without converting feet"),
-)  # fmt: skip
-"""Units that the map's numbers may have instead of metres: (name, metres, mend)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,11 +216,13 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
     Scans made larger and smaller are registered anew; at the right scale many more of their points agree. A sound scan
     shows it to .0005. Where scans contradict each other, (1, inf).
     """
+    step = MAP_FIT_RULE.scale_step
+    scales = 1.0 + step * np.arange(-MAP_FIT_RULE.scale_steps, MAP_FIT_RULE.scale_steps + 1)
     peaks = []
     for place in e.told("trying other scales", places):
         ndt_map = e.around(place.T_map_lidar[:3, 3])
         fits = []
-        for scale in _SCALES:
+        for scale in scales:
             clouds = thin_for_levels(np.asarray(scale * e.scans[place.index].points, dtype=np.float32))
             starts = [place.T_map_lidar]
             if not place.fits:  # it may be elsewhere: where the prior has it, in a map so much larger
@@ -234,12 +230,23 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
             found = [ndt_map.refine(clouds, start).T_map_lidar for start in starts]
             fits.append(max(likelihood_at(ndt_map, clouds, T, len(clouds) - 1) for T in found))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
-        peaks.append(_SCALES[best] + _FINER * peak_of(fits[best - 1], fits[best], fits[best + 1]))
+        peaks.append(scales[best] + step * peak_of(fits[best - 1], fits[best], fits[best + 1]))
     scale = float(np.median(peaks))
     off = np.abs(np.array(peaks) - scale)
-    if (off > 0.5 * _FINER).mean() > 0.5:
+    if (off > 0.5 * step).mean() > 0.5:
         return 1.0, float("inf")
     return scale, max(MAP_FIT_RULE.points_scale, 1.4826 * float(np.median(off)) / np.sqrt(len(peaks)))
+
+
+def _units() -> list[tuple[str, float, str]]:
+    """Units that the map's numbers may have instead of metres: (name, metres, mend)."""
+    mend = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
+    lengths = {"feet": FEET_M, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "kilometres": 1000.0}
+    converted = "in metres that were converted as if they were feet"
+    return [
+        *((f"in {name}", metres, mend.format(metres)) for name, metres in lengths.items()),
+        (converted, 1.0 / FEET_M, "import it without converting feet"),
+    ]
 
 
 def in_another_unit(e: MapEvidence) -> Finding | None:
@@ -250,7 +257,7 @@ def in_another_unit(e: MapEvidence) -> Finding | None:
     """
     some = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.unit_scans)][: MAP_FIT_RULE.unit_scans]
     centres = np.zeros(3), _middle(e.point_map), e.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, MAP_FIT_RULE.sensor_m]
-    for name, in_metres, mend in e.told("trying other units", _UNITS):
+    for name, in_metres, mend in e.told("trying other units", _units()):
         for centre in centres:
             metres = _in_metres(e.point_map, in_metres, centre, e.T)
             if metres is None:
@@ -294,6 +301,7 @@ def _searched(e: MapEvidence) -> tuple[list[Place], int]:
     chosen = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.searched)][: MAP_FIT_RULE.searched]
     best: list[Place] = []
     mirrored = 0
+    mirror = np.array([1.0, -1.0, 1.0], dtype=np.float32)
     for i in e.told("searching the map", chosen):
         scan = e.scans[i]
         found = _find(search, scan)
@@ -302,7 +310,7 @@ def _searched(e: MapEvidence) -> tuple[list[Place], int]:
             best = max(best, e.places({j: [D @ e.T[j]] for j in e.scans}), key=lambda p: len(fitting(p)))
             if len(fitting(best)) > 0.6 * len(e.scans):
                 return best, 0
-        elif _find(search, Scan(scan.stamp_ns, scan.points * _MIRROR)) is not None:
+        elif _find(search, Scan(scan.stamp_ns, scan.points * mirror)) is not None:
             mirrored += 1
     return best, mirrored if mirrored >= 2 and len(fitting(best)) < 2 else 0
 
@@ -333,10 +341,15 @@ def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], ju
                 best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known), key=lambda p: p.fit)
             if best.fits or attempt:
                 break
-            beside = [from_xyz_rpy(x, y, 0.0) @ guess for x in _OFFSETS_M for y in _OFFSETS_M]
-            grid = [T @ from_xyz_rpy(0, 0, 0, yaw=yaw) for T in beside for yaw in _YAWS]
-            starts = likeliest(ndt_map, clouds[0], grid, MAP_FIT_RULE.ranked, 500)
+            starts = likeliest(ndt_map, clouds[0], _grid_around(guess), MAP_FIT_RULE.ranked, 500)
     return best
+
+
+def _grid_around(guess: F64, rule: MapFitRule = MAP_FIT_RULE) -> list[F64]:
+    offsets_m = np.arange(-rule.grid_m, rule.grid_m + 0.1, 1.0)
+    yaws = np.radians([0.0, -rule.grid_deg, rule.grid_deg])
+    beside = [from_xyz_rpy(x, y, 0.0) @ guess for x in offsets_m for y in offsets_m]
+    return [T @ from_xyz_rpy(0, 0, 0, yaw=yaw) for T in beside for yaw in yaws]
 
 
 def _known(ndt_map: NdtMap, points: F64, T: F64) -> float:

@@ -42,11 +42,19 @@ class PriorCheck:
     """Standard errors from which a deviation may be an error."""
     sure_of_time: float = 5.0
     """Standard errors from which a shift in time is an error."""
+    least_scale: float = 0.02
+    """Deviation of the scale up to which nothing is reported, as a share: priors err so much by themselves."""
+    least_turn_deg: float = 2.0
+    """Deviation of a turn or a pitch up to which nothing is reported, degrees."""
+    least_time_s: float = 0.15
+    """Shift in time up to which nothing is reported, seconds."""
+
+    def least_of(self, kind: str) -> float:
+        """Deviation of this kind ("scale", "turn", "pitch" or "time") up to which nothing is reported."""
+        return {"scale": self.least_scale, "time": self.least_time_s}.get(kind, self.least_turn_deg)
 
 
 PRIOR_CHECK = PriorCheck()
-LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
-"""Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
 X_FORWARD = "turn the points, or T_base_lidar, so that x is forward"
 
 
@@ -220,9 +228,8 @@ class Number:
     @property
     def least(self) -> float:
         """Deviations that the drive can surely show."""
-        return max(
-            LEAST[self.kind], (PRIOR_CHECK.sure_of_time if self.kind == "time" else PRIOR_CHECK.sure) * self.off[1]
-        )
+        sure = PRIOR_CHECK.sure_of_time if self.kind == "time" else PRIOR_CHECK.sure
+        return max(PRIOR_CHECK.least_of(self.kind), sure * self.off[1])
 
     @property
     def words(self) -> tuple[str, str]:

@@ -20,7 +20,6 @@ from mapvote.doctor import Finding, Reading, Severity
 from mapvote.doctor.drive_evidence import DriveEvidence, Road, Run
 from mapvote.doctor.prior import (
     AS_IT_IS,
-    LEAST,
     PRIOR_CHECK,
     READINGS,
     X_FORWARD,
@@ -60,7 +59,6 @@ class PriorFitRule:
 
 PRIOR_FIT_RULE = PriorFitRule()
 FEET_M = 0.3048
-_TURNED_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 CANNOT_TELL = "without a turn this drive cannot decide whether"
 
 
@@ -99,7 +97,7 @@ def agreement(e: DriveEvidence) -> tuple[list[Finding], F64 | None]:
     found, T = compare(e, e.T)
     if e.road.up == "-z":
         # Nothing wrong with a prior shows surely in scans that are mended by a guess.
-        return [f for f in found if f.severity == "error"], T @ _TURNED_OVER
+        return [f for f in found if f.severity == "error"], T @ np.diag([1.0, -1.0, -1.0, 1.0])
     return found, T
 
 
@@ -348,7 +346,7 @@ def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Findi
         shift_m = abs(time.value) * float(np.median(speed_mps))
         better = later is not None and later.rms_m < 0.8 * whole.rms_m
         if later is not None and better and shift_m > PRIOR_CHECK.sure * min(sigma_m, later.rms_m):
-            yield Finding("error" if abs(time.value) > 2.0 * LEAST["time"] else "warning", *time.words)
+            yield Finding("error" if abs(time.value) > 2.0 * PRIOR_CHECK.least_time_s else "warning", *time.words)
             return
     if whole is None:
         yield Finding("note", "too few scans fit each other to measure scale and heading", "drive farther")
@@ -407,13 +405,13 @@ def _shows(time: Number, T: F64, runs: Sequence[Run]) -> bool:
 
 def _small(number: Number) -> Iterator[Finding]:
     off, sigma = number.off
-    if off <= max(LEAST[number.kind], PRIOR_CHECK.likely * sigma):
+    if off <= max(PRIOR_CHECK.least_of(number.kind), PRIOR_CHECK.likely * sigma):
         return
     what, mend = number.words
     if off <= PRIOR_CHECK.sure * sigma:
         yield Finding("note", f"{what}; that may be chance", f"a longer drive decides; else: {mend}")
     else:
-        yield Finding("error" if off > 2.0 * LEAST[number.kind] else "warning", what, mend)
+        yield Finding("error" if off > 2.0 * PRIOR_CHECK.least_of(number.kind) else "warning", what, mend)
 
 
 def _places(as_it_is: _Fit, runs: Sequence[Run], prior_sigma_m: float) -> Iterator[Finding]:

@@ -36,7 +36,6 @@ class ReadingRules:
 
 
 RULES = ReadingRules()
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +90,7 @@ def _fit_under(reading: Reading, drive: Drive, T: F64, point_map: PointMap, prog
     """How the scans lie on the map by poses T (n, 4, 4) under a reading."""
     poses = reading.poses(T)
     if np.linalg.det(poses[0, :3, :3]) < 0.0:
-        poses = poses @ _MIRROR
+        poses = poses @ np.diag([1.0, -1.0, 1.0, 1.0])
         drive = replace(drive, read_scan=_mirrored(drive))
     evidence = MapEvidence(drive, poses, point_map, progress)
     places = evidence.places({i: [poses[i]] for i in evidence.scans})
@@ -103,7 +102,7 @@ def _fit_under(reading: Reading, drive: Drive, T: F64, point_map: PointMap, prog
 def _mirrored(drive: Drive) -> Callable[[int], Scan]:
     def read(i: int) -> Scan:
         scan = drive.read_scan(i)
-        mirror = _MIRROR[:3, :3].astype(np.float32)
+        mirror = np.diag(np.array([1.0, -1.0, 1.0], dtype=np.float32))
         return replace(scan, points=np.ascontiguousarray(scan.points @ mirror))
 
     return read

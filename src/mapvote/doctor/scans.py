@@ -67,11 +67,6 @@ NO_PRIOR = Finding(
     "no prior: the vehicle must find itself in the map",
     "give poses with --prior: a file (3 x 4 rows T_map_lidar, TUM, CSV) or a topic of a bag; or give the first pose",
 )
-_UNTOLD = {
-    True: TimesTold("field", "times of points"),
-    False: TimesTold("none", "of a scan that was not read from fields"),
-}
-"""Times of scans that no reader made."""
 _LOOK = np.dtype(
     [
         ("index", "i8"),  # which scan
@@ -148,7 +143,7 @@ class Looking:
             raise
         if i not in self._rows:
             self._rows[i] = _look(i, scan.points, self._R)
-            self._times[scan.times or _UNTOLD[scan.time_s is not None]] += 1
+            self._times[scan.times or _times_without_reader(scan)] += 1
             self._intensity |= "intensity" in scan.fields
         return scan
 
@@ -184,6 +179,12 @@ def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) 
     if any_error(cheap_checks(drive, looking.look(some, progress))):
         looking.warnings(progress)
     return looking
+
+
+def _times_without_reader(scan: Scan) -> TimesTold:
+    if scan.time_s is None:
+        return TimesTold("none", "of a scan that was not read from fields")
+    return TimesTold("field", "times of points")
 
 
 def _look(index: int, points: F32, R: F32 | None = None) -> np.void:

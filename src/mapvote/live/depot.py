@@ -9,9 +9,6 @@ from pathlib import Path
 from mapvote.client import MapClient, Refused
 from mapvote.core.types import MapvoteError
 
-_OF_THE_KEY = (401, 403)
-"""HTTP statuses of a key that is missing or may not send."""
-
 
 @dataclass(slots=True)
 class Delivery:
@@ -45,7 +42,7 @@ def send_all(client: MapClient, files: Sequence[Path], say: Callable[[str], obje
         try:
             outcome = client.send(_read(file))
         except MapvoteError as error:
-            if isinstance(error, Refused) and error.status in _OF_THE_KEY:
+            if isinstance(error, Refused) and error.of_key:
                 raise  # no other ballot would be taken either
             delivery.refused += 1
             say(f"{file}: {error}")

@@ -119,22 +119,18 @@ def marked_osm(
 ) -> str:
     """The lanelet2 file with a tag ``mapvote:changes`` on each affected part, and on no other: for JOSM or Vector Map
     Builder. The elements of ``tree`` are altered in place."""
+    most_named = 8
+    most_signs = 255  # of the value of a tag in OSM
     root = tree.getroot()
     for element in root.iter():
         for tag in [tag for tag in element.findall("tag") if tag.get("k") == TAG]:
             element.remove(tag)
     for one, row in zip(affected, affected_rows(affected, changes), strict=True):
-        words = [f"{changes.kinds[i]} {changes.ids[i]}" for i in one.changes[:_MOST_NAMED]]
-        more = [f"{len(one.changes) - _MOST_NAMED} more"] if len(one.changes) > _MOST_NAMED else []
+        words = [f"{changes.kinds[i]} {changes.ids[i]}" for i in one.changes[:most_named]]
+        more = [f"{len(one.changes) - most_named} more"] if len(one.changes) > most_named else []
         value = f"{row['distance_m']} m: " + ", ".join(words + more)
-        ElementTree.SubElement(one.part.element, "tag", {"k": TAG, "v": value[:_MOST_SIGNS]})
+        ElementTree.SubElement(one.part.element, "tag", {"k": TAG, "v": value[:most_signs]})
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-_MOST_NAMED = 8
-"""Changes named in a tag."""
-_MOST_SIGNS = 255
-"""Length of the value of a tag in OSM."""
 
 
 def summary(affected: Sequence[Affected]) -> str:

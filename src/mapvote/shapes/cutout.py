@@ -32,14 +32,6 @@ class CutoutSizes:
 
 
 CUTOUT_SIZES = CutoutSizes()
-_MODULES = (
-    "vendor/three.core.min.js",
-    "vendor/three.module.min.js",
-    "shaders.js",
-    "orbit.js",
-    "cloud.js",
-    "standalone.js",
-)
 Tiles = Callable[[TileIndex], Tile]
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1, map metres."""
@@ -101,7 +93,10 @@ def fragment(cutouts: Sequence[Cutout]) -> str:
     if not cutouts:
         return "<p>Nothing is gone and nothing is new: there is no change to show.</p>"
     viewer = resources.files("mapvote.shapes") / "viewer"
-    modules = {name: (viewer / name).read_text() for name in _MODULES}
+    names = ("shaders.js", "orbit.js", "cloud.js", "standalone.js")
+    modules = {
+        name: (viewer / name).read_text() for name in ("vendor/three.core.min.js", "vendor/three.module.min.js", *names)
+    }
     return (
         f"<style>{(viewer / 'standalone.css').read_text()}</style>"
         '<div class="cutouts"><div class="stage">'

@@ -99,6 +99,10 @@ def _neighbours(objects: Sequence[ChangeObject], among: Sequence[ChangeObject]) 
 def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
     polygons = [[_corners(ring, lattice) for ring in polygon] for polygon in change.outline]
     single = len(polygons) == 1
+    facts = (
+        *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
+        *("against_median", "share_for", "probability", "trimmed", "fell"),
+    )
     return {
         "type": "Feature",
         "id": change.id,
@@ -106,7 +110,7 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
             "type": "Polygon" if single else "MultiPolygon",
             "coordinates": polygons[0] if single else polygons,
         },
-        "properties": {name: _rounded(name, getattr(change, name)) for name in _FACTS}
+        "properties": {name: _rounded(name, getattr(change, name)) for name in facts}
         | {
             "first_seen": utc(change.first_seen_ns),
             "last_seen": utc(change.last_seen_ns),
@@ -117,15 +121,9 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
     }
 
 
-_FACTS = (
-    *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
-    *("against_median", "share_for", "probability", "trimmed", "fell"),
-)
-_DIGITS = {"area_m2": 2, "height_m": 2, "volume_m3": 2, "share_for": 3, "probability": 3}
-
-
 def _rounded(name: str, value: Any) -> Any:
-    return value if value is None or name not in _DIGITS else round(value, _DIGITS[name])
+    digits = {"area_m2": 2, "height_m": 2, "volume_m3": 2, "share_for": 3, "probability": 3}
+    return value if value is None or name not in digits else round(value, digits[name])
 
 
 def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:

@@ -17,9 +17,6 @@ from mapvote.core.types import F64, I32, I64, Bool
 
 Ring = I64
 """(n, 2) corners (col, row) of the lattice, closed: the first corner is repeated at the end."""
-_RIGHT, _ABOVE = (0, 1), (1, 0)
-_DIAGONALS = (1, -1), (1, 1)
-_SHIFT = np.int64(32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +32,8 @@ class Pieces:
 def pieces(rows: I64, cols: I64, kinds: I64) -> Pieces:
     """Connected cells of the same kind; cells (n,) on the lattice, sorted by row, then column, each once."""
     key = _key(rows, cols)
-    straight = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in (_RIGHT, _ABOVE)]
-    diagonal = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in _DIAGONALS]
+    straight = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in ((0, 1), (1, 0))]
+    diagonal = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in ((1, -1), (1, 1))]
     return Pieces(_labels(straight + diagonal, len(rows)), _labels(straight, len(rows)))
 
 
@@ -73,7 +70,7 @@ def members(labels: I32) -> list[I64]:
 
 def _key(rows: I64, cols: I64) -> I64:
     """One sortable number per cell: by row, then by column; indices within +-2^30."""
-    key: I64 = (rows << _SHIFT) + cols
+    key: I64 = (rows << np.int64(32)) + cols
     return key
 
 
@@ -98,10 +95,6 @@ def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
     return _in_order(found)
 
 
-SLOT_CELLS = 4
-"""1.2 m: two walls of one room are farther apart."""
-
-
 @record()
 @dataclass(frozen=True, slots=True)
 class PieceRule:
@@ -120,10 +113,11 @@ class PieceRule:
     """Overlap of hulls up to which they only touch, cells: houses wall to wall."""
     wall_cells: int = 10
     """Least length of a slot, cells: 3 m."""
+    slot_cells: int = 4
+    """Greatest width of a slot, cells: 1.2 m, for two walls of one room are farther apart."""
 
 
 PIECE_RULE = PieceRule()
-_DISK = np.hypot(*np.indices((SLOT_CELLS + 1, SLOT_CELLS + 1)) - SLOT_CELLS // 2) <= SLOT_CELLS / 2 + 0.25
 
 
 def buildings(rows: I64, cols: I64, kinds: I64) -> Pieces:
@@ -161,12 +155,13 @@ def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) ->
 
 def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
     """(n,) the cells beyond the cut along the longest slot that has enough on either side; None without one."""
-    margin = SLOT_CELLS
+    margin = PIECE_RULE.slot_cells
+    disk = np.hypot(*np.indices((margin + 1, margin + 1)) - margin // 2) <= margin / 2 + 0.25
     r = rows - rows.min() + margin
     c = cols - cols.min() + margin
     image = np.zeros((r.max() + margin + 1, c.max() + margin + 1), dtype=np.bool_)
     image[r, c] = True
-    slots, count = scipy.ndimage.label(scipy.ndimage.binary_closing(image, _DISK) & ~image, np.ones((3, 3)))
+    slots, count = scipy.ndimage.label(scipy.ndimage.binary_closing(image, disk) & ~image, np.ones((3, 3)))
     at = np.stack([r, c], axis=1).astype(np.float64)
     best: tuple[float, Bool] | None = None
     for k in range(1, count + 1):
@@ -177,7 +172,7 @@ def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
         across = (at - middle) @ np.array([-along[1], along[0]])
         beyond = across > 0
         bridge = 0.5 * np.count_nonzero(np.abs(across) < 1)
-        narrow = max(PIECE_RULE.wall_cells, bridge) <= length and width <= SLOT_CELLS
+        narrow = max(PIECE_RULE.wall_cells, bridge) <= length and width <= margin
         enough = PIECE_RULE.least_share <= beyond.mean() <= 1 - PIECE_RULE.least_share
         if narrow and enough and (best is None or length > best[0]):
             best = length, beyond

@@ -39,8 +39,6 @@ class LayerRule:
 
 
 LAYER_RULE = LayerRule()
-_BYTES = "<u4,<u4,<f4,<f4"
-_CLOUD_MAGIC = 0x3143564D
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +105,7 @@ def _heights(points: F32) -> tuple[float, float]:
 def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
     """Sixteen bytes (0x3143564D, number of points, z0_m, z_step_m as uint32, uint32, float32, float32), then
     (n, 4) uint16, all little-endian."""
-    head = np.array([(_CLOUD_MAGIC, len(packed), z0_m, z_step_m)], dtype=_BYTES)
+    head = np.array([(0x3143564D, len(packed), z0_m, z_step_m)], dtype="<u4,<u4,<f4,<f4")
     return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
 
 
