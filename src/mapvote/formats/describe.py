@@ -134,16 +134,14 @@ def _foundation(ballot: Ballot) -> str:
     return f"{ballot.length_m:.0f} m driven, {ballot.scans_localised / max(ballot.scans, 1):.0%} of scans, {misfit}"
 
 
-_PLANES = "states", "tally", "gone", "free", "new_points", "odds"
-
-
 def _ballot(ballot: Ballot, size: int) -> Rows:
     counts = np.zeros(len(CellState), dtype=np.int64)
     for tile in ballot.tiles:
         if tile.states is not None:
             counts += np.bincount(unpack_states(tile.states).ravel(), minlength=256)[: len(CellState)]
     new = sum(len(unpack_points(t.new_points)) for t in ballot.tiles if t.new_points is not None)
-    planes = [p for p in _PLANES if any(getattr(t, p) for t in ballot.tiles)]
+    names = ("states", "tally", "gone", "free", "new_points", "odds")
+    planes = [name for name in names if any(getattr(t, name) for t in ballot.tiles)]
     seconds = (ballot.end_ns - ballot.start_ns) * 1e-9
     rows = [
         ("vehicle", ballot.vehicle),

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 
 from mapvote.core.types import MapvoteError
 
-_NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-
 
 @dataclass(frozen=True, slots=True)
 class RosNames:
@@ -60,7 +58,7 @@ def ros_names(namespace: str = "", remaps: Sequence[str] = ()) -> RosNames:
 
 def _absolute(name: str, namespace: str) -> str:
     """``name`` with the namespace before it, unless it begins with a slash."""
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
         raise MapvoteError(
             f"{name!r}: no name of a topic; between slashes it has letters, digits and underscores, and begins with "
             "no digit"

@@ -32,8 +32,6 @@ class DdsLimits:
 
 DDS_LIMITS = DdsLimits()
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
-_PEER = re.compile(r"[0-9A-Za-z.:\[\]%_-]+")
-"""A host name or an address, with or without a port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +115,7 @@ def _peers(text: str) -> list[str]:
     """The addresses in ROS_STATIC_PEERS."""
     peers = [peer.strip() for peer in text.split(";") if peer.strip()]
     for peer in peers:
-        if not _PEER.fullmatch(peer):
+        if not re.fullmatch(r"[0-9A-Za-z.:\[\]%_-]+", peer):  # a host or an address, with or without a port
             raise MapvoteError(
                 f"ROS_STATIC_PEERS={text}: {peer!r} is no host name or address; separate several with semicolons"
             )

@@ -27,6 +27,7 @@ from mapvote.core.mount import Mount
 from mapvote.core.point_map import PointMap, lattice_of, map_from_points
 from mapvote.core.record import record
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
+from mapvote.core.times import has_date
 from mapvote.core.types import F64, Drive, MapvoteError, PosePrior, Scan
 from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.formats.drives.upright import upright
@@ -39,8 +40,6 @@ from mapvote.survey.driven_road import road_under, wrong_attitude
 from mapvote.survey.pose_graph import DriveTrack, carried_along, fit_to_priors, settle_poses
 
 Progress = Callable[[int, int], None]
-_FIRST_DATE_NS = 946_684_800 * 10**9
-"""Start of the year 2000. Clocks that count from zero are below it."""
 
 
 @record()
@@ -169,7 +168,7 @@ def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
 def _last_stamp(drives: Sequence[Drive]) -> int | None:
     """When the last drive ended; None if the clock of one has no date."""
     ends = [int(drive.stamps_ns[-1]) for drive in drives]
-    return max(ends) if min(ends) > _FIRST_DATE_NS else None
+    return max(ends) if has_date(min(ends)) else None
 
 
 def _agreed_heights(track: DriveTrack, point_map: PointMap, most_off: float = SURVEY.most_off) -> Heights:

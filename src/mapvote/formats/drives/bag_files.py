@@ -19,23 +19,20 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.listing import plain_name
 from mapvote.formats.reading import first_line, read_yaml
 
-STORAGES = (".mcap", ".db3", ".bag")
+STORAGES = {
+    ".mcap": "mcap recover {0} -o recovered.mcap",
+    ".db3": 'sqlite3 {0} ".recover" | sqlite3 recovered.db3',
+    ".bag": "rosbag reindex {0}",
+}
+"""Suffixes of files that hold messages, and the command that repairs such a file."""
 UNFINISHED = ".active"
 """Suffix of a ROS 1 bag while it is being recorded."""
-_COMPRESSED = (".zstd", ".zst")
 _METADATA = "metadata.yaml"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")
 """Opcode of a record, length of its content."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
 """Times of the first and last message of a chunk, its uncompressed size, its checksum."""
-_MENDS = {
-    ".mcap": "mcap recover {0} -o recovered.mcap",
-    ".db3": 'sqlite3 {0} ".recover" | sqlite3 recovered.db3',
-    ".bag": "rosbag reindex {0}",
-    UNFINISHED: "rosbag reindex {0}",
-}
-"""Command that repairs a file, by its suffix."""
 
 
 def is_bag(path: Path) -> bool:
@@ -93,12 +90,13 @@ def bag_files(path: Path) -> BagFiles:
 def mend_of(path: Path) -> str:
     """The command that repairs the files at ``path``, of whatever storage."""
     files = [path] if path.is_file() else _beside(path)
-    compressed = [file for file in path.glob("*") if _suffix(file) in _COMPRESSED] if path.is_dir() else []
+    compressed = [file for file in path.glob("*") if _suffix(file) in (".zstd", ".zst")] if path.is_dir() else []
     if compressed and not files:
         return f"zstd -d {compressed[0]}"
     if not files:
         return "copy the bag again"
-    return _MENDS[_suffix(files[0])].format(files[0])
+    suffix = _suffix(files[0])
+    return STORAGES[".bag" if suffix == UNFINISHED else suffix].format(files[0])
 
 
 def _suffix(file: Path) -> str:

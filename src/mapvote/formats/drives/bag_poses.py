@@ -22,8 +22,6 @@ from mapvote.formats.drives.trajectory import Prior, Trajectory, prior_of
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
 
 POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-_OWN_POSES = "/mapvote/pose"
-"""The topic on which a live drive publishes its own pose: no prior."""
 GNSS = ("sensor_msgs/msg/NavSatFix",)
 IMU = "sensor_msgs/msg/Imu"
 
@@ -123,8 +121,9 @@ def prior_of_bag(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: Poses) 
 def _only_topic_of_poses(bag: Bag) -> str | None:
     """The only Odometry that holds messages, else the only other topic of poses, else the only one of fixes, else the
     frames that move; None, and a word, if there are several."""
+    own = "/mapvote/pose"  # the pose that a live drive published is no prior
     for kinds in (POSES[:1], POSES[1:], GNSS):
-        named = [topic for topic, n in bag.topics(*kinds).items() if n and topic != _OWN_POSES]
+        named = [topic for topic, n in bag.topics(*kinds).items() if n and topic != own]
         if len(named) > 1:
             log.warning("%s: several topics of poses, none is used; --prior chooses: %s", bag.path, ", ".join(named))
         if named:

@@ -54,15 +54,12 @@ from mapvote.formats.maps.pcd import read_pcd_table
 from mapvote.formats.reading import read_text, read_whole
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
-_NUSCENES_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""R_nuscenes_lidar: their y is our x."""
 MULRAN_MOUNT = geometry.from_xyz_rpy(1.7042, -0.021, 1.8047, *np.deg2rad([0.0001, 0.0003, 179.6654]))
 """The dataset's calib_base2ouster.txt."""
 NEWER_COLLEGE_MOUNT = geometry.from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
 """The camera that carries the poses to the Ouster (Ramezani et al. 2020)."""
 OXFORD_LIDARS = ("velodyne_left", "velodyne_right")
 _OXFORD_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-_NORTH_EAST_DOWN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
 
 def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
@@ -154,7 +151,8 @@ def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
     files = [path / row.filename for row in rows]
     stamps = np.array([row.timestamp * 1000 for row in rows], dtype=np.int64)
     T_base_lidar = _nuscenes_poses(tables / "calibrated_sensor.json", [rows[0].calibrated_sensor_token])[0]
-    T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ _NUSCENES_AXES
+    R_nuscenes_lidar = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # their y is our x
+    T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ R_nuscenes_lidar
     T_map_base = _nuscenes_poses(tables / "ego_pose.json", [row.ego_pose_token for row in rows])
     folder = ScanFolder(files, stamps, read, lambda: T_map_base @ T_base_lidar, T_base_lidar=T_base_lidar)
     return open_scan_folder(path, options, folder)
@@ -322,7 +320,8 @@ def _oxford_poses(file: Path) -> Trajectory:
     times_ns, columns = read_columns(file)
     T_ned = motions_of_rpy(needed(file, columns, "y", "x", "down", "roll", "pitch", "yaw"))
     longitude, latitude = needed(file, columns, "longitude", "latitude")[0].tolist()
-    T_map_base = _NORTH_EAST_DOWN @ T_ned @ _OXFORD_AXES
+    T_map_ned = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    T_map_base = T_map_ned @ T_ned @ _OXFORD_AXES
     return sorted_trajectory(times_ns, T_map_base, of_vehicle=True, frame=MapFrame(utm_of(longitude, latitude)))
 
 
@@ -341,15 +340,21 @@ def open_oxford(path: Path, options: DriveOptions) -> Drive:
     return Dataset((f"{name}/*.bin",), _oxford_rows, "gps/ins.csv", _oxford_poses, T_base_lidar).open(path, options)
 
 
-_BOREAS_BIN = BinLayout((*KITTI, "laser_number", "time"))
-BOREAS = Dataset(("lidar/*.bin",), _BOREAS_BIN.read, "applanix/lidar_poses.csv", _boreas_poses, beside="applanix")
-"""Test sequences keep their poses secret. The times of points count from the scan's."""
-MULRAN = Dataset(("Ouster/*.bin",), BinLayout().read, "global_pose.csv", _mulran_poses, MULRAN_MOUNT)
-NEWER_COLLEGE = Dataset(
-    ("raw_format/ouster_scan/cloud_*_*.pcd", "ouster_scan/cloud_*_*.pcd"),
-    read_pcd_table,
-    "ground_truth/registered_poses.csv",
-    lambda file: replace(read_trajectory(file), of_vehicle=True),
-    NEWER_COLLEGE_MOUNT,
-    _newer_college_stamp_ns,
-)
+DATASETS = {
+    "Boreas sequence": Dataset(  # test sequences keep their poses secret; the times of points count from the scan's
+        ("lidar/*.bin",),
+        BinLayout((*KITTI, "laser_number", "time")).read,
+        "applanix/lidar_poses.csv",
+        _boreas_poses,
+        beside="applanix",
+    ),
+    "MulRan sequence": Dataset(("Ouster/*.bin",), BinLayout().read, "global_pose.csv", _mulran_poses, MULRAN_MOUNT),
+    "Newer College experiment": Dataset(
+        ("raw_format/ouster_scan/cloud_*_*.pcd", "ouster_scan/cloud_*_*.pcd"),
+        read_pcd_table,
+        "ground_truth/registered_poses.csv",
+        lambda file: replace(read_trajectory(file), of_vehicle=True),
+        NEWER_COLLEGE_MOUNT,
+        _newer_college_stamp_ns,
+    ),
+}

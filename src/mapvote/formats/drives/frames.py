@@ -12,14 +12,13 @@ from mapvote.core.types import F64, MapvoteError
 
 Edges = dict[str, list[tuple[str, F64]]]
 """From each frame to its neighbours, with T_frame_neighbour (4, 4), both ways."""
-_MAP_FRAMES = {"", "map", "world", "earth", "global", "utm", "enu"}
-"""Last parts of the names of frames that are fixed to the Earth, in small letters; "" is no name."""
 
 
 def is_map_frame(name: str) -> bool:
     """Whether poses in the frame of this name may be taken for poses in the map (REP 105: map and earth are fixed, odom
     is not, and a LiDAR odometry names its first pose)."""
-    return name.strip("/").split("/")[-1].lower() in _MAP_FRAMES
+    last = name.strip("/").split("/")[-1].lower()
+    return last in ("", "map", "world", "earth", "global", "utm", "enu")
 
 
 def T_from(edges: Edges, source: str) -> dict[str, F64]:

@@ -17,6 +17,7 @@ from msgspec import structs
 from mapvote.config import did_you_mean
 from mapvote.core import geometry
 from mapvote.core.sensors import NAMED, Sensor
+from mapvote.core.times import has_date
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag_files import is_bag, is_bag_without_metadata
 from mapvote.formats.drives.point_times import UNITS_NS, TimeRules
@@ -30,10 +31,6 @@ from mapvote.formats.drives.sensor_estimate import (
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 from mapvote.formats.listing import below, entry
 from mapvote.formats.reading import read_text
-
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_YEAR_2000_S, _YEAR_2100_S = 946_684_800, 4_102_444_800
-"""Seconds since 1970 between which drives are recorded."""
 
 
 class SaidOfDrive(TypedDict, total=False):
@@ -98,9 +95,6 @@ class DriveOptions(msgspec.Struct, frozen=True, kw_only=True):
         return TimeRules(self.motion_compensated, self.time_field, self.time_unit, rate)
 
 
-_NOT_IN_FILE = ("scans", "mount", "frame", "as_live")
-
-
 def beside(drive: Path) -> Path:
     """The folder in which drive.toml, prior.txt and other files of a drive lie: its own, or that of its only file."""
     return drive.parent if drive.is_file() else drive
@@ -128,7 +122,8 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
     if isinstance(prior, str) and (not prior.startswith("/") or Path(prior).exists()):
         place = below(beside(folder), prior, file)
         table["prior"] = str(place) if place.is_file() else prior
-    keys = [key for key in DriveOptions.__struct_fields__ if key not in _NOT_IN_FILE]
+    not_in_file = ("scans", "mount", "frame", "as_live")
+    keys = [key for key in DriveOptions.__struct_fields__ if key not in not_in_file]
     for key in table:
         if key not in keys:
             raise MapvoteError(f"{file}: unknown key {key!r}{did_you_mean(key, keys)}")
@@ -139,9 +134,10 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
     if not (0.0 < options.prior_sigma_m < math.inf and 0.0 < options.prior_sigma_deg < math.inf):
         raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive numbers")
     for unit, per_ns in (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3)):
-        if _YEAR_2000_S <= options.start_ns * per_ns / 1e9 <= _YEAR_2100_S:
+        start_ns = options.start_ns * per_ns
+        if has_date(start_ns) and start_ns <= 4_102_444_800 * 10**9:  # the year 2100
             what = f"{file}: start_ns = {options.start_ns} looks like {unit} since 1970"
-            raise MapvoteError(f"{what}: write nanoseconds, {options.start_ns * per_ns}")
+            raise MapvoteError(f"{what}: write nanoseconds, {start_ns}")
     options = structs.replace(options, **{name: value for name, value in said.items() if value is not None})
     if options.time_unit not in (None, *UNITS_NS):
         raise MapvoteError(f"{file}: time_unit is {options.time_unit!r}; it must be {', '.join(UNITS_NS)}")
@@ -229,7 +225,7 @@ def parse_scans(scans: str | None, n: int, where: str) -> I64:
 def _name(said: str | None, path: Path, what: str) -> str:
     """A legal name of a vehicle or a drive: what is said, else made from the file's name."""
     name = said or re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64] or "drive"
-    if not _ID.fullmatch(name):
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
         raise MapvoteError(
             f"{path}: {what} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
         )

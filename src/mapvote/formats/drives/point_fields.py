@@ -52,8 +52,6 @@ class PointRule:
 
 POINT_RULE = PointRule()
 _AZIMUTHS_AT_ONCE = 512
-_RINGS = ("ring", "channel", "laserid", "lasernumber", "line")
-"""Names of the number of a beam, plainly spelled."""
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
 
@@ -106,7 +104,8 @@ class PointReader:
         points = xyz_view(where, table).astype(np.float32, copy=False)
         names = table.dtype.names or ()
         spelled = {plain(name): name for name in reversed(names)}
-        ring = next((spelled[name] for name in _RINGS if name in spelled), None)
+        beams = ("ring", "channel", "laserid", "lasernumber", "line")  # names of a beam's number
+        ring = next((spelled[name] for name in beams if name in spelled), None)
         # Points that are measurements.
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
         usable = np.empty(len(points), np.int32)
@@ -346,18 +345,6 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
-_LIVOX_FIELDS = {
-    "offset_time": ("<u4", 0),
-    "x": ("<f4", 4),
-    "y": ("<f4", 8),
-    "z": ("<f4", 12),
-    "reflectivity": ("u1", 16),
-    "tag": ("u1", 17),
-    "line": ("u1", 18),
-}
-"""Type of each field of a CustomPoint, and its place in the 19 bytes."""
-
-
 def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
     """The points (n,) of a serialised CustomMsg of Livox's drivers: offset_time in ns since the stamp, x, y, z,
     reflectivity, tag, line.
@@ -380,9 +367,9 @@ def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
         raise MapvoteError(f"{where}: {len(data)} bytes for {count} points: the message is cut off; copy the bag again")
     record = np.dtype(
         {
-            "names": list(_LIVOX_FIELDS),
-            "formats": [kind for kind, _ in _LIVOX_FIELDS.values()],
-            "offsets": [offset for _, offset in _LIVOX_FIELDS.values()],
+            "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
+            "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"],
+            "offsets": [0, 4, 8, 12, 16, 17, 18],
             "itemsize": size,
         }
     )

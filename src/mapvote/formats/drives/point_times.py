@@ -32,7 +32,6 @@ from mapvote.formats.maps.field_names import plain
 TIME_FIELDS = ("t", "time", "timestamp", "stamp", "offsettime", "pointtimeoffset", "timeoffset", "gpstime")
 """Names that drivers give the time of a point, plainly spelled: Ouster, Velodyne, Hesai and RoboSense, Autoware, Livox,
 LAS."""
-_LIKE_TIME = re.compile(r"time|stamp|(^|_)(t|dt|sec|nsec|usec|nanosec)(_|$)")
 _OTHER_FIELDS = re.compile(
     r"^(x|y|z|w|i|rgba?|r|g|b|red|green|blue|.*(red|green|blue)|alpha|nir|ambient|intensity|reflectiv.*|reflectance|remission|ring|channel|"
     r"laser.*|line|row|col|column|range|distance|depth|azimuth|elevation|theta|phi|normal.*|n[xyz]|curvature|label|"
@@ -40,8 +39,6 @@ _OTHER_FIELDS = re.compile(
     r"point_source_id|scanner_channel|key_point|synthetic|withheld|overlap|edge_of_flight_line|scan_direction_flag)$"
 )
 """Names of fields that are no times, lower case."""
-_SPLIT = re.compile(r"(.*?)(n|nano|u|micro)(s|sec|secs|seconds?)")
-"""Names of the part of a time below a second; the other part has the same name without n or u."""
 UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
@@ -201,7 +198,8 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
     values = len(distinct)
     if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
         return Refusal(
-            f"holds times since 1970 as {raw.dtype.name}, which cannot tell points apart; record {_LOSSLESS}"
+            f"holds times since 1970 as {raw.dtype.name}, which cannot tell points apart; record float64, "
+            "or times since the stamp"
         )
     if values < JUDGEMENT.least_values:
         return Refusal(f"holds {values} different value{'s' if values > 1 else ''} in a scan", varies=False)
@@ -267,9 +265,6 @@ def read_times(
     after[~good] = np.nan
     clock_off_ns = value_ns + starts_ns - stamp_ns if origin == TimeOrigin.ANOTHER else 0
     return FieldTimes(name, chosen, after, origin, clock_off_ns, wraps_ns, turn is not None, turns)
-
-
-_LOSSLESS = "float64, or times since the stamp"
 
 
 def _is_lost(raw: NDArray[Any], reference: Any, stamp_ns: int) -> bool:
@@ -436,7 +431,8 @@ def _named_like_times(columns: Mapping[str, Any]) -> tuple[list[str], list[str]]
     """(fields whose names are known, in the order of ``TIME_FIELDS``; others whose names look like a time)."""
     spelled = {plain(name): name for name in reversed(list(columns))}
     known = [spelled[name] for name in TIME_FIELDS if name in spelled]
-    alike = [name for name in columns if name not in known and _LIKE_TIME.search(_lower(name))]
+    like_time = r"time|stamp|(^|_)(t|dt|sec|nsec|usec|nanosec)(_|$)"
+    alike = [name for name in columns if name not in known and re.search(like_time, _lower(name))]
     return known, alike
 
 
@@ -450,7 +446,8 @@ def _joined(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     lower = {name.lower(): name for name in columns}
     out = {}
     for small, name in lower.items():
-        parts = _SPLIT.fullmatch(small)
+        # The part of a time below a second; the other part has the same name without n or u.
+        parts = re.fullmatch(r"(.*?)(n|nano|u|micro)(s|sec|secs|seconds?)", small)
         whole = (
             next((lower[parts[1] + s] for s in ("sec", "secs", "s") if parts[1] + s in lower), None) if parts else None
         )

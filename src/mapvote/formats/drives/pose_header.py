@@ -10,29 +10,8 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
-_AXES = {"x": "x|east|easting", "y": "y|north|northing", "z": "z|up|altitude|alt|height"}
-_PLACE = r"(?:.*_)?(?:position|pos|translation|trans|location|loc)(?:_[a-z]+)*?_?"
-_TURN = r"(?:.*_)?(?:quaternion|quat|orientation|ori|rotation|rot)(?:_[a-z]+)*?_?"
-_ROLES = [
-    *((axis, rf"(?:utm_?|map_?|world_?|enu_?)?(?:{names})|t_?{axis}|p{axis}|p(?:_[a-z]+)*_{axis}|{_PLACE}{axis}")
-      for axis, names in _AXES.items()),
-    *((f"q{axis}", rf"q_?{axis}|q(?:_[a-z]+)*_{axis}|{_TURN}{axis}") for axis in "xyzw"),
-    *((angle, rf"(?:.*_)?{angle}") for angle in ("roll", "pitch", "yaw")),
-    ("heading", "(?:.*_)?(?:heading|azimuth|course)"),
-    ("down", "down"),
-    ("latitude", "(?:.*_)?lat(?:itude)?"),
-    ("longitude", "(?:.*_)?(?:lon|lng|long|longitude)"),
-    ("sigma", "(?:.*_)?(?:sigma|std|stddev|accuracy)(?:_(?:h|xy|horizontal|position))?"),
-    ("status", "(?:.*_)?status"),
-    ("nanoseconds", "(?:.*_)?(?:nsecs?|nanosecs?|nanoseconds)"),
-    ("stamp", "header_stamp(?:_secs?|_seconds)?"),
-    ("time", "(?:ros|gps|unix)?_?(?:timestamp|time|stamp)|t|secs?|seconds"),
-]  # fmt: skip
-"""Roles and patterns of their names, in the order in which they are tried."""
-_NOT_A_POSE = re.compile(
-    r"(?:^|_)(?:v|vel|velocity|twist|linear|angular|acc|acceleration|bias|b|cov|covariance)(?:_|\d|$)"
-)
 _UNITS_OF_POSES = {
     "m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048,
     "rad": 1.0, "radian": 1.0, "radians": 1.0, "deg": 0.017453292519943295, "degree": 0.017453292519943295,
@@ -68,9 +47,6 @@ class Header:
     """By role: x, y, z, qx, .., roll, .., latitude, time."""
 
 
-_DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)")
-
-
 def split_row(line: str) -> list[str]:
     """The values of one line, between commas, semicolons, tabs or blanks; quotes are taken off. Commas within numbers
     that semicolons or tabs part are decimal points."""
@@ -78,7 +54,7 @@ def split_row(line: str) -> list[str]:
     apart = next((mark for mark in ";\t" if mark in text), "," if "," in text else None)
     words = [word.strip().strip("\"'").strip() for word in text.split(apart)]
     if apart in (";", "\t"):
-        words = [_DECIMAL_COMMA.sub(r"\1.\2", word) if _DECIMAL_COMMA.fullmatch(word) else word for word in words]
+        words = [re.sub(r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$", r"\1.\2", word) for word in words]
     return words
 
 
@@ -134,6 +110,29 @@ def _header_of(number: int, line: str) -> Header | None:
     return Header(number, tuple(names), columns) if len(columns) >= 3 else None
 
 
+@cache
+def _roles() -> list[tuple[str, str]]:
+    """Roles and patterns of their names, in the order in which they are tried."""
+    axes = {"x": "x|east|easting", "y": "y|north|northing", "z": "z|up|altitude|alt|height"}
+    place = r"(?:.*_)?(?:position|pos|translation|trans|location|loc)(?:_[a-z]+)*?_?"
+    turn = r"(?:.*_)?(?:quaternion|quat|orientation|ori|rotation|rot)(?:_[a-z]+)*?_?"
+    return [
+        *((axis, rf"(?:utm_?|map_?|world_?|enu_?)?(?:{names})|t_?{axis}|p{axis}|p(?:_[a-z]+)*_{axis}|{place}{axis}")
+          for axis, names in axes.items()),
+        *((f"q{axis}", rf"q_?{axis}|q(?:_[a-z]+)*_{axis}|{turn}{axis}") for axis in "xyzw"),
+        *((angle, rf"(?:.*_)?{angle}") for angle in ("roll", "pitch", "yaw")),
+        ("heading", "(?:.*_)?(?:heading|azimuth|course)"),
+        ("down", "down"),
+        ("latitude", "(?:.*_)?lat(?:itude)?"),
+        ("longitude", "(?:.*_)?(?:lon|lng|long|longitude)"),
+        ("sigma", "(?:.*_)?(?:sigma|std|stddev|accuracy)(?:_(?:h|xy|horizontal|position))?"),
+        ("status", "(?:.*_)?status"),
+        ("nanoseconds", "(?:.*_)?(?:nsecs?|nanosecs?|nanoseconds)"),
+        ("stamp", "header_stamp(?:_secs?|_seconds)?"),
+        ("time", "(?:ros|gps|unix)?_?(?:timestamp|time|stamp)|t|secs?|seconds"),
+    ]  # fmt: skip
+
+
 def _role(name: str) -> tuple[str, str]:
     """(the role of a column or "", the unit that its name tells)."""
     bracket = re.search(r"[\[(]([^\])]*)[\])]", name)
@@ -145,9 +144,11 @@ def _role(name: str) -> tuple[str, str]:
     ):
         word = last[0]
         unit = last[2]
-    if _NOT_A_POSE.search(word):
-        return "", ""
-    return next((role for role, pattern in _ROLES if re.fullmatch(pattern, word)), ""), unit
+    if re.search(
+        r"(?:^|_)(?:v|vel|velocity|twist|linear|angular|acc|acceleration|bias|b|cov|covariance)(?:_|\d|$)", word
+    ):
+        return "", ""  # no pose, but its change, its bias or its error
+    return next((role for role, pattern in _roles() if re.fullmatch(pattern, word)), ""), unit
 
 
 def number_in(text: str) -> float:
@@ -157,12 +158,9 @@ def number_in(text: str) -> float:
     except ValueError:
         pass
     try:
-        return float(_FORTRAN.sub(r"\1e\2", text))
+        return float(re.sub(r"(\d|\.)[dD]([-+]?\d+)$", r"\1e\2", text))
     except ValueError:
         return float("nan")
-
-
-_FORTRAN = re.compile(r"(\d|\.)[dD]([-+]?\d+)$")
 
 
 def is_number(text: str) -> bool:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
+from mapvote.core.times import has_date
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
 from mapvote.formats.drives.point_fields import PointReader, log
@@ -38,10 +39,6 @@ from mapvote.formats.maps.marked_points import without_marked
 from mapvote.formats.maps.pcd import is_pcd_tiles, read_pcd_table, read_viewpoint
 from mapvote.formats.maps.ply import stream_ply_tables
 from mapvote.formats.reading import read_text, read_whole
-
-_LATEST_NS = 230 * 366 * 86_400 * 10**9
-_EARLIEST_NS = 946_684_800 * 10**9
-"""The year 2000: no drive was recorded before it, and no clock that starts with the sensor has come so far."""
 
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
@@ -66,7 +63,8 @@ def read_times_ns(file: Path) -> I64:
             out.append(int((Decimal(text) * 10**9).to_integral_value()))
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise MapvoteError(f"{file}:{number}: not a time in seconds: {text!r}") from error
-    if any(abs(ns) > _LATEST_NS for ns in out):
+    year_2200_ns = 230 * 366 * 86_400 * 10**9
+    if any(abs(ns) > year_2200_ns for ns in out):
         raise MapvoteError(f"{file}: times after the year 2200: they are milli-, micro- or nanoseconds? Write seconds")
     return np.array(out, dtype=np.int64)
 
@@ -79,7 +77,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     table = entry(folder, "times.txt")
     if table.is_file():
         times_ns = of_scans(read_times_ns(table), files, table)
-        if len(times_ns) and times_ns[0] > _EARLIEST_NS and options.start_ns > _EARLIEST_NS:
+        if len(times_ns) and has_date(int(times_ns[0])) and has_date(options.start_ns):
             what = f"{table}: its times count from 1970 already, and drive.toml adds start_ns = {options.start_ns}"
             raise MapvoteError(f"{what}: leave it out")
         return options.start_ns + times_ns
@@ -147,7 +145,6 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
 KITTI = ("x", "y", "z", "intensity")
 NUSCENES = (*KITTI, "ring")
 _SUFFIXES = (".ply", ".las", ".laz", ".npy", ".bin")
-_FOLDERS = ("", "scans", "lidar", "points")
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +223,7 @@ def open_kitti(path: Path, options: DriveOptions) -> Drive:
 
 def cloud_scans(path: Path) -> tuple[Path, str] | None:
     """(folder, suffix) of two or more scans of one kind; a single file is a map, not a drive."""
-    for name in _FOLDERS:
+    for name in ("", "scans", "lidar", "points"):
         for suffix in _SUFFIXES:
             files = files_like(path / name, f"*{suffix}")
             if len(files) >= 2:

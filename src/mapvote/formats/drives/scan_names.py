@@ -19,13 +19,6 @@ import numpy as np
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError
 
-_TOKEN = re.compile(r"(?:(?:^|(?<=[_=\s]))-)?\d+(?:\.\d+)*|\D")
-"""A number with its decimals, where a minus is a sign at the start of a name and after ``_``, ``=`` or a blank; or one
-letter."""
-_DATE = ((1990, 2100), (1, 12), (1, 31), (0, 23), (0, 59), (0, 59))
-"""Least and largest year, month, day, hour, minute, second."""
-_HEX = re.compile(r"(?:0x)?[0-9a-f]+")
-
 
 @record()
 @dataclass(frozen=True, slots=True)
@@ -154,9 +147,10 @@ def _parts_ns(column: Sequence[_Number]) -> I64:
 
 def _are_dates(columns: Sequence[Sequence[_Number]]) -> bool:
     """Whether names begin with year, month, day, hour, minute and second."""
-    return len(columns) >= len(_DATE) and all(
+    ranges = ((1990, 2100), (1, 12), (1, 31), (0, 23), (0, 59), (0, 59))
+    return len(columns) >= len(ranges) and all(
         low <= int(number.whole) <= high and abs(number.sign) == 1
-        for column, (low, high) in zip(columns, _DATE, strict=False)
+        for column, (low, high) in zip(columns, ranges, strict=False)
         for number in column
     )
 
@@ -179,7 +173,8 @@ def _tokens(file: Path) -> list[Token]:
     """Text and numbers of a name without its suffix, in turn. Three or more numbers with dots between them count one by
     one, as in a date or a version."""
     tokens: list[Token] = []
-    for match in _TOKEN.findall(file.stem.lower()):
+    # A number with its decimals, or one letter. A minus is a sign at the start of a name and after _, = or a blank.
+    for match in re.findall(r"(?:(?:^|(?<=[_=\s]))-)?\d+(?:\.\d+)*|\D", file.stem.lower()):
         if not match[-1].isdigit():
             if tokens and isinstance(tokens[-1], str):
                 tokens[-1] += match
@@ -240,7 +235,7 @@ def _hexadecimal(files: Sequence[Path]) -> list[int] | None:
     if len({len(row) for row in rows}) != 1:
         return None
     varying = [column for column in zip(*rows, strict=True) if len(set(column)) > 1]
-    if len(varying) != 1 or not all(_HEX.fullmatch(piece) for piece in varying[0]):
+    if len(varying) != 1 or not all(re.fullmatch(r"(?:0x)?[0-9a-f]+", piece) for piece in varying[0]):
         return None
     digits = [piece.removeprefix("0x") for piece in varying[0]]
     letters = any(re.search("[a-f]", one) for one in digits)

@@ -431,13 +431,11 @@ def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
     return found
 
 
-_DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
-
-
 def date_ns(text: str, where: str) -> int:
     """Nanoseconds since 1970 of a date and time such as KITTI's "2011-09-26 13:02:25.964389445", in UTC where it names
     no other zone. MapvoteError if it is none."""
-    parts = _DATE.fullmatch(text.strip())
+    date = r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?"
+    parts = re.fullmatch(date, text.strip())
     try:
         if parts is None:
             raise ValueError

@@ -32,7 +32,6 @@ ENU = "ENU "
 """``crs`` of a plane that touches the Earth: "ENU latitude longitude height" of its origin, x east, y north, z up."""
 PROJECTOR = "map_projector_info.yaml"
 TYPES = ("Local", "MGRS", "LocalCartesianUTM", "LocalCartesian", "TransverseMercator")
-_SQUARE_M = 100_000.0
 log = logging.getLogger("mapvote.formats")
 
 
@@ -221,10 +220,6 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
     return poses_at(frame.from_lonlat(lonlat), frame.axes_at(lonlat) @ R_enu_base), frame
 
 
-_NO_FIX_DEG = 1e-6
-"""Degrees from latitude 0, longitude 0, in the Gulf of Guinea: no vehicle is there."""
-
-
 def sound_fixes(where: str, lonlat: F64, status: F64 | None = None) -> tuple[Bool, F64]:
     """(which of the fixes (n, 3), longitude, latitude in degrees, height in metres, are ones (n,), these (m, 3)).
 
@@ -233,7 +228,7 @@ def sound_fixes(where: str, lonlat: F64, status: F64 | None = None) -> tuple[Boo
     counted. MapvoteError if none is left.
     """
     finite = np.isfinite(lonlat[:, :2]).all(axis=1)
-    at_zero = finite & (np.abs(lonlat[:, :2]) < _NO_FIX_DEG).all(axis=1)
+    at_zero = finite & (np.abs(lonlat[:, :2]) < 1e-6).all(axis=1)  # in the Gulf of Guinea: no vehicle is there
     no_fix = np.zeros(len(lonlat), dtype=np.bool_) if status is None else status < 0
     keep = finite & ~at_zero & ~no_fix
     if not keep.all():
@@ -340,7 +335,8 @@ def _mgrs_frame(grid: str, where: str = PROJECTOR) -> MapFrame:
         raise
     except Exception as error:  # the library raises its own, of several kinds
         raise MapvoteError(f"{where}: {grid!r} is no MGRS grid such as 54SUE") from error
-    x0, y0 = (float(np.floor(v / _SQUARE_M) * _SQUARE_M) for v in (easting, northing))
+    side_m = 100_000.0
+    x0, y0 = (float(np.floor(v / side_m) * side_m) for v in (easting, northing))
     return MapFrame(f"EPSG:{(32600 if hemisphere == 'N' else 32700) + int(zone)}", (x0, y0, 0.0))
 
 

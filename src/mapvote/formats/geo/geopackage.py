@@ -14,9 +14,6 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.frame import ENU, MapFrame
 
-LAYER = "changes"
-_LOCAL = 'ENGCRS["local map metres",EDATUM["map"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
-
 
 def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapFrame) -> None:
     """GeoJSON features (polygons in map metres) as one layer, whole or not at all.
@@ -35,6 +32,9 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
     geometry = np.array([shape.wkb for shape in shapes], dtype=object)
     names = list(features[0]["properties"]) if features else []
     columns = [_column([f["properties"][name] for f in features]) for name in names]
+    local = (
+        'ENGCRS["local map metres",EDATUM["map"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+    )
     with whole_file(path) as partial:
         named = partial.with_name(f"{partial.name}.gpkg")  # GDAL wants the suffix
         pyogrio.write(
@@ -42,10 +42,10 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
             geometry=geometry,
             field_data=columns,
             fields=names,
-            layer=LAYER,
+            layer="changes",
             driver="GPKG",
             geometry_type="MultiPolygon",
-            crs=_LOCAL if frame.is_local else frame.crs,
+            crs=local if frame.is_local else frame.crs,
         )
         os.replace(named, partial)
 

@@ -121,10 +121,6 @@ def _bounds(root: ElementTree.Element) -> set[str]:
     return {str(m.get("ref")) for r in relations for m in r.iter("member") if m.get("type") == "way"}
 
 
-_BOUND_TYPES = ("line_thin", "line_thick", "virtual", "")
-"""Types of ways that mean nothing but the edge of a lane."""
-
-
 def _all_parts(root: ElementTree.Element, lines: Mapping[str, F64], bounds: set[str]) -> Iterator[MapPart]:
     for relation in _there(root, "relation"):
         tags = _tags(relation)
@@ -133,11 +129,12 @@ def _all_parts(root: ElementTree.Element, lines: Mapping[str, F64], bounds: set[
             yield MapPart("lanelet", tags.get("subtype", ""), name, _lanelet(relation, lines), relation)
         elif tags.get("type") == "multipolygon":
             yield MapPart("area", tags.get("subtype", ""), name, _area(relation, lines), relation)
+    edges = ("line_thin", "line_thick", "virtual", "")  # types that mean nothing but the edge of a lane
     for way in _there(root, "way"):
         tags = _tags(way)
         name = str(way.get("id"))
         kind = tags.get("type", "")
-        if name not in lines or (name in bounds and kind in _BOUND_TYPES):
+        if name not in lines or (name in bounds and kind in edges):
             continue
         closed = tags.get("area") == "yes"
         shape = _polygon(lines[name]) if closed else shapely.LineString(lines[name])

@@ -40,7 +40,6 @@ HISTORY = ".mapvote_versions.json"
 """Beside tiles that ``mapvote export --follow`` wrote: which version has which."""
 FOLLOWED = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
 """How it names them: X_Y_HASH8.pcd."""
-_CONTENT = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
 
 
 def is_autoware(path: Path) -> bool:
@@ -55,15 +54,16 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     """
     file = path / METADATA
     table = read_yaml(file)
+    content = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
     if not isinstance(table, dict):
-        raise MapvoteError(f"{file}: not Autoware's metadata; {_CONTENT}")
+        raise MapvoteError(f"{file}: not Autoware's metadata; {content}")
     try:
         size = np.array([float(table.pop("x_resolution")), float(table.pop("y_resolution"))])
         corners = {str(name): np.array([float(v) for v in corner]) for name, corner in table.items()}
         if not corners or (size <= 0).any() or any(c.shape != (2,) for c in corners.values()):
             raise ValueError("no tiles, or a corner that is not [x, y]")
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {_CONTENT}") from error
+        raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {content}") from error
     for name in corners:
         plain_name(name, file)
     frame = _frame(path)

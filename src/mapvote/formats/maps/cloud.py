@@ -37,10 +37,6 @@ READ_SIZES = ReadSizes()
 log = logging.getLogger("mapvote.formats")
 SCALED = {"intensity": "intensity"} | dict.fromkeys(COLOURS, "colour")
 """Fields that count from nothing to a full scale, and what shares it."""
-_SHORT = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)
-"""Types of coordinates that float32 holds exactly."""
-WEEK_S = 604_800.0
-"""Seconds of a GPS week."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +102,7 @@ class CloudPieces:
             gps_times = gps_times or piece.gps_times
             latest_s = max(latest_s, float(np.nanmax(piece.fields.get("gps_time", np.zeros(1)), initial=0.0)))
         corners = np.array([low, high]) if n else np.zeros((2, 3))
-        told = gps_times or ("adjusted standard" if latest_s > WEEK_S else "week")
+        told = gps_times or ("adjusted standard" if latest_s > 604_800.0 else "week")
         return cls(pieces, frame, n, corners, kinds, brightness, told)
 
     def __iter__(self) -> Iterator[Cloud]:
@@ -172,7 +168,8 @@ def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
     if single and table.flags.c_contiguous and len(table):
         return np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
-    exact = any(table.dtype[found[axis]] not in _SHORT for axis in "xyz")
+    short = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)  # float32 holds them exactly
+    exact = any(table.dtype[found[axis]] not in short for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
     for column, axis in enumerate("xyz"):
         out[:, column] = table[found[axis]]

@@ -165,16 +165,12 @@ def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
         yield Cloud(np.empty((0, 3)), others, frame)
 
 
-_BOX = struct.Struct("<6d"), 179
-"""Highest and lowest x, y, z of a LAS header, and where they stand in it."""
-
-
 def beside_its_box(path: Path, low: F64, high: F64) -> str:
     """How far the points from ``low`` (3,) to ``high`` (3,) lie beside the box that the file's header states; "" if
     they share a part of it, or if it states none. So an offset shows that was lost."""
-    layout, start = _BOX
+    layout = struct.Struct("<6d")  # highest and lowest x, y, z
     with path.open("rb") as file:
-        file.seek(start)
+        file.seek(179)
         numbers = file.read(layout.size)
     if len(numbers) < layout.size or not np.isfinite(low).all():
         return ""

@@ -34,8 +34,6 @@ FIELDS = {
 """Fields of a point that a map keeps besides x, y, z."""
 FLAGS = {"synthetic": 1, "key_point": 2, "withheld": 4, "overlap": 8}
 """Bits of ``las_flags``."""
-LAYERED = 3
-"""LASzip's compressor of the point formats from 6 on."""
 
 
 class LasClass(IntEnum):
@@ -141,7 +139,8 @@ def points_in_chunks(path: str, start: int) -> int | None:
         size = struct.unpack_from("<I", record, 12)[0]
         if size == 0xFFFFFFFF:
             return sum(points for points, _ in chunks)
-        if struct.unpack_from("<H", record, 0)[0] != LAYERED or not chunks:
+        layered = 3  # LASzip's compressor of the point formats from 6 on
+        if struct.unpack_from("<H", record, 0)[0] != layered or not chunks:
             return None
         point_bytes = sum(struct.unpack_from("<H", record, 36 + 6 * i)[0] for i in range(record[32]))
         if point_bytes != header.point_format.size:

@@ -28,7 +28,6 @@ from mapvote.formats.reading import FILE_LIMITS, first_bytes, read_whole
 MANIFEST = "manifest.json"
 FORMAT = "mapvote-map"
 FORMAT_VERSION = 1
-_TILE_M = np.float32(TILE_CELLS * CELL_SIZE)
 
 
 class FolderManifest(Manifest, kw_only=True):
@@ -114,10 +113,12 @@ def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
     except ValueError as error:
         raise MapvoteError(f"{path / MANIFEST}: names a tile by no row and column ({error})") from error
 
+    side_m = np.float32(TILE_CELLS * CELL_SIZE)
+
     def load(index: TileIndex) -> Tile:
         with _whole(path, index):
             tile = unpack_tile(manifest.lattice.tile(index), named[index], _planes(path, named[index]))
-        if not (np.isfinite(tile.points).all() and ((tile.points[:, :2] >= 0) & (tile.points[:, :2] < _TILE_M)).all()):
+        if not (np.isfinite(tile.points).all() and ((tile.points[:, :2] >= 0) & (tile.points[:, :2] < side_m)).all()):
             raise MapvoteError(f"{path}: tile {tile_key(index)} holds a point outside it or not finite; copy it again")
         return tile
 

@@ -32,14 +32,6 @@ from mapvote.formats.maps.cloud import (
 from mapvote.formats.maps.pcd_header import PcdHeader, compose_header, read_header
 from mapvote.formats.reading import FILE_LIMITS, reading
 
-_PAGE = 4096
-"""Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
-_GRID_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}")
-"""X_Y: nobody names scans so."""
-_PLACE_TILE = re.compile(r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?", re.IGNORECASE)
-"""By metres of UTM or Gauss-Krueger (412340_5423980), or with a word before them (map_0_0): scans may be named so, too,
-which their points tell."""
-
 
 @record()
 @dataclass(frozen=True, slots=True)
@@ -66,9 +58,13 @@ def is_pcd_tiles(path: Path) -> bool:
     names = [file.stem for file in files_like(path, "*.pcd")]
     if not names or is_recording(path):
         return False
-    if all(_GRID_TILE.fullmatch(name) for name in names):
+    if all(re.fullmatch(r"-?\d{1,5}_-?\d{1,5}", name) for name in names):  # X_Y: nobody names scans so
         return True
-    return all(_PLACE_TILE.fullmatch(name) for name in names) and _lie_side_by_side(files_like(path, "*.pcd"))
+    # By metres of UTM or Gauss-Krueger (412340_5423980), or with a word before them (map_0_0). So may scans be named.
+    by_metres = r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?"
+    return all(re.fullmatch(by_metres, name, re.IGNORECASE) for name in names) and _lie_side_by_side(
+        files_like(path, "*.pcd")
+    )
 
 
 def _lie_side_by_side(files: list[Path], rule: TileRule = TILE_RULE) -> bool:
@@ -265,7 +261,8 @@ def _bytes_left(file: BinaryIO) -> int:
     """Bytes that follow, zeros that fill a page at most not counted."""
     start = file.tell()
     left = max(0, file.seek(0, os.SEEK_END) - start)
-    if left > _PAGE:
+    page = 4096  # PCL up to 1.7 reserved so much for the header; what that leaves follows the points, as zeros
+    if left > page:
         return left
     file.seek(start)
     return len(file.read().rstrip(b"\0"))

@@ -20,8 +20,6 @@ _TYPES = {
     "f8": "double", "f4": "float", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"
 }  # fmt: skip
 
-_HEADER_MEND = "correct the numbers of elements in the header, or export it again"
-
 
 def stream_ply(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
     """The vertices of a PLY file with the fields that a map keeps, piece by piece. MapvoteError as
@@ -44,7 +42,8 @@ def stream_ply_tables(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[NDA
             more = source.read() if is_text else source.read().strip(b"\0\r\n ")
         if more and file.elements[-1].name == "vertex":  # faces too many are nothing to a map
             raise MapvoteError(
-                f"{path}: data follow the elements that its header counts ({_counts(file)}); {_HEADER_MEND}"
+                f"{path}: data follow the elements that its header counts ({_counts(file)}); correct the numbers of "
+                "elements in the header, or export it again"
             )
         if "vertex" not in file:
             raise ValueError("it holds no element vertex")
