@@ -180,7 +180,9 @@ class History:
         """Then once more: a publish without new votes changes nothing."""
         done = publish(self.store, override=True).published
         again = publish(self.store, override=True)
-        assert not again.published, f"published without new votes: {again.deleted} points go, {again.added} come"
+        assert not again.published, (
+            f"published without new votes: {again.points_deleted} points go, {again.points_added} come"
+        )
         assert done == self._publish_by_the_rules(), f"published: {done}"
 
     def _publish_by_the_rules(self) -> bool:

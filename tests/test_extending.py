@@ -132,7 +132,7 @@ def test_an_attribute_of_another_distribution_goes_from_a_drive_over_a_server_to
     ballots = [vote_drive(drive, classed, settings, localise=GivenPoses(drive.stamps_ns, poses))[0] for drive in drives]
     store = new_store(classed, Policy(fuse=FuseSettings(min_votes=2, max_deleted_share=1.0)), name="fleet.db")
     send(store, *ballots)
-    assert publish(store).added > 100, "the new house comes in"
+    assert publish(store).points_added > 100, "the new house comes in"
     export_map(store.point_map(), tmp_path / "out.las")
     written = laspy.read(tmp_path / "out.las")
     classes = np.asarray(written.classification)

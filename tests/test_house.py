@@ -50,6 +50,9 @@ MOST_PACKED_SHARE = 0.01
 """Share of assignments that pack several statements into one line."""
 MOST_ODD_SENTENCES = 8
 """Sentences of docstrings that begin with Of, What or As: their subject is missing or a clause."""
+MADE_ELSEWHERE = {"ManifestAnswer", "PolicyChange"}
+"""Answers that no function beside them makes: the manifest's model is derived from the codec's type, and the store
+reads the changes of its policy."""
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 
@@ -229,6 +232,46 @@ def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:
         and any(keyword.arg == "type" for keyword in call.keywords)
     ]
     assert late == [], "make a Decoder of the type at the module's top level"
+
+
+def answer_models(source: Path) -> set[str]:
+    """Names of the models that the routes of a module declare for their answers."""
+    found: set[str] = set()
+    for function in functions(source):
+        for decorator in function.decorator_list:
+            if isinstance(decorator, ast.Call) and ast.unparse(decorator.func).startswith("router."):
+                told = [keyword.value for keyword in decorator.keywords if keyword.arg == "response_model"]
+                models = told or ([] if function.returns is None else [function.returns])
+                nodes = [node for model in models for node in ast.walk(model)]
+                found |= {node.id for node in nodes if isinstance(node, ast.Name)}
+    return found - {"Response", "StreamingResponse"}
+
+
+def made_in(tree: ast.Module) -> set[str]:
+    """Classes that a module both defines and makes, itself or as the base of one that it makes."""
+    called = {ast.unparse(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    bases = {ast.unparse(base) for node in classes if node.name in called for base in node.bases}
+    return {node.name for node in classes} & (called | bases)
+
+
+def test_an_answer_is_told_once_as_the_dataclass_beside_the_function_that_makes_it() -> None:
+    """A dict in the function and a model in api/schemas.py told the same members twice."""
+    declared = {name for s in SOURCES if s.stem.endswith("routes") for name in answer_models(s)}
+    made = {name for source in SOURCES for name in made_in(parsed(source))}
+    assert len(declared) > 20
+    assert declared - made == MADE_ELSEWHERE
+    schemas = parsed(SRC / "mapvote_server/api/schemas.py")
+    assert [n.name for n in schemas.body if isinstance(n, ast.ClassDef) and not n.name.endswith("Ask")] == [
+        "Answer",
+        "Problem",
+    ]
+
+
+def test_an_answer_that_is_declared_in_one_module_and_made_in_another_is_found() -> None:
+    """The check above can fail."""
+    told = "class A: ...\nclass B(A): ...\nclass C: ...\ndef f():\n    return B(), D()\n"
+    assert made_in(ast.parse(told)) == {"A", "B"}
 
 
 def module_constants(source: Path) -> Iterator[tuple[str, ast.expr]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -146,7 +147,7 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
     before = street()
     after = street(cell_points(0, 0, 3, 3, (2.0,)), cell_points(3, 3, 1, 1, (2.0,)))
     first, again = (
-        json.dumps(
+        msgspec.json.encode(
             to_geojson(compare(before, after), Lattice(0.3, -0.6), map_id="street", from_version=1, to_version=2)
         )
         for _ in range(2)
@@ -199,11 +200,11 @@ def test_geojson_of_a_map_on_earth_is_longitude_and_latitude() -> None:
     before, after = street(), street(cell_points(0, 0, 3, 3, (2.0,)))
     place = {"crs": "EPSG:32654", "offset": "300000.0,3900000.0,0.0"}
     found = to_geojson(compare(before, after), Lattice(), map_id="m", georeference=place, lonlat=True)
-    corners = np.array(found["features"][0]["geometry"]["coordinates"][0])
+    corners = np.array(found.features[0].geometry.coordinates[0])
     assert np.abs(corners - [138.80, 35.22]).max() < 0.05
     assert (np.ptp(corners, axis=0) < 2e-5).all()
     local = to_geojson(compare(before, after), Lattice(), map_id="m", lonlat=True)
-    assert "local metres" in local["frame"]
+    assert "local metres" in local.frame
 
 
 def test_what_two_vehicles_leave_behind_is_no_larger_thing_but_a_long_low_wall_is() -> None:

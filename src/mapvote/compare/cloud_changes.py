@@ -368,9 +368,9 @@ def difference_geojson(
     features = []
     for row, one in zip(difference_rows(changes), changes, strict=True):
         polygons = [[np.round(ring * CELL_SIZE + origin, 3).tolist() for ring in polygon] for polygon in one.outline]
-        geometry = {"type": "MultiPolygon", "coordinates": polygons}
         if not frame.is_local:
-            rings_to_lonlat(geometry, frame)
+            rings_to_lonlat(polygons, frame)
+        geometry = {"type": "MultiPolygon", "coordinates": polygons}
         features.append({"type": "Feature", "id": row.pop("id"), "geometry": geometry, "properties": row})
     return {
         "type": "FeatureCollection",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -17,6 +17,7 @@ from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64
 from mapvote.core.voxels import found_among
+from mapvote.shapes.geojson import ChangeFacts, ChangeFeature
 from mapvote.shapes.packed_cloud import SIDE_M, cloud_bytes, pack
 
 
@@ -71,21 +72,23 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
     return told | {kind: base64.b64encode(cloud).decode() for kind, cloud in clouds.items()}
 
 
-def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
-    """The cutout of a feature of :func:`mapvote.shapes.geojson.to_geojson`."""
-    p = feature["properties"]
-    kind = "Built" if p["kind"] == "built" else "Trimmed beside what stands" if _only_trimmed(p) else "Demolished"
-    votes = f"{p['votes_median']:g} votes for it, {p['against_median']:g} against"
-    if not p["versions"]:
+def of_feature(feature: ChangeFeature, tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
+    """The cutout of a change."""
+    change = feature.properties
+    kind = (
+        "Built" if change.kind == "built" else "Trimmed beside what stands" if _only_trimmed(change) else "Demolished"
+    )
+    votes = f"{change.votes_median:g} votes for it, {change.against_median:g} against"
+    if not change.versions:
         votes = "no votes: a rollback or replay took a decision back"
-    facts = f"{p['area_m2']:.1f} m², {p['height_m']:.1f} m high, {p['points']} points; {votes}"
-    (x0, y0), (x1, y1) = p["box"]
+    facts = f"{change.area_m2:.1f} m², {change.height_m:.1f} m high, {change.points} points; {votes}"
+    (x0, y0), (x1, y1) = change.box
     name = f"{kind} at {0.5 * (x0 + x1):.0f}, {0.5 * (y0 + y1):.0f}"
-    return cut_out(name, facts, (x0, y0, x1, y1), p["height_m"], tiles, lattice)
+    return cut_out(name, facts, (x0, y0, x1, y1), change.height_m, tiles, lattice)
 
 
-def _only_trimmed(facts: Mapping[str, Any]) -> bool:
-    return bool(facts["trimmed"] == facts["cells"])
+def _only_trimmed(change: ChangeFacts) -> bool:
+    return change.trimmed == change.cells
 
 
 def fragment(cutouts: Sequence[Cutout]) -> str:

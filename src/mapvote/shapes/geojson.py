@@ -1,23 +1,122 @@
-"""Change objects and tiles as GeoJSON, and any list of the server as CSV."""
+"""Change objects and tiles as GeoJSON (RFC 7946), and any list of the server as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
+from pydantic import Field
 
+from mapvote.core.answers import answer
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.record import record
 from mapvote.core.times import utc
 from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame, frame_of
-from mapvote.shapes.change_objects import ChangeObject
+from mapvote.shapes.change_objects import ChangeObject, Kind, Size
 from mapvote.shapes.outlines import Ring
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """A geometry of RFC 7946."""
+
+    type: Literal["Point", "LineString", "Polygon", "MultiPolygon"]
+    coordinates: list[Any]
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class ChangeFacts:
+    """One thing that was built or demolished."""
+
+    kind: Kind
+    size: Size
+    area_m2: float
+    height_m: float
+    volume_m3: Annotated[float, Field(description="of its columns")]
+    cells: int
+    points: int
+    votes_min: int
+    votes_median: float
+    against_median: float
+    share_for: float | None
+    probability: Annotated[float | None, Field(description="mean over its cells that each of them changed")]
+    trimmed: Annotated[
+        int, Field(description="of its cells those that stand and lost only some voxels, beside what stays")
+    ]
+    fell: Annotated[
+        int, Field(description="of its cells those whose points fell with the others', because nothing holds them")
+    ]
+    first_seen: str | None
+    last_seen: str | None
+    versions: list[int]
+    box: list[list[float]]
+    near: Annotated[list[str], Field(description="ids of large things within 15 m")]
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class ChangeFeature:
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    id: str
+    geometry: Geometry
+    properties: ChangeFacts
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class ChangeCollection:
+    """GeoJSON; ``frame`` says what its coordinates are."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    map_id: str
+    georeference: dict[str, str]
+    from_version: int | None
+    to_version: int | None
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Changes(ChangeCollection):
+    """The differences between two versions."""
+
+    features: list[ChangeFeature]
+    numberMatched: int
+    """of all that were asked for (OGC API Features)"""
+    numberReturned: int
+    """of those here"""
+    damaged: list[str] | None = None
+    """tiles that cannot be read"""
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class PlacedFeature:
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    geometry: Geometry
+    properties: dict[str, Any]
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Places:
+    """GeoJSON in map metres."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    features: list[PlacedFeature]
 
 
 def to_geojson(
@@ -30,36 +129,38 @@ def to_geojson(
     georeference: Mapping[str, str] | None = None,
     lonlat: bool = False,
     among: Sequence[ChangeObject] | None = None,
-) -> dict[str, Any]:
-    """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``json.dumps``; its member "frame" says where
-    coordinates lie.
+) -> Changes:
+    """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``msgspec.json.encode``; its member "frame" says
+    where coordinates lie.
 
     ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
     ``among``: the list of which the objects are a part, for what is near them; None: they are all.
     """
     frame = frame_of(georeference or {})
-    near = _neighbours(objects, objects if among is None else among)
-    features = [_feature(change, lattice, beside) for change, beside in zip(objects, near, strict=True)]
-    if lonlat and not frame.is_local:
-        for feature in features:
-            rings_to_lonlat(feature["geometry"], frame)
-    return {
-        "type": "FeatureCollection",
-        "frame": "WGS 84 longitude, latitude" if lonlat and not frame.is_local else f"{MAP_METRES}: {frame.told()}",
-        "map_id": map_id,
-        "georeference": dict(georeference or {}),
-        "from_version": from_version,
-        "to_version": to_version,
-        "features": features,
-    }
+    every = objects if among is None else among
+    in_degrees = lonlat and not frame.is_local
+    near = _neighbours(objects, every)
+    features = [
+        _feature(change, lattice, beside, frame if in_degrees else None)
+        for change, beside in zip(objects, near, strict=True)
+    ]
+    return Changes(
+        type="FeatureCollection",
+        frame="WGS 84 longitude, latitude" if in_degrees else f"{MAP_METRES}: {frame.told()}",
+        map_id=map_id,
+        georeference=dict(georeference or {}),
+        from_version=from_version,
+        to_version=to_version,
+        features=features,
+        numberMatched=len(every),
+        numberReturned=len(features),
+    )
 
 
-def rings_to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
-    """Rings in map metres to degrees, in place. The sense of the rings stays."""
-    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+def rings_to_lonlat(polygons: list[list[Any]], frame: MapFrame) -> None:
+    """The rings of polygons in map metres to degrees, in place. The sense of the rings stays."""
     for polygon in polygons:
-        for i, ring in enumerate(polygon):
-            polygon[i] = frame.plane_to_lonlat(np.array(ring)).tolist()
+        polygon[:] = [frame.plane_to_lonlat(np.array(ring)).tolist() for ring in polygon]
 
 
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -72,9 +173,14 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return out.getvalue()
 
 
-def feature_rows(collection: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The features of :func:`to_geojson` without their outlines, for a table."""
-    return [{"id": f["id"]} | f["properties"] for f in collection["features"]]
+def feature_rows(features: Sequence[ChangeFeature]) -> list[dict[str, Any]]:
+    """Features without their outlines, for a table."""
+    return [{"id": feature.id} | members_of(feature.properties) for feature in features]
+
+
+def members_of(answer: Any) -> dict[str, Any]:
+    """The members of a dataclass by name, none of them copied."""
+    return {member.name: getattr(answer, member.name) for member in fields(answer)}
 
 
 def _cell(value: Any) -> Any:
@@ -96,29 +202,25 @@ def _neighbours(objects: Sequence[ChangeObject], among: Sequence[ChangeObject]) 
     return [[name for _, name in sorted(one)][: NEIGHBOUR_RULE.listed] for one in near]
 
 
-def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
+def _feature(change: ChangeObject, lattice: Lattice, near: list[str], frame: MapFrame | None) -> ChangeFeature:
+    """``frame``: of the degrees that its outline is in; None: map metres."""
     polygons = [[_corners(ring, lattice) for ring in polygon] for polygon in change.outline]
+    if frame is not None:
+        rings_to_lonlat(polygons, frame)
     single = len(polygons) == 1
-    facts = (
-        *("kind", "size", "area_m2", "height_m", "volume_m3", "cells", "points", "votes_min", "votes_median"),
-        *("against_median", "share_for", "probability", "trimmed", "fell"),
-    )
-    return {
-        "type": "Feature",
-        "id": change.id,
-        "geometry": {
-            "type": "Polygon" if single else "MultiPolygon",
-            "coordinates": polygons[0] if single else polygons,
-        },
-        "properties": {name: _rounded(name, getattr(change, name)) for name in facts}
-        | {
-            "first_seen": utc(change.first_seen_ns),
-            "last_seen": utc(change.last_seen_ns),
-            "versions": change.versions,
-            "box": _corners(np.reshape(change.box, (2, 2)), lattice),
-            "near": near,
-        },
+    outline = Geometry("Polygon", polygons[0]) if single else Geometry("MultiPolygon", polygons)
+    return ChangeFeature("Feature", change.id, outline, _facts(change, lattice, near))
+
+
+def _facts(change: ChangeObject, lattice: Lattice, near: list[str]) -> ChangeFacts:
+    here: dict[str, Any] = {
+        "first_seen": utc(change.first_seen_ns),
+        "last_seen": utc(change.last_seen_ns),
+        "box": _corners(np.reshape(change.box, (2, 2)), lattice),
+        "near": near,
     }
+    own = [member.name for member in fields(ChangeFacts) if member.name not in here]
+    return ChangeFacts(**{name: _rounded(name, getattr(change, name)) for name in own}, **here)
 
 
 def _rounded(name: str, value: Any) -> Any:
@@ -147,7 +249,7 @@ NEIGHBOUR_RULE = NeighbourRule()
 MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 
-def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
+def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> Places:
     """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
     side = TILE_CELLS * CELL_SIZE
     squares = []
@@ -155,11 +257,10 @@ def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[s
         window = lattice.tile((tile["row"], tile["col"]))
         x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))
         ring = [[x, y], [x1, y], [x1, y1], [x, y1], [x, y]]
-        squares.append(({"type": "Polygon", "coordinates": [ring]}, dict(tile)))
-    return collection(squares)
+        squares.append(PlacedFeature("Feature", Geometry("Polygon", [ring]), dict(tile)))
+    return places(squares)
 
 
-def collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
-    """Things in map metres, each (geometry, properties), as GeoJSON."""
-    features = [{"type": "Feature", "geometry": geometry, "properties": properties} for geometry, properties in things]
-    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+def places(features: list[PlacedFeature]) -> Places:
+    """Features in map metres as GeoJSON."""
+    return Places("FeatureCollection", MAP_METRES, features)

@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from mapvote.shapes.geojson import feature_rows
+from mapvote.shapes.geojson import Changes, feature_rows
 from mapvote_server.api.etags import has_already, tag_of
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
@@ -16,7 +16,6 @@ from mapvote_server.api.schemas import (
     AS_YOU_HAVE,
     LEAST,
     MOST,
-    Changes,
     as_json,
     as_table,
     problems,
@@ -62,9 +61,9 @@ def changes(request: Request, parts: Parts, known: Known, asked: Annotated[Chang
         return Response(status_code=304, headers=headers)
     shown: dict[str, Any] = {"limit": asked.limit, "offset": asked.offset}
     found = changes_between(parts.store, asked.old, newest, asked.min_cells, lonlat=asked.lonlat, known=known, **shown)
-    answer = as_table(feature_rows(found)) if asked.format == "csv" else as_json(found)
-    after = asked.offset + found["numberReturned"]
-    if after < found["numberMatched"]:
+    answer = as_table(feature_rows(found.features)) if asked.format == "csv" else as_json(found)
+    after = asked.offset + found.numberReturned
+    if after < found.numberMatched:
         following = dict(request.query_params) | {"to": str(newest), "offset": str(after)}
         headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
     answer.headers.update(headers)

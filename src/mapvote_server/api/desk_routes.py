@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
-from mapvote.codec.ballot import tile_key
+from mapvote.core.answers import answer
 from mapvote.shapes.geojson import feature_rows
 from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
@@ -17,19 +18,16 @@ from mapvote_server.api.schemas import (
     MOST_SEQ,
     PLAIN,
     Ask,
-    DeskAnswer,
-    Pending,
     SeqOfBody,
     TableOrMap,
-    VerdictGiven,
     as_json,
     as_table,
     problems,
     sends_bytes,
 )
 from mapvote_server.api.services import Parts, Reviewer, Services
-from mapvote_server.questions.desk import Desk, Proposed, desk, review, verdict_of
-from mapvote_server.store.reviews import undo
+from mapvote_server.questions.desk import Desk, DeskAnswer, Pending, desk, review
+from mapvote_server.store.reviews import VerdictAnswer, undo
 
 router = APIRouter()
 
@@ -56,30 +54,17 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
 
     ``geojson`` and ``csv`` hold all of them in one list.
     """
-    found = await _look(parts)
-    left_out = [verdict_of(one) for one in found.reviewed]
+    found = (await _look(parts)).answer
     if format == "json":
-        answer = {
-            "version": found.version,
-            "held": found.held,
-            "doubts": found.doubts,
-            "waits": found.waits,
-            "pending": found.pending,
-        }
-        tiles = {tile_key(index): _hashes(made) for index, made in found.edited.items()}
-        return as_json(answer | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
-    listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}
-    return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
+        return as_json(found)
+    listed = found.in_one()
+    return as_json(listed) if format == "geojson" else as_table(list(map(_flat, feature_rows(listed.features))))
 
 
 @router.get("/v1/desk/clouds", summary="Points that a publish would add and delete", **sends_bytes(403))
 async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Response:
     """Tile by tile, two clouds each, as `/v1/clouds/changed` gives them."""
     return packed(request, (await _look(parts)).clouds, "no-store")
-
-
-def _hashes(made: Proposed) -> dict[str, str] | None:
-    return {"points": made.hashes.points, "ground": made.hashes.ground} if made.points else None
 
 
 async def _look(parts: Services) -> Desk:
@@ -90,9 +75,21 @@ async def _look(parts: Services) -> Desk:
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A verdict has its own columns."""
-    said = row["verdict"] or {"verdict": "", "by": "", "comment": ""}
-    return dict(row) | {"verdict": said["verdict"], "by": said["by"], "comment": said["comment"]}
+    """A verdict has three columns of its own."""
+    given: VerdictAnswer | None = row["verdict"]
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        columns = ("verdict", "by", "comment") if name == "verdict" else ()
+        flat |= {column: "" if given is None else getattr(given, column) for column in columns} or {name: value}
+    return flat
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class VerdictGiven:
+    """The verdict's number in the log."""
+
+    seq: int
 
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")

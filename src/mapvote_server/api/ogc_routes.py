@@ -18,7 +18,7 @@ from fastapi import APIRouter, Request, Response
 
 from mapvote.core.times import utc
 from mapvote_server.api.lanes import on
-from mapvote_server.api.schemas import LEAST, MOST, as_json
+from mapvote_server.api.schemas import LEAST, MOST
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import BadRequest, Forbidden, NotFound
 from mapvote_server.questions.desk import desk
@@ -233,7 +233,8 @@ async def _pending(parts: Services, kind: Collection) -> Features | None:
     """The features of the desk, whose work has a lane of its own; None for every other collection."""
     if kind.features is not None:
         return None
-    pending: Features = (await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)).pending["features"]
+    found = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
+    pending: Features = msgspec.to_builtins(found.answer.pending.features)
     return pending
 
 
@@ -277,12 +278,10 @@ def _answer(
     """JSON, or a page if the client asks for one by ``f`` or wants HTML above all."""
     first = request.headers.get("accept", "").partition(",")[0].partition(";")[0].strip()
     wanted = request.query_params.get("f") or ("html" if first == _HTML else "json")
+    count_rows(1 + len(content.get("features", ())))
     if wanted == "html":
-        count_rows(1 + len(content.get("features", ())))
         return _page(str(content.get("title", request.url.path)), content)
-    answer = as_json(content, kind)
-    answer.headers.update(headers or {})
-    return answer
+    return Response(msgspec.json.encode(content), media_type=kind, headers=dict(headers or {}))
 
 
 def _page(title: str, content: Mapping[str, Any]) -> Response:

@@ -5,64 +5,51 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
-from dataclasses import asdict, replace
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Annotated, Any, Literal
 
 import structlog
 from fastapi import APIRouter, Query, Request, Response
 from prometheus_client import generate_latest
 
-from mapvote.codec.ballot import tile_key
+from mapvote.core.answers import answer
 from mapvote.core.types import MapvoteError
-from mapvote.shapes.geojson import tile_squares
+from mapvote.shapes.geojson import Places, tile_squares
 from mapvote_server.api.lanes import on
 from mapvote_server.api.schemas import (
     AS_CSV,
-    Cancelled,
-    Checked,
-    Coverage,
     Digest,
-    Health,
     IssueAsk,
-    KeyIssued,
-    KeysAnswer,
-    KeysRevoked,
     Metres,
-    Passes,
-    Places,
     PolicyAsk,
     PublishAsk,
-    Published,
-    Publishes,
-    Ready,
     ReplayAsk,
-    Restored,
     RevokeAsk,
     RollbackAsk,
-    RolledBack,
     RotateAsk,
     TableOrMap,
-    Vehicles,
-    Withdrawn,
     as_json,
     as_table,
     problems,
 )
-from mapvote_server.api.services import Known, Operator, Parts, Reviewer, Services
+from mapvote_server.api.services import Known, Operator, Parts, Progress, Reviewer, Services
+from mapvote_server.api.vehicle_routes import Withdrawn
 from mapvote_server.errors import Held, Unavailable
-from mapvote_server.questions.coverage import waiting_votes, wanted_passes
+from mapvote_server.questions.coverage import Passes, waiting_votes, wanted_passes
 from mapvote_server.questions.explain import CellStory, explain_cell
-from mapvote_server.questions.freshness import tiles_seen
+from mapvote_server.questions.freshness import CoveredTile, tiles_seen
 from mapvote_server.questions.history import Info, Log, log_of, overview
 from mapvote_server.questions.vehicles import (
+    VehicleStanding,
     contradictions,
     standing_rows,
     vehicle_standings,
 )
 from mapvote_server.store import keys
-from mapvote_server.store.integrity import check, restore_plane, set_aside
+from mapvote_server.store.integrity import Damage, check, restore_plane, set_aside
+from mapvote_server.store.keys import KeyEntry
 from mapvote_server.store.policy import Policy, PolicyChange, without_drive
-from mapvote_server.store.publish import Outcome, preview, publish
+from mapvote_server.store.publish import Published, preview, publish
 from mapvote_server.store.queries import log_event
 from mapvote_server.store.retention import Cleared, clear
 from mapvote_server.store.rollback import replay, rollback
@@ -80,10 +67,26 @@ async def publish_now(by: Operator, parts: Parts, ask: PublishAsk) -> Published:
     return await parts.rounds.run(_publish, parts, ask, by)
 
 
+@answer
+@dataclass(frozen=True, slots=True)
+class Publishes:
+    """Those under way, oldest first."""
+
+    running: list[Progress]
+
+
 @router.get("/v1/publish", response_model=Publishes, responses=problems(403), summary="How far a publish is")
 async def publishing_now(by: Reviewer, parts: Parts) -> Response:
     """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
-    return as_json({"running": parts.publishing.now()})
+    return as_json(Publishes(parts.publishing.now()))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Cancelled:
+    """Number of publishes."""
+
+    cancelled: int
 
 
 @router.delete(
@@ -91,7 +94,7 @@ async def publishing_now(by: Reviewer, parts: Parts) -> Response:
 )
 async def cancel_publishing(by: Operator, parts: Parts) -> Response:
     """Every publish under way ends before its next tiles with 409; no part of it is published."""
-    return as_json({"cancelled": parts.publishing.cancel(by)})
+    return as_json(Cancelled(parts.publishing.cancel(by)))
 
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
@@ -104,7 +107,7 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
     waits = None if done.tiles else waiting_votes(parts.store)
-    return _as_answer(done, "" if waits is None else str(waits))
+    return _told(done, "" if waits is None else str(waits))
 
 
 @contextmanager
@@ -124,17 +127,17 @@ def _round(parts: Services, by: str, dry_run: bool) -> Iterator[Executor]:
         raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
 
 
-def _as_answer(done: Outcome, waits: str = "") -> Published:
-    return Published(
-        version=done.version,
-        published=done.published,
-        tiles=[tile_key(tile) for tile in done.tiles],
-        points_added=done.added,
-        points_deleted=done.deleted,
-        held=list(done.held),
-        doubts=list(done.doubts),
-        waits=waits,
-    )
+def _told(done: Published, waits: str) -> Published:
+    """A result without the tiles that were fused for it."""
+    return Published(**{member.name: getattr(done, member.name) for member in fields(Published)} | {"waits": waits})
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class RolledBack:
+    """The new version."""
+
+    version: int
 
 
 @router.post(
@@ -143,7 +146,7 @@ def _as_answer(done: Outcome, waits: str = "") -> Published:
 async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
     version = await parts.commands.run(rollback, parts.store, ask.to, by=by, reason=ask.reason)
-    return as_json({"version": version.number})
+    return as_json(RolledBack(version.number))
 
 
 @router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
@@ -152,6 +155,14 @@ def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
     """Each ballot's statement on the cell at (x, y), map metres, whether it counts, and the decision of each
     version."""
     return as_json(explain_cell(parts.store, x, y, known=known))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Extent of all tiles of the map and of standing ballots."""
+
+    tiles: list[CoveredTile]
 
 
 @router.get(
@@ -165,7 +176,7 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
     tiles = tiles_seen(parts.store, known)
     if format == "json":
-        return as_json({"tiles": tiles})
+        return as_json(Coverage(tiles))
     rows = [asdict(tile) for tile in tiles]
     return as_table(rows) if format == "csv" else as_json(tile_squares(rows, parts.store.lattice))
 
@@ -175,6 +186,14 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
 def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
     return as_json(wanted_passes(parts.store))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """By name."""
+
+    vehicles: list[VehicleStanding]
 
 
 @router.get(
@@ -191,7 +210,7 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
         return as_table(standing_rows(found))
     if format == "geojson":
         return as_json(contradictions(found))
-    return as_json({"vehicles": [replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]})
+    return as_json(Vehicles([replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]))
 
 
 @router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
@@ -229,16 +248,32 @@ def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000
     return as_json(log_of(parts.store, events))
 
 
+@answer
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """The damaged items."""
+
+    damage: list[Damage]
+
+
 @router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
 async def whole(by: Operator, parts: Parts) -> Response:
     """Reads the whole store and names what is damaged. Nothing is changed."""
-    return as_json({"damage": await parts.rounds.run(check, parts.store)})
+    return as_json(Checked(await parts.rounds.run(check, parts.store)))
 
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(by: Operator, parts: Parts) -> Response:
     """As GET; damaged items are also quarantined."""
-    return as_json({"damage": await parts.rounds.run(check, parts.store, mend=True, by=by)})
+    return as_json(Checked(await parts.rounds.run(check, parts.store, mend=True, by=by)))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """A plane is as it was written; ``restored``: by this request."""
+
+    restored: bool
 
 
 @router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
@@ -264,7 +299,7 @@ async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Publishe
 
 def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
     with _round(parts, by, ask.dry_run) as executor:
-        return _as_answer(replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor))
+        return replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor)
 
 
 @router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
@@ -279,25 +314,50 @@ async def clear_now(by: Operator, parts: Parts) -> Response:
     return as_json(await parts.rounds.run(clear, parts.store, dry_run=False, by=by))
 
 
+@answer
+@dataclass(frozen=True, slots=True)
+class KeysAnswer:
+    """All keys ever issued, oldest first."""
+
+    keys: list[KeyEntry]
+
+
 @router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
 @on("questions")
 def listed_keys(by: Operator, parts: Parts) -> Response:
     """All keys ever issued, revoked and expired ones too."""
-    return as_json({"keys": keys.entries(parts.store)})
+    return as_json(KeysAnswer(keys.entries(parts.store)))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class KeyIssued:
+    """The only time that the key is seen."""
+
+    key: str
 
 
 @router.post("/v1/keys", response_model=KeyIssued, responses=problems(403, 409), summary="Issue a key")
 @on("commands")
 def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
     """The answer is the only place where the key is ever seen: the store keeps its hash."""
-    return as_json({"key": keys.issue(parts.store, ask.name, ask.role, by=by, days=ask.days)})
+    return as_json(KeyIssued(keys.issue(parts.store, ask.name, ask.role, by=by, days=ask.days)))
 
 
 @router.post("/v1/keys/rotate", response_model=KeyIssued, responses=problems(403, 404), summary="Replace a key")
 @on("commands")
 def rotate_key(by: Operator, parts: Parts, ask: RotateAsk) -> Response:
     """A new key of the same role and length for who has a valid one."""
-    return as_json({"key": keys.rotate(parts.store, ask.name, by=by, overlap_days=ask.overlap_days)})
+    return as_json(KeyIssued(keys.rotate(parts.store, ask.name, by=by, overlap_days=ask.overlap_days)))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class KeysRevoked:
+    """Number of keys, and of ballots that count no more."""
+
+    revoked: int
+    ballots: int
 
 
 @router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
@@ -324,10 +384,30 @@ async def live() -> Response:
     return Response()
 
 
+@answer
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The store can be read."""
+
+    status: Literal["ok"]
+    version: int
+
+
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
 async def health(parts: Parts) -> Health:
     """200 with the newest version, 503 if the database does not answer."""
     return Health(status="ok", version=await parts.newest.put(None))
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Ballots are taken in."""
+
+    status: Literal["ready"]
+    version: int
+    quarantine: list[str]
+    quarantined: int
 
 
 @router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")

@@ -16,6 +16,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
+from mapvote.shapes.geojson import Places
 from mapvote.shapes.packed_cloud import N_LEVELS
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
@@ -24,7 +25,6 @@ from mapvote_server.api.schemas import (
     AS_CSV,
     Digest,
     From,
-    Places,
     TableOrMap,
     To,
     VersionQuery,
@@ -104,7 +104,7 @@ def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: Table
     """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
     ``csv`` without the lines."""
     found = paths(parts.store, vehicle)
-    return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
+    return as_table([line.properties for line in found.features]) if format == "csv" else as_json(found)
 
 
 def packed(request: Request, data: bytes, cache: str) -> Response:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -19,9 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.core.types import MapvoteError
-from mapvote.shapes.change_objects import Kind, Size
 from mapvote.shapes.geojson import as_csv
-from mapvote_server.api.services import Progress
 from mapvote_server.errors import (
     BadRequest,
     Conflict,
@@ -35,11 +34,7 @@ from mapvote_server.errors import (
     Unavailable,
 )
 from mapvote_server.questions.explain import FARTHEST_M
-from mapvote_server.questions.freshness import CoveredTile
-from mapvote_server.questions.history import DatedVersion
-from mapvote_server.questions.vehicles import VehicleStanding
 from mapvote_server.store import keys
-from mapvote_server.store.integrity import Damage
 from mapvote_server.store.policy import Policy, names_in
 from mapvote_server.work import count_rows
 
@@ -173,10 +168,6 @@ class Problem(Answer):
     reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
 
 
-def _answer(name: str, what: str | None, **members: Any) -> type[Answer]:
-    return create_model(name, __base__=Answer, __doc__=what, **members)
-
-
 def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **instead: Any) -> type[Answer]:
     """The model of an answer that the codec defines, with some members of other types."""
     members: dict[str, Any] = {}
@@ -184,214 +175,12 @@ def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **in
         if member.name not in leave_out:
             default = ... if member.required else member.default
             members[member.name] = instead.get(member.name, member.type), default
-    return _answer(kind.__name__, kind.__doc__, **members)
+    return create_model(kind.__name__, __base__=Answer, __doc__=kind.__doc__, **members)
 
 
 Planes = _answer_of(TileHashes, leave_out=["memory"])
 ManifestAnswer = _answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[valid-type]
 
-
-class Withdrawn(Answer):
-    """Number of ballots."""
-
-    withdrawn: int
-
-
-class Published(Answer):
-    """The result of a publish, or of a dry run."""
-
-    version: int
-    published: bool
-    tiles: list[str]
-    points_added: int
-    points_deleted: int
-    held: list[str]
-    doubts: list[str] = Field(description="what an operator should know about the voters")
-    waits: str = Field(default="", description="changes that lack only the quorum, if nothing was published")
-
-
-class VerdictAnswer(Answer):
-    """A reviewer's verdict on a change."""
-
-    seq: int
-    verdict: Literal["accepted", "held", "rejected"]
-    by: str
-    comment: str
-    at_ns: int
-
-
-class VerdictGiven(Answer):
-    """The verdict's number in the log."""
-
-    seq: int
-
-
-class Geometry(Answer):
-    """A feature collection of RFC 7946."""
-
-    type: Literal["Point", "LineString", "Polygon", "MultiPolygon"]
-    coordinates: list[Any]
-
-
-class ChangeFacts(Answer):
-    """One thing that was built or demolished."""
-
-    kind: Kind
-    size: Size
-    area_m2: float
-    height_m: float
-    volume_m3: float = Field(description="of its columns")
-    cells: int
-    points: int
-    votes_min: int
-    votes_median: float
-    against_median: float
-    share_for: float | None
-    probability: float | None = Field(description="mean over its cells that each of them changed")
-    trimmed: int = Field(description="of its cells those that stand and lost only some voxels, beside what stays")
-    fell: int = Field(description="of its cells those whose points fell with the others', because nothing holds them")
-    first_seen: str | None
-    last_seen: str | None
-    versions: list[int]
-    box: list[list[float]]
-    near: list[str] = Field(description="ids of large things within 15 m")
-
-
-class PendingFacts(ChangeFacts):
-    """A change on the desk."""
-
-    verdict: VerdictAnswer | None
-    waits: str | None = Field(default=None, description="why it is not deleted yet")
-    false_deletion: float | None = Field(
-        default=None, description="largest probability that something that stands goes"
-    )
-    drive_by: list[float] | None = Field(default=None, description="x, y where a vehicle should drive by")
-
-
-class ChangeFeature(Answer):
-    """GeoJSON."""
-
-    type: Literal["Feature"]
-    id: str
-    geometry: Geometry
-    properties: ChangeFacts
-
-
-class PendingFeature(ChangeFeature):
-    """GeoJSON."""
-
-    properties: PendingFacts
-
-
-class _Collection(Answer):
-    """GeoJSON; ``frame`` says what its coordinates are."""
-
-    type: Literal["FeatureCollection"]
-    frame: str
-    map_id: str
-    georeference: dict[str, str]
-    from_version: int | None
-    to_version: int | None
-
-
-class Changes(_Collection):
-    """The differences between two versions."""
-
-    features: list[ChangeFeature]
-    numberMatched: int = Field(description="of all that were asked for (OGC API Features)")
-    numberReturned: int = Field(description="of those here")
-    damaged: list[str] | None = Field(default=None, description="tiles that cannot be read")
-
-
-class Pending(_Collection):
-    """The changes that a publish would make."""
-
-    features: list[PendingFeature]
-
-
-class Drawn(Answer):
-    """The planes of a tile that the page draws."""
-
-    points: str
-    ground: str
-
-
-class DeskAnswer(Answer):
-    """The review desk."""
-
-    version: int
-    held: list[str] = Field(description="why the policy would hold the version")
-    doubts: list[str] = Field(description="what a reviewer should know about the voters")
-    waits: str = Field(description="changes that lack only the quorum, if nothing is pending")
-    pending: Pending
-    waiting: list[PendingFeature]
-    reviewed: list[PendingFeature]
-    tiles: dict[str, Drawn | None] = Field(description="as a publish would make them; null: without points")
-
-
-class PlacedFeature(Answer):
-    """GeoJSON."""
-
-    type: Literal["Feature"]
-    geometry: Geometry
-    properties: dict[str, Any]
-
-
-class Places(Answer):
-    """GeoJSON in map metres."""
-
-    type: Literal["FeatureCollection"]
-    frame: str
-    features: list[PlacedFeature]
-
-
-class Passes(Places):
-    """Stretches of road, and the changes that wait for one more vote."""
-
-    cells: int = Field(description="that one more vote would decide")
-    without_path: int = Field(description="of these cells those that no drive with a path saw")
-    waits: str = Field(description="changes that lack only the quorum")
-    damaged: list[str] = Field(description="tiles that cannot be read, and are left out")
-
-
-class Restored(Answer):
-    """A plane is as it was written; ``restored``: by this request."""
-
-    restored: bool
-
-
-class KeysRevoked(Answer):
-    """Number of keys, and of ballots that count no more."""
-
-    revoked: int
-    ballots: int
-
-
-class Health(Answer):
-    """The store can be read."""
-
-    status: Literal["ok"]
-    version: int
-
-
-class Ready(Answer):
-    """Ballots are taken in."""
-
-    status: Literal["ready"]
-    version: int
-    quarantine: list[str]
-    quarantined: int
-
-
-Versions = _answer("Versions", "Oldest first.", versions=list[DatedVersion])
-Publishes = _answer("Publishes", "Those under way, oldest first.", running=list[Progress])
-Cancelled = _answer("Cancelled", "Number of publishes.", cancelled=int)
-RolledBack = _answer("RolledBack", "The new version.", version=int)
-Coverage = _answer("Coverage", "Extent of all tiles of the map and of standing ballots.", tiles=list[CoveredTile])
-Vehicles = _answer("Vehicles", "By name.", vehicles=list[VehicleStanding])
-Checked = _answer("Checked", "The damaged items.", damage=list[Damage])
-KeysAnswer = _answer("KeysAnswer", "All keys ever issued, oldest first.", keys=list[keys.KeyEntry])
-KeyIssued = _answer("KeyIssued", "The only time that the key is seen.", key=str)
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
 AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
@@ -408,12 +197,12 @@ def sends_bytes(*codes: int) -> dict[str, Any]:
     return {"responses": problems(*codes) | AS_BYTES, "response_class": Response}
 
 
-def as_json(content: object, media_type: str = "application/json") -> Response:
+def as_json(content: Any) -> Response:
     """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
     all others. The members of its lists are counted as rows."""
-    members = content.values() if isinstance(content, Mapping) else ()
+    members = (getattr(content, member.name) for member in fields(content))
     count_rows(1 + sum(len(member) for member in members if isinstance(member, list)))
-    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type=media_type)
+    return Response(msgspec.json.encode(content, enc_hook=_plain), media_type="application/json")
 
 
 def _plain(model: Any) -> Any:

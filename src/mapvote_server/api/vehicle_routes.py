@@ -5,7 +5,7 @@ OpenAPI is the contract for vehicles in other languages: every answer is declare
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import msgspec
@@ -14,6 +14,7 @@ from fastapi.routing import APIRoute
 
 from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import TILE_PLANE_SIZES
+from mapvote.core.answers import answer
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
@@ -26,14 +27,12 @@ from mapvote_server.api.schemas import (
     Number,
     Table,
     VersionQuery,
-    Versions,
-    Withdrawn,
     as_json,
     as_table,
     problems,
 )
 from mapvote_server.api.services import Known, Parts, own, services
-from mapvote_server.questions.history import dated_versions
+from mapvote_server.questions.history import DatedVersion, dated_versions
 from mapvote_server.store.admission import Intake, Receipt
 from mapvote_server.store.examination import Examination, Incoming
 from mapvote_server.store.votes import withdraw
@@ -52,6 +51,14 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
     return await _manifest(request, None, since)
 
 
+@answer
+@dataclass(frozen=True, slots=True)
+class Versions:
+    """Oldest first."""
+
+    versions: list[DatedVersion]
+
+
 @router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
 @on("questions")
 def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
@@ -60,7 +67,7 @@ def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
     listed = dated_versions(parts.store, known)
     if format == "csv":
         return as_table([{name: value for name, value in asdict(one).items() if name != "policy"} for one in listed])
-    return as_json({"versions": listed})
+    return as_json(Versions(listed))
 
 
 @router.get(
@@ -97,6 +104,14 @@ async def plane(request: Request, digest: Digest) -> Response:
     else:
         data = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "tile plane")
     return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Withdrawn:
+    """Number of ballots."""
+
+    withdrawn: int
 
 
 @router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Withdraw a ballot")

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from threading import Lock
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,7 +22,7 @@ from mapvote.fusion.decision_record import Record, cells_in
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.shapes.change_objects import ChangedCells, ChangeObject, Decided, change_objects, changed_cells
 from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
-from mapvote.shapes.geojson import to_geojson
+from mapvote.shapes.geojson import Changes, to_geojson
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import seen, sound_votes
 from mapvote_server.store.integrity import hurt_or_mended_since
@@ -153,7 +152,7 @@ def changes_between(
     known: bool = True,
     limit: int | None = None,
     offset: int = 0,
-) -> dict[str, Any]:
+) -> Changes:
     """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``),
     the largest first. ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
 
@@ -164,7 +163,7 @@ def changes_between(
     compared = compare_versions(store, old, new)
     listed = [thing for thing in compared.objects if thing.cells >= min_cells]
     shown = slice(offset, None if limit is None else offset + limit)
-    collection = to_geojson(
+    found = to_geojson(
         [
             replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
             for thing in listed[shown]
@@ -177,21 +176,20 @@ def changes_between(
         lonlat=lonlat,
         among=listed,
     )
-    collection |= {"numberMatched": len(listed), "numberReturned": len(collection["features"])}
-    return collection | ({"damaged": list(compared.damaged)} if compared.damaged else {})
+    return replace(found, damaged=list(compared.damaged) or None)
 
 
-def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
+def cutouts_between(store: Store, old: int, new: int, found: Changes, most: int = 12) -> list[Cutout]:
     """The largest things of :func:`changes_between` with their surroundings, before and after."""
     tiles = tiles_at(store, old), tiles_at(store, new)
-    large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
-    largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
+    large = [feature for feature in found.features if feature.properties.size == "large"] or found.features
+    largest = sorted(large, key=lambda feature: -feature.properties.area_m2)[:most]
     return [of_feature(feature, tiles, store.lattice) for feature in largest]
 
 
-def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
+def page_between(store: Store, old: int, new: int, found: Changes) -> str:
     """HTML of :func:`cutouts_between`, one file without any request."""
-    return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
+    return whole_page(f"{found.map_id}: version {old} to {new}", cutouts_between(store, old, new, found))
 
 
 def tiles_at(store: Store, version: int) -> Tiles:

@@ -6,18 +6,18 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key, unpack_path
+from mapvote.core.answers import answer
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError
 from mapvote.fusion.next_pass import Stretch, Waiting, Witness, lacks_quorum_only, one_vote_short, stretches
 from mapvote.fusion.tile_vote import TileVote, by_voter, one_each
-from mapvote.shapes.geojson import collection
+from mapvote.shapes.geojson import MAP_METRES, Geometry, PlacedFeature, Places
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import said_by
 from mapvote_server.questions.kept import KeptTiles
@@ -152,12 +152,24 @@ def _together(tiles: Iterable[_Tile], quorum: int) -> Waiting | None:
     return Waiting(cells, len(drives), sorted(vehicles), quorum) if cells else None
 
 
-def wanted_passes(store: Store) -> dict[str, Any]:
+@answer
+@dataclass(frozen=True, slots=True)
+class Passes(Places):
+    """Stretches of road, and the changes that wait for one more vote."""
+
+    cells: int
+    """that one more vote would decide"""
+    without_path: int
+    """of these cells those that no drive with a path saw"""
+    waits: str
+    """changes that lack only the quorum"""
+    damaged: list[str]
+    """tiles that cannot be read, and are left out"""
+
+
+def wanted_passes(store: Store) -> Passes:
     """Stretches of road on which one more pass would decide cells, those with most cells first: GeoJSON lines in map
     metres, each in the direction to drive, with its decisions there; at most ``CoverageSizes.stretches``.
-
-    Besides, "cells" that one more vote would decide; "without_path", those of them that no drive with a path saw;
-    "waits", text: what lacks only the quorum; "damaged": tiles with standing ballots that cannot be read.
     """
     tiles = _kept.of(store).every
     with tiles.lock:
@@ -178,14 +190,16 @@ def wanted_passes(store: Store) -> dict[str, Any]:
             tiles.refresh(connection, asked, now_ns, look)
         found = list(tiles.found.values())
     waits = _together(found, asked.settings.min_votes)
-    told = {
-        "cells": sum(tile.cells for tile in found),
-        "without_path": sum(tile.without_path for tile in found),
-        "waits": "" if waits is None else str(waits),
-        "damaged": sorted(tile.damaged for tile in found if tile.damaged),
-    }
     every = _in_order([stretch for tile in found for stretch in tile.stretches])
-    return collection([_line(stretch) for stretch in every[: COVERAGE_SIZES.stretches]]) | told
+    return Passes(
+        type="FeatureCollection",
+        frame=MAP_METRES,
+        features=[_line(stretch) for stretch in every[: COVERAGE_SIZES.stretches]],
+        cells=sum(tile.cells for tile in found),
+        without_path=sum(tile.without_path for tile in found),
+        waits="" if waits is None else str(waits),
+        damaged=sorted(tile.damaged for tile in found if tile.damaged),
+    )
 
 
 def _look(
@@ -240,9 +254,10 @@ def _in_order(found: Sequence[Stretch]) -> list[Stretch]:
     return sorted(found, key=lambda one: (-one.cells, one.tile, one.heading_rad))
 
 
-def _line(stretch: Stretch) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Geometry and properties of a stretch of road."""
-    line = {"type": "LineString", "coordinates": np.round(stretch.path_m, 2).tolist()}
+def _line(stretch: Stretch) -> PlacedFeature:
+    """A stretch of road."""
+    line = Geometry("LineString", np.round(stretch.path_m, 2).tolist())
     counts = {"cells": stretch.cells, "built": stretch.built, "gone": stretch.gone}
     heading_deg = round(float(np.degrees(stretch.heading_rad)))
-    return line, {"row": stretch.tile[0], "col": stretch.tile[1], "heading_deg": heading_deg} | counts
+    about = {"row": stretch.tile[0], "col": stretch.tile[1], "heading_deg": heading_deg}
+    return PlacedFeature("Feature", line, about | counts)

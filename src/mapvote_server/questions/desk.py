@@ -9,9 +9,12 @@ from threading import Lock
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import msgspec
 import numpy as np
 
+from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
+from mapvote.core.answers import answer
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
@@ -19,18 +22,84 @@ from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
 from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.shapes.change_objects import ChangedCells, ChangeObject, change_objects, changed_cells
-from mapvote.shapes.geojson import to_geojson
+from mapvote.shapes.geojson import ChangeCollection, ChangeFacts, ChangeFeature, members_of, to_geojson
 from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.coverage import waiting_votes
 from mapvote_server.store.fusion_jobs import Fused, edited_tile
 from mapvote_server.store.publish import Gate, Round, doubts_of, reasons_to_hold, round_at
 from mapvote_server.store.queries import load_tile, tile_of
-from mapvote_server.store.reviews import Review, Verdict, decide, standing
+from mapvote_server.store.reviews import Review, Verdict, VerdictAnswer, decide, standing
 from mapvote_server.store.store import Store
 
 _OF_REVIEW = "verdict."
+_WAITS = "waits."
 _lock = Lock()
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class PendingFacts(ChangeFacts):
+    """A change on the desk."""
+
+    verdict: VerdictAnswer | None
+    waits: str | None = None
+    """why it is not deleted yet"""
+    false_deletion: float | None = None
+    """largest probability that something that stands goes"""
+    drive_by: list[float] | None = None
+    """x, y where a vehicle should drive by"""
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class PendingFeature(ChangeFeature):
+    """GeoJSON."""
+
+    properties: PendingFacts
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Pending(ChangeCollection):
+    """The changes that a publish would make."""
+
+    features: list[PendingFeature]
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """The planes of a tile that the page draws."""
+
+    points: str
+    ground: str
+
+
+@answer
+@dataclass(frozen=True, slots=True)
+class DeskAnswer:
+    """The review desk."""
+
+    version: int
+    """the newest, on which a publish would build"""
+    held: list[str]
+    """why the policy would hold the version"""
+    doubts: list[str]
+    """what a reviewer should know about the voters"""
+    waits: str
+    """changes that lack only the quorum, if nothing is pending"""
+    pending: Pending
+    waiting: list[PendingFeature]
+    """deletions beyond the policy's budget of false deletions"""
+    reviewed: list[PendingFeature]
+    """held and rejected changes, which a publish leaves out"""
+    tiles: dict[str, Drawn | None]
+    """as a publish would make them; null: without points"""
+
+    def in_one(self) -> Pending:
+        """All changes as one collection."""
+        return replace(self.pending, features=[*self.pending.features, *self.waiting, *self.reviewed])
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +116,9 @@ class Proposed:
 class Desk:
     """The desk at one moment."""
 
-    version: int
-    """The newest, on which a publish would build."""
-    held: list[str]
-    """The policy's reasons to hold the version."""
-    doubts: list[str]
-    """Warnings on the voters for a reviewer."""
-    waits: str
-    """Changes that lack only the quorum, if a publish would change nothing; else ""."""
-    pending: dict[str, Any]
-    """Changes that a publish would make, GeoJSON; accepted ones carry the verdict."""
-    waiting: list[dict[str, Any]]
-    """Deletions beyond the policy's budget of false deletions, GeoJSON features."""
-    reviewed: list[Review]
-    """Held and rejected changes, which a publish leaves out."""
+    answer: DeskAnswer
+    reviews: Sequence[Review]
+    """Of the held and rejected changes."""
     objects: Mapping[str, ChangeObject]
     """Pending changes by their ids."""
     edited: Mapping[TileIndex, Proposed]
@@ -81,32 +139,30 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
         known = _desks.get(found)
         if known is None:
             known = _desks[found] = _desk_of(store, found)
-    return replace(known, held=reasons_to_hold(store, found, gate))
+    held = list(reasons_to_hold(store, found, gate))
+    return replace(known, answer=replace(known.answer, held=held))
 
 
 def _desk_of(store: Store, found: Round) -> Desk:
     version = found.newest.number
-    budget = found.asked.settings.false_deletions
     looked = [_look_at(store, version, fused) for fused in found.changed]
     objects = change_objects([cells for cells, _ in looked])
-    pending = to_geojson(
-        objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
-    )
-    reviews = standing(store)
-    known = {one.id: one for one in objects}
-    for feature in pending["features"]:
-        mine = _cells_of(known[feature["id"]]) if reviews else {}
-        feature["properties"]["verdict"] = next(
-            (_verdict_json(r) for r, theirs in reviews if _meet(mine, theirs)), None
-        )
-    left_out = [review for review, _ in reviews if review.verdict != "accepted"]
     edited = {fused.index: _proposed(store, version, fused) for fused in found.changed}
-    clouds = b"".join(cloud for _, cloud in looked)
-    waiting = _waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
+    reviews = standing(store)
+    left_out = [review for review, _ in reviews if review.given.verdict != "accepted"]
+    budget = found.asked.settings.false_deletions
     lacking = None if found.changed else waiting_votes(store)
-    waits = "" if lacking is None else str(lacking)
-    doubts = doubts_of(store, found).told(found.asked.settings)
-    return Desk(version, [], doubts, waits, pending, waiting, left_out, known, edited, clouds)
+    told = DeskAnswer(
+        version=version,
+        held=[],
+        doubts=list(doubts_of(store, found).told(found.asked.settings)),
+        waits="" if lacking is None else str(lacking),
+        pending=_pending(store, version, objects, reviews),
+        waiting=_waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget),
+        reviewed=list(map(_reviewed, left_out)),
+        tiles={tile_key(index): _drawn(made) for index, made in edited.items()},
+    )
+    return Desk(told, left_out, {one.id: one for one in objects}, edited, b"".join(cloud for _, cloud in looked))
 
 
 def _look_at(store: Store, version: int, fused: Fused) -> tuple[ChangedCells, bytes]:
@@ -121,6 +177,45 @@ def _proposed(store: Store, version: int, fused: Fused) -> Proposed:
     assert fused.hashes is not None
     points = fused.points + fused.added - fused.deleted
     return Proposed(fused.hashes, points, lambda: edited_tile(fused, _tile(store, version, fused.index)))
+
+
+def _pending(
+    store: Store,
+    version: int,
+    objects: Sequence[ChangeObject],
+    reviews: Sequence[tuple[Review, Mapping[TileIndex, Bool]]],
+) -> Pending:
+    """The changes, each with the verdict on its cells."""
+    found = to_geojson(
+        objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
+    )
+    verdicts = [_verdict_on(one, reviews) for one in objects]
+    return Pending(
+        type="FeatureCollection",
+        frame=found.frame,
+        map_id=found.map_id,
+        georeference=found.georeference,
+        from_version=version,
+        to_version=None,
+        features=[_on_desk(one, verdict=given) for one, given in zip(found.features, verdicts, strict=True)],
+    )
+
+
+def _verdict_on(
+    change: ChangeObject, reviews: Sequence[tuple[Review, Mapping[TileIndex, Bool]]]
+) -> VerdictAnswer | None:
+    """The verdict that stands on some cell of a change."""
+    cells = _cells_of(change) if reviews else {}
+    return next((review.given for review, theirs in reviews if _meet(cells, theirs)), None)
+
+
+def _on_desk(feature: ChangeFeature, **more: Any) -> PendingFeature:
+    facts = PendingFacts(**members_of(feature.properties), **more)
+    return PendingFeature("Feature", feature.id, feature.geometry, facts)
+
+
+def _drawn(made: Proposed) -> Drawn | None:
+    return Drawn(made.hashes.points, made.hashes.ground) if made.points else None
 
 
 def review(
@@ -138,8 +233,8 @@ def review(
     ``after`` as in :func:`mapvote_server.store.reviews.decide`. NotFound if no such change is pending any more.
     """
     now = desk(store, executor)
-    features = {f["id"]: f for f in now.pending["features"]}
-    features |= {f"{_OF_REVIEW}{r.seq}": dict(r.feature) for r in now.reviewed}
+    features = {feature.id: msgspec.to_builtins(feature) for feature in now.answer.pending.features}
+    features |= {f"{_OF_REVIEW}{one.given.seq}": dict(one.feature) for one in now.reviews}
     if change not in features:
         raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
     feature = features[change] | {"properties": features[change]["properties"] | {"verdict": None}}
@@ -149,17 +244,14 @@ def review(
 
 def _cells_of_review(store: Store, change: str) -> Mapping[TileIndex, Bool]:
     """The cells of a change that was reviewed, by the id of its verdict."""
-    return next(cells for one, cells in standing(store) if f"{_OF_REVIEW}{one.seq}" == change)
+    return next(cells for one, cells in standing(store) if f"{_OF_REVIEW}{one.given.seq}" == change)
 
 
-def verdict_of(review: Review) -> dict[str, Any]:
-    """A held or rejected change as GeoJSON, in the state of its review, with the verdict."""
-    properties = dict(review.feature["properties"]) | {"verdict": _verdict_json(review)}
-    return dict(review.feature) | {"id": f"{_OF_REVIEW}{review.seq}", "properties": properties}
-
-
-def _verdict_json(review: Review) -> dict[str, Any]:
-    return {name: getattr(review, name) for name in ("seq", "verdict", "by", "comment", "at_ns")}
+def _reviewed(review: Review) -> PendingFeature:
+    """A held or rejected change, in the state of its review, with the verdict."""
+    feature = msgspec.convert(review.feature, PendingFeature)
+    facts = replace(feature.properties, verdict=review.given)
+    return replace(feature, id=f"{_OF_REVIEW}{review.given.seq}", properties=facts)
 
 
 def _tile(store: Store, version: int, index: TileIndex) -> Tile:
@@ -183,11 +275,8 @@ def _meet(mine: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> b
     return any((mine[i] & theirs[i]).any() for i in mine.keys() & theirs.keys())
 
 
-_WAITS = "waits."
-
-
-def _waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[dict[str, Any]]:
-    """Deletions from a version's tiles that only the ``budget`` prevents, as GeoJSON features in map metres.
+def _waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[PendingFeature]:
+    """Deletions from a version's tiles that only the ``budget`` prevents.
 
     "waits" is the reason, "false_deletion" the largest probability among its cells that something that stands would be
     deleted, "drive_by" the middle of its cells.
@@ -195,19 +284,20 @@ def _waiting_features(store: Store, version: int, fused: Sequence[Fused], budget
     waits = {one.index: one.pending for one in fused if len(one.pending.cells)}
     tiles = [_tile(store, version, index) for index in waits]
     objects = change_objects([changed_cells(tile, _emptied(tile, waits[tile.index])) for tile in tiles])
-    features: list[dict[str, Any]] = to_geojson(objects, store.lattice, map_id=store.map_id)["features"]
-    for change, feature in zip(objects, features, strict=True):
+    features = []
+    for change, plain in zip(objects, to_geojson(objects, store.lattice, map_id=store.map_id).features, strict=True):
         rows, cols = change.where
         likeliest = _likeliest(change, waits)
         middle = [store.lattice.x0, store.lattice.y0] + CELL_SIZE * (np.array([cols.mean(), rows.mean()]) + 0.5)
-        feature["id"] = _WAITS + change.id
-        feature["properties"] |= {
-            "verdict": None,
-            "waits": f"deleting it takes something that stands with a probability of up to {likeliest:.2g}; "
+        feature = _on_desk(
+            plain,
+            verdict=None,
+            waits=f"deleting it takes something that stands with a probability of up to {likeliest:.2g}; "
             f"the policy allows {budget:g}",
-            "false_deletion": round(likeliest, 6),
-            "drive_by": [round(float(value), 2) for value in middle],
-        }
+            false_deletion=round(likeliest, 6),
+            drive_by=[round(float(value), 2) for value in middle],
+        )
+        features.append(replace(feature, id=_WAITS + change.id))
     return features
 
 

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+import msgspec
 import numpy as np
 import shapely
 from shapely.geometry import mapping, shape
@@ -45,13 +46,13 @@ class Collection:
 
 
 def _changes(store: Store, known: bool, old: int, new: int) -> Features:
-    features: Features = changes_between(store, old, new, known=known)["features"]
+    features: Features = msgspec.to_builtins(changes_between(store, old, new, known=known).features)
     return features
 
 
 def _tiles(store: Store, known: bool, old: int, new: int) -> Features:
     rows = [asdict(tile) for tile in tiles_seen(store, known)]
-    squares: Features = tile_squares(rows, store.lattice)["features"]
+    squares: Features = msgspec.to_builtins(tile_squares(rows, store.lattice).features)
     return [square | {"id": f"{row['row']},{row['col']}"} for square, row in zip(squares, rows, strict=True)]
 
 
@@ -60,7 +61,7 @@ def _seen(store: Store, known: bool, old: int, new: int) -> Features:
 
 
 def _passes(store: Store, known: bool, old: int, new: int) -> Features:
-    lines: Features = wanted_passes(store)["features"]
+    lines: Features = msgspec.to_builtins(wanted_passes(store).features)
     return [line | {"id": str(number)} for number, line in enumerate(lines, 1)]
 
 

@@ -8,9 +8,9 @@ from threading import Lock
 
 import sqlalchemy as sa
 
+from mapvote.core.answers import answer
 from mapvote.core.grid import TileIndex
 from mapvote.core.times import utc
-from mapvote_server.answers import answer
 from mapvote_server.questions.explain import seen
 from mapvote_server.store import schema
 from mapvote_server.store.database import DATABASE_SIZES, Question

@@ -16,10 +16,10 @@ from pydantic import Field
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import names_in_plane
+from mapvote.core.answers import answer
 from mapvote.core.record import record
 from mapvote.core.times import utc
 from mapvote.core.types import MapvoteError
-from mapvote_server.answers import answer
 from mapvote_server.errors import Unavailable
 from mapvote_server.store import schema
 from mapvote_server.store.integrity import set_aside

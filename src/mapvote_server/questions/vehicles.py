@@ -24,7 +24,7 @@ from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.times import utc
 from mapvote.core.types import F32, I64
-from mapvote.shapes.geojson import collection
+from mapvote.shapes.geojson import Geometry, PlacedFeature, Places, places
 from mapvote_server.questions.contradictions import CONTRADICTIONS, Compared, Objects, compare, over_borders
 from mapvote_server.questions.explain import votes_on
 from mapvote_server.questions.kept import KeptTiles
@@ -190,12 +190,13 @@ def _evidence(found: Sequence[Objects], lattice: Lattice) -> tuple[Contradiction
     return tuple(map(Contradiction, x, y, largest.cells.tolist(), claims))
 
 
-def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
+def contradictions(standings: Sequence[VehicleStanding]) -> Places:
     """Where vehicles contradict the others, as GeoJSON points in map metres."""
-    return collection(
+    return places(
         [
-            (
-                {"type": "Point", "coordinates": [e.x, e.y]},
+            PlacedFeature(
+                "Feature",
+                Geometry("Point", [e.x, e.y]),
                 {"vehicle": s.vehicle, "verdict": s.verdict, "says": e.says, "cells": e.cells},
             )
             for s in standings
@@ -213,7 +214,7 @@ MOST_PATHS = 500
 """The last drives."""
 
 
-def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
+def paths(store: Store, vehicle: str | None = None) -> Places:
     """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
     ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
     b = schema.ballots.c
@@ -234,10 +235,11 @@ def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
             return _NO_GROUND if plane is None else unpack_ground_plane(load_blob(connection, plane), plane)
 
         lines = [_line(store, path, ground) for path in driven]
-    return collection(
+    return places(
         [
-            (
-                {"type": "LineString", "coordinates": line},
+            PlacedFeature(
+                "Feature",
+                Geometry("LineString", line),
                 {
                     "vehicle": row.vehicle,
                     "drive": row.drive,

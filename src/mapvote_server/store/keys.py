@@ -12,9 +12,9 @@ from typing import Literal, get_args
 
 import sqlalchemy as sa
 
+from mapvote.core.answers import answer
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote_server.answers import answer
 from mapvote_server.errors import Conflict, NotFound, Unauthorised
 from mapvote_server.store import schema
 from mapvote_server.store.queries import end_votes, log_event

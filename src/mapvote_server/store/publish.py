@@ -24,6 +24,7 @@ from sqlalchemy.exc import IntegrityError
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.config import FuseSettings
+from mapvote.core.answers import answer
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.point_map import LazyTiles, PointMap, with_changed
 from mapvote.core.tile import Tile
@@ -58,22 +59,31 @@ _MOST_DETAIL = 400
 Part = TypeVar("Part")
 
 
+@answer
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Published:
     """The result of a publish, or of a dry run."""
 
     version: int
-    """The new version, or the current one if nothing was published."""
+    """the new version, or the current one if nothing was published"""
     published: bool
-    tiles: Sequence[TileIndex]
-    """Tiles that changed."""
-    added: int
-    deleted: int
-    held: Sequence[str]
-    """Why the policy would hold it back, or what the operator overrode."""
+    tiles: list[str]
+    """keys of the tiles that changed"""
+    points_added: int
+    points_deleted: int
+    held: list[str]
+    """why the policy would hold it back, or what the operator overrode"""
+    doubts: list[str]
+    """what an operator should know about the voters"""
+    waits: str = ""
+    """changes that lack only the quorum, if nothing was published"""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Published):
+    """The result of a publish in this process."""
+
     fused: Sequence[Fused] = field(default=(), repr=False)
-    doubts: Sequence[str] = ()
-    """Warnings on the voters (store/doubts.py)."""
 
 
 def preview(
@@ -121,7 +131,7 @@ def publish(
     if not outcome.tiles:
         return outcome
     if outcome.held and not override:
-        raise Held(list(outcome.held))
+        raise Held(outcome.held)
     why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
     newest = found.newest.number
     made_by = policy.model_dump(mode="json")
@@ -147,12 +157,17 @@ def _outcome(
     changed = found.changed
     if parent is not None and parent != newest:
         raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
-    held = reasons_to_hold(store, found, gate)
-    fused = list(found.decided.values())
-    added = sum(f.added for f in changed)
-    deleted = sum(f.deleted for f in changed)
-    doubts = doubts_of(store, found).told(found.asked.settings)
-    return found, Outcome(newest, False, [f.index for f in changed], added, deleted, held, fused, doubts)
+    outcome = Outcome(
+        version=newest,
+        published=False,
+        tiles=[tile_key(fused.index) for fused in changed],
+        points_added=sum(fused.added for fused in changed),
+        points_deleted=sum(fused.deleted for fused in changed),
+        held=list(reasons_to_hold(store, found, gate)),
+        doubts=list(doubts_of(store, found).told(found.asked.settings)),
+        fused=list(found.decided.values()),
+    )
+    return found, outcome
 
 
 def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 import sqlalchemy as sa
 from msgspec import structs
 
+from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import pack_memory, pack_tile
 from mapvote.core.grid import TileIndex
@@ -29,7 +30,7 @@ from mapvote_server.errors import Conflict, NotFound
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of
 from mapvote_server.store.fusion_jobs import Task, fuse_round, settled
-from mapvote_server.store.publish import Outcome, write_version
+from mapvote_server.store.publish import Published, write_version
 from mapvote_server.store.queries import (
     Version,
     load_tile,
@@ -106,7 +107,7 @@ class _History:
 
 def replay(
     store: Store, vehicle: str, *, by: str = "operator", dry_run: bool = True, executor: Executor | None = None
-) -> Outcome:
+) -> Published:
     """Take a vehicle's votes out of every version; with ``dry_run`` only say what would change.
 
     NotFound if it never voted, Conflict if another version is published meanwhile.
@@ -140,13 +141,14 @@ def replay(
             planes.append(packed)
             added += int((~found_among(ours.tile.points, theirs.tile.points)).sum())
             deleted += int((~found_among(theirs.tile.points, ours.tile.points)).sum())
+    outcome = Published(newest.number, False, [tile_key(index) for index in sorted(tiles)], added, deleted, [], [])
     if dry_run:
-        return Outcome(newest.number, False, sorted(tiles), added, deleted, [])
+        return outcome
     why = f"as if {vehicle} had never voted, from version {start} on"
     policy = {"unvoted": vehicle}
     version = Version(number, newest.number, "replay", start, store.clock(), by, why, mark, policy)
     write_version(store, version, tiles, planes, unvoted=vehicle)
-    return Outcome(number, True, sorted(tiles), added, deleted, [])
+    return replace(outcome, version=number, published=True)
 
 
 def _again(store: Store, version: Version, history: _History, executor: Executor | None) -> None:

@@ -55,7 +55,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
         name = "liar" if i == 3 else f"v{i}"
         send(store, make_ballot(point_map, {(0, 0): say}, name, "d1", end_ns=now - (10 - i) * HOUR_NS))
     done = publish(store, FuseSettings(max_deleted_share=1.0), by="<b>boss</b>", reason=REASON, override=True)
-    assert (done.added, done.deleted) == (len(NEW) * len(HEIGHTS), len([*GONE, *POLE]) * len(HEIGHTS))
+    assert (done.points_added, done.points_deleted) == (len(NEW) * len(HEIGHTS), len([*GONE, *POLE]) * len(HEIGHTS))
     store.close()
     return home / "store.db"
 

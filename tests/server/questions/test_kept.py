@@ -137,7 +137,7 @@ class Street:
 
     def take_back(self) -> None:
         for one, _ in standing(self.store):
-            undo(self.store, one.seq, by="anna")
+            undo(self.store, one.given.seq, by="anna")
 
     def spoil_ballot(self, which: int) -> None:
         """A ballot on a tile is not what was sent any more, and a check says so."""

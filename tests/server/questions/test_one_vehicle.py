@@ -49,7 +49,7 @@ def test_publish_coverage_and_the_cell_tell_what_lacks_only_the_quorum(store: St
     assert not publish(store).published
     assert str(waiting_votes(store)) == SENTENCE
     told = wanted_passes(store)
-    assert (told["cells"], told["without_path"], told["waits"], told["features"]) == (3, 3, SENTENCE, [])
+    assert (told.cells, told.without_path, told.waits, told.features) == (3, 3, SENTENCE, [])
     assert "1 cell waits: 2 drives say so, all by car_1" in explain_cell(store, 3.1, 3.1).thing
     hidden = explain_cell(store, 3.1, 3.1, known=False).thing
     assert "waits" in hidden
@@ -66,17 +66,17 @@ def test_a_vote_that_is_spent_or_opposed_or_joined_by_a_second_vehicle_does_not_
     send(store, make_ballot(store.point_map(), {(0, 0): say}, "car_2", "d1", store.clock()))
     waits = waiting_votes(store)
     assert waits is None, "two vehicles vote on the tile"
-    assert wanted_passes(store)["waits"].startswith("1 cell waits: 2 drives"), "the third cell of the wall"
+    assert wanted_passes(store).waits.startswith("1 cell waits: 2 drives"), "the third cell of the wall"
     store.set_policy(Policy(fuse=FuseSettings(max_deleted_share=1.0, min_votes=1)))
     assert publish(store).published
     store.set_policy(Policy(fuse=FuseSettings(max_deleted_share=1.0)))
-    assert wanted_passes(store)["waits"] == ""
+    assert wanted_passes(store).waits == ""
 
 
 def test_by_days_the_drives_of_two_days_decide_and_of_one_day_do_not(store: Store) -> None:
     days = FuseSettings(max_deleted_share=1.0, one_vehicle="days")
     store.set_policy(Policy(fuse=days))
-    assert publish(store).deleted == 9
+    assert publish(store).points_deleted == 9
     assert [vote.counted_in for vote in explain_cell(store, 3.1, 3.1).votes] == [(2,), (2,)]
 
 

@@ -44,45 +44,46 @@ def middle(store: Store) -> CellStory:
 def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(store: Store) -> None:
     vote(store, "d1", UNSURE)
     now = desk(store)
-    assert [f["properties"]["cells"] for f in now.pending["features"]] == [1, 1], "the two of which they are sure"
-    (waits,) = now.waiting
-    assert waits["properties"]["kind"] == "demolished"
-    assert waits["properties"]["drive_by"] == [3.45, 3.15], "the middle of the cell"
-    assert waits["properties"]["false_deletion"] > 0.01
-    assert "the policy allows 0.01" in waits["properties"]["waits"]
-    assert publish(store).deleted == 6
+    assert [f.properties.cells for f in now.answer.pending.features] == [1, 1], "the two of which they are sure"
+    (waits,) = now.answer.waiting
+    assert waits.properties.kind == "demolished"
+    assert waits.properties.drive_by == [3.45, 3.15], "the middle of the cell"
+    assert waits.properties.false_deletion is not None
+    assert waits.properties.false_deletion > 0.01
+    assert "the policy allows 0.01" in str(waits.properties.waits)
+    assert publish(store).points_deleted == 6
     story = middle(store)
     assert "pending: the probability that emptying it deletes something that stands" in story.thing
     assert "stands: surveyed" in story.thing
-    assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
+    assert [w.id for w in desk(store).answer.waiting] == [waits.id], "though nothing has come since"
     assert not publish(store).published
     for name in "ab":  # both drive by again, and are sure of the cell in the middle now
         say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([20], np.int8))
         send(store, make_ballot(store.point_map(), {(0, 0): say}, name, "d2", end_ns=store.clock()))
-    assert desk(store).waiting == []
-    assert publish(store).deleted == 3
+    assert desk(store).answer.waiting == []
+    assert publish(store).points_deleted == 3
 
 
 def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> None:
     vote(store, "d1", UNSURE)
-    (waits,) = desk(store).waiting
+    (waits,) = desk(store).answer.waiting
     with pytest.raises(MapvoteError, match="pending any more"):
-        review(store, waits["id"], "accepted", by="anna")
+        review(store, waits.id, "accepted", by="anna")
 
 
 def test_the_desk_says_in_which_system_its_coordinates_lie(new_store: NewStore) -> None:
     place = {"crs": "EPSG:32654", "offset": "300000.0,3900000.0,0.0"}
-    pending = desk(new_store(replace(two_walls(), georeference=place), BUDGET)).pending
-    assert pending["georeference"] == place
-    assert "EPSG:32654" in pending["frame"]
+    pending = desk(new_store(replace(two_walls(), georeference=place), BUDGET)).answer.pending
+    assert pending.georeference == place
+    assert "EPSG:32654" in pending.frame
 
 
 def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
     vote(store, "d1", UNSURE)
     store.change_policy({"fuse.false_deletions": "1"}, by="boss")
     assert store.policy().fuse.false_deletions == 1.0
-    assert desk(store).waiting == []
-    assert publish(store).deleted == 9
+    assert desk(store).answer.waiting == []
+    assert publish(store).points_deleted == 9
     with pytest.raises(MapvoteError, match=r"policy: fuse\.false_deletions = '0'"):
         store.change_policy({"fuse.false_deletions": "0"}, by="boss")
 
@@ -90,7 +91,7 @@ def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
 def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(store: Store) -> None:
     vote(store, "d1", SURE, "a")
     vote(store, "d1", [5, 5, 5], "b")
-    assert publish(store).deleted == 9
+    assert publish(store).points_deleted == 9
     story = middle(store)
     assert [vote.sure for vote in story.votes] == [
         pytest.approx(1 / (1 + np.exp(-steps / STEPS_PER_NAT)), abs=1e-4) for steps in (20, 5)
@@ -100,8 +101,8 @@ def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(
         np.array([CellState.CHANGED_EMPTY], np.uint8), 2 * one, 0 * one, one, np.array([5], np.int8)
     )
     assert story.probability == pytest.approx(told[0], abs=1e-3), "as the one says who is less sure"
-    (change,) = changes_between(store, 1, 2)["features"]
-    assert change["properties"]["probability"] == pytest.approx(story.probability, abs=1e-3)
+    (change,) = changes_between(store, 1, 2).features
+    assert change.properties.probability == pytest.approx(story.probability, abs=1e-3)
     assert check(store) == []
     with store.database.writing() as connection:
         connection.execute(schema.decisions.update().values(odds=None))
@@ -110,7 +111,7 @@ def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(
 
 def test_ballots_that_do_not_say_are_told_by_their_votes(store: Store) -> None:
     vote_gone(store)
-    assert publish(store).deleted == 9
+    assert publish(store).points_deleted == 9
     assert [vote.sure for vote in middle(store).votes] == [None, None]
     assert middle(store).probability is not None
 
@@ -118,7 +119,7 @@ def test_ballots_that_do_not_say_are_told_by_their_votes(store: Store) -> None:
 def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
     vote(store, "d1", SURE, "ab")
     vote(store, "d1", UNSURE, "c")
-    assert publish(store).deleted == 9, "two of three are sure"
+    assert publish(store).points_deleted == 9, "two of three are sure"
     replay(store, "a", dry_run=False)
     assert middle(store).thing == "stands: surveyed", "without the liar one of two was not"
     assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
@@ -140,6 +141,6 @@ def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_ch
     beside, there = (explain_cell(store, x, 41.55) for x in (29.85, 30.15))
     assert "noise of a change in the next cell" in beside.thing
     assert "noise of" not in there.thing
-    assert publish(store).deleted == len(wall) + len(spill)
+    assert publish(store).points_deleted == len(wall) + len(spill)
     told = [explain_cell(store, x, 41.55).decisions for x in (29.85, 30.15)]
     assert [[decision.state for decision in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]

@@ -92,7 +92,7 @@ def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
     send(store, *[says(store, base, every[k % 16 * 4 : k % 16 * 4 + 4], f"v{k // 16}", f"d{k}") for k in range(200)])
     counted = Counted(store, monkeypatch)
     assert counted.of(lambda: desk(store))[0] == 64
-    ids = [feature["id"] for feature in desk(store).pending["features"]]
+    ids = [feature.id for feature in desk(store).answer.pending.features]
     assert len(ids) == 128
     for click in (lambda: desk(store), lambda: preview(store)):
         fused, statements = counted.of(click)
@@ -104,7 +104,7 @@ def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
     assert counted.of(lambda: desk(store))[0] == 1, "the tile with the vote"
     done: list[Any] = []
     assert counted.of(lambda: done.append(publish(store)))[0] == 0, "what was looked at is what is published"
-    assert (len(done[0].tiles), done[0].deleted) == (64, 64 * 18)
+    assert (len(done[0].tiles), done[0].points_deleted) == (64, 64 * 18)
 
 
 def test_a_publish_of_what_was_looked_at_is_the_publish_of_who_never_looked(
@@ -118,7 +118,7 @@ def test_a_publish_of_what_was_looked_at_is_the_publish_of_who_never_looked(
                 desk(store)
         withdraw(store, "b", by="boss")
         if store is looked:
-            assert desk(store).pending["features"] == []
+            assert desk(store).answer.pending.features == []
         vote(store, [(0, 1), (1, 1)], "c")
         vote(store, [(1, 1)], "b", "d2")
         if store is looked:
@@ -133,15 +133,15 @@ def test_a_round_ends_with_the_policy_and_with_a_version(make: Callable[..., Sto
     store = make()
     for vehicle in "ab":
         vote(store, [(0, 0)], vehicle)
-    assert preview(store).deleted == 18
+    assert preview(store).points_deleted == 18
     store.change_policy({"fuse.min_votes": "3"})
-    assert preview(store).deleted == 0
+    assert preview(store).points_deleted == 0
     store.change_policy({"fuse.min_votes": "2", "fuse.max_deleted_share": "0.01"})
     with pytest.raises(Held):
         publish(store)
     store.change_policy({"fuse.max_deleted_share": "1"})
     assert publish(store).version == 2
-    assert preview(store).deleted == 0
+    assert preview(store).points_deleted == 0
 
 
 def test_with_a_minimum_age_a_round_ends_when_the_next_vote_is_old_enough(
@@ -156,11 +156,11 @@ def test_with_a_minimum_age_a_round_ends_when_the_next_vote_is_old_enough(
     fusions = []
     for minutes in (0, 49, 5, 6):
         clock.now += minutes * 60 * 10**9
-        fusions.append(counted.of(lambda: found.append(preview(store).deleted))[0])
+        fusions.append(counted.of(lambda: found.append(preview(store).points_deleted))[0])
     assert found == [0, 0, 0, 18], "an hour after the second vote came"
     assert fusions == [1, 0, 1, 1], "none where no vote came of age"
     clock.now += 60 * 10**9
-    assert publish(store).deleted == 18
+    assert publish(store).points_deleted == 18
     assert store.versions()[-1].created_ns == clock.now
 
 
@@ -168,5 +168,5 @@ def test_what_the_newest_version_edited_is_fused_again_for_votes_were_spent_ther
     store = make()
     for vehicle in "ab":
         vote(store, [(0, 0), (0, 1)], vehicle)
-    assert publish(store).tiles == [(0, 0), (0, 1)]
+    assert publish(store).tiles == ["0,0", "0,1"]
     assert [fused.index for fused in preview(store).fused] == [(0, 0), (0, 1)]

@@ -20,11 +20,11 @@ def test_a_rollback_is_told_as_no_vote(new_store: NewStore, tmp_path: Path) -> N
     for name in "abc":
         say = Say(states_plane({(10, col): CellState.CHANGED_EMPTY for col in range(10, 14)}))
         send(store, make_ballot(store.point_map(), {(0, 0): say}, name, "d1", store.clock()))
-    assert publish(store).deleted
+    assert publish(store).points_deleted
     rollback(store, 1)
     voted, taken_back = changes_between(store, 1, 2), changes_between(store, 2, 3)
-    assert [f["properties"]["votes_min"] for f in voted["features"]] == [3]
-    assert [f["properties"]["kind"] for f in taken_back["features"]] == ["built"]
+    assert [f.properties.votes_min for f in voted.features] == [3]
+    assert [f.properties.kind for f in taken_back.features] == ["built"]
     assert "taken back" not in typed("log", tmp_path / "s.db", "--from", 1, "--to", 2)
     told = typed("log", tmp_path / "s.db", "--from", 2, "--to", 3)
     assert "none: taken back" in told

@@ -36,20 +36,20 @@ def store(new_store: NewStore) -> Store:
 
 
 def test_the_desk_names_it_and_counts_the_votes_on_its_voxels(store: Store) -> None:
-    (change,) = desk(store).pending["features"]
-    told = change["properties"]
-    assert (told["kind"], told["cells"], told["trimmed"], told["points"]) == ("demolished", 1, 1, 2)
-    assert (told["votes_min"], told["votes_median"], told["against_median"]) == (3, 3.0, 1.0)
+    (change,) = desk(store).answer.pending.features
+    told = change.properties
+    assert (told.kind, told.cells, told.trimmed, told.points) == ("demolished", 1, 1, 2)
+    assert (told.votes_min, told.votes_median, told.against_median) == (3, 3.0, 1.0)
     assert "trimmed: the cell stands, and 3 of 4 vehicles" in explain_cell(store, 3.1, 3.1).thing
 
 
 def test_log_and_cell_name_who_voted_for_it_once_it_is_published(store: Store) -> None:
-    assert publish(store).deleted == 2
-    (change,) = changes_between(store, 1, 2)["features"]
-    told = change["properties"]
-    assert (told["trimmed"], told["votes_min"], told["against_median"], told["versions"]) == (1, 3, 1.0, [2])
-    assert told["first_seen"] is not None
-    assert told["probability"] is None, "the curve knows cells that change, not cells that stand"
+    assert publish(store).points_deleted == 2
+    (change,) = changes_between(store, 1, 2).features
+    told = change.properties
+    assert (told.trimmed, told.votes_min, told.against_median, told.versions) == (1, 3, 1.0, [2])
+    assert told.first_seen is not None
+    assert told.probability is None, "the curve knows cells that change, not cells that stand"
     story = explain_cell(store, 3.1, 3.1)
     (decision,) = story.decisions
     assert (decision.state, decision.edit) == ("unchanged_occupied", Edit("changed_empty", 3, 1))

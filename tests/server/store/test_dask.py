@@ -108,8 +108,8 @@ def test_a_cluster_publishes_byte_for_byte_what_one_machine_does(
         client.wait_for_workers(2, timeout=60)
         outcome = publish(there, policy, executor=client.get_executor(pure=False))
     assert (outcome.published, len(outcome.tiles)) == (True, len(TILES))
-    assert outcome.added > 0
-    assert outcome.deleted > 0
+    assert outcome.points_added > 0
+    assert outcome.points_deleted > 0
     assert published(here) == published(there)
     here.close()
     there.close()

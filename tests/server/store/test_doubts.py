@@ -56,13 +56,13 @@ def test_a_change_against_what_as_many_vehicles_said_is_told_and_can_be_held(
     drive(store, clock, [f"liar{i}" for i in range(after)], CE)
     (told,) = preview(store).doubts
     assert f"in 3 cells: {after} votes for a change where up to {before} vehicles said otherwise" in told
-    assert desk(store).doubts == [told]
+    assert desk(store).answer.doubts == [told]
     hold(store, hold_overturned=True)
     with pytest.raises(Held, match="overturns"):
         publish(store)
-    assert desk(store).held == [told]
+    assert desk(store).answer.held == [told]
     done = publish(store, override=True)
-    assert done.deleted == 9
+    assert done.points_deleted == 9
     events = [event for event in last_events(store) if event.kind == "doubt"]
     assert [event.detail for event in events] == [f"v{done.version}: {told}"]
     assert not publish(store).published
@@ -72,7 +72,7 @@ def test_a_change_against_what_as_many_vehicles_said_is_told_and_can_be_held(
 def test_what_a_majority_decides_against_fewer_overturns_nobody(store: Store, clock: Clock) -> None:
     drive(store, clock, ["a"], UO)
     drive(store, clock, ["b", "c"], CE)
-    assert preview(store).deleted == 9
+    assert preview(store).points_deleted == 9
     assert list(preview(store).doubts) == []
 
 
@@ -106,5 +106,5 @@ def test_vehicles_whose_drives_are_copies_are_told_at_the_desk(store: Store, clo
     for name in ("honest", "copier"):
         clock.now += 60 * 10**9
         send(store, make_ballot(store.point_map(), {(0, 0): Say(states, free=free)}, name, "d", clock.now))
-    (told,) = desk(store).doubts
+    (told,) = desk(store).answer.doubts
     assert told == "copier sends what honest sends, on 1 tile: they count as one vehicle"

@@ -87,36 +87,36 @@ def test_the_server_publishes_what_update_makes(store: Store) -> None:
     vote(store, "ab")
     offline, _ = update_map(base, [says_gone(base, name) for name in "ab"], FUSE)
     outcome = publish(store)
-    assert set(outcome.tiles) == {(0, 0), (0, 1), (1, 0), (1, 1)}, "two of them without a vote"
-    assert outcome.deleted == POINTS
+    assert set(outcome.tiles) == {"0,0", "0,1", "1,0", "1,1"}, "two of them without a vote"
+    assert outcome.points_deleted == POINTS
     assert len(all_points(store.point_map())) == len(all_points(offline)) == 0
 
 
 def test_a_cell_that_fell_says_with_which_object(store: Store) -> None:
     vote(store, "ab")
     publish(store)
-    (thing,) = changes_between(store, 1, 2)["features"]
-    assert (thing["properties"]["cells"], thing["properties"]["fell"]) == (len(ROOF), len(ROOF))
+    (thing,) = changes_between(store, 1, 2).features
+    assert (thing.properties.cells, thing.properties.fell) == (len(ROOF), len(ROOF))
     for cell in ((259, 261), (259, 250), (252, 255)):
         story = explain_cell(store, *at(cell))
-        assert [d.fell for d in story.decisions] == [f"fell with object {thing['id']}: nothing holds it"]
+        assert [d.fell for d in story.decisions] == [f"fell with object {thing.id}: nothing holds it"]
         assert story.probability is None
 
 
 def test_a_review_of_the_house_covers_what_falls_with_it(store: Store) -> None:
     vote(store, "ab")
-    (change,) = desk(store).pending["features"]
-    assert change["properties"]["cells"] == len(ROOF)
-    number = review(store, change["id"], "rejected", by="olga")
+    (change,) = desk(store).answer.pending.features
+    assert change.properties.cells == len(ROOF)
+    number = review(store, change.id, "rejected", by="olga")
     assert preview(store).tiles == []
     undo(store, number, by="olga")
-    assert publish(store).deleted == POINTS
+    assert publish(store).points_deleted == POINTS
 
 
 def test_what_a_reviewer_holds_does_not_fall_with_the_house_next_door(store: Store, clock: Clock) -> None:
     vote(store, "ab", ROOF[-3:])
-    (change,) = desk(store).pending["features"]
-    review(store, change["id"], "held", by="olga")
+    (change,) = desk(store).answer.pending.features
+    review(store, change.id, "held", by="olga")
     clock.now += 10**9
     vote(store, "ab")
     publish(store)
@@ -154,4 +154,4 @@ def test_a_round_that_is_asked_again_lets_the_same_fall(store: Store) -> None:
     vote(store, "b")
     first = preview(store)
     vote(store, "c", [(100, 100)])
-    assert preview(store).deleted == first.deleted == POINTS
+    assert preview(store).points_deleted == first.points_deleted == POINTS

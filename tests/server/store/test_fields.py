@@ -93,13 +93,13 @@ def test_every_point_that_stays_keeps_its_fields_and_new_ones_have_the_sensors_i
     assert all_carried(before) == all_carried(street())
     vote(store)
     done = publish(store)
-    assert (done.added, done.deleted > 50) == (2, True)
+    assert (done.points_added, done.points_deleted > 50) == (2, True)
     after, offline = store.point_map(), update_map(before, ballots(before), POLICY.fuse)[0]
     for index, tile in offline.tiles.items():
         assert pack_tile(tile) == pack_tile(after.tiles[index]), "as `mapvote update` makes it on files"
     new = all_carried(after) - all_carried(before)
     assert sorted(point[1] for point in new) == sorted(map(tuple, BUILT.tolist()))
-    assert len(all_carried(before) - all_carried(after)) == done.deleted
+    assert len(all_carried(before) - all_carried(after)) == done.points_deleted
     tile = after.tiles[0, 0]
     assert tile.fields["intensity"][-2:].tolist() == [51 * 257, 204 * 257]
     assert not any(column[-2:].any() for name, column in tile.fields.items() if name != "intensity")

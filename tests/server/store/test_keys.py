@@ -91,10 +91,10 @@ def test_whose_key_is_revoked_is_not_heard_any_more_unless_one_says_so_and_what_
         send(store, takes_the_wall_down(vehicle))
     assert keys.revoke(store, "v3") == (1, 1)
     assert keys.revoke(store, "v2", keep_votes=True) == (1, 0)
-    assert publish(store, override=True).deleted == 3, "v1 and v2"
+    assert publish(store, override=True).points_deleted == 3, "v1 and v2"
     keys.revoke(store, "v1")
     assert not publish(store).published, "nothing comes back by itself"
-    assert replay(store, "v1", dry_run=False).added == 3
+    assert replay(store, "v1", dry_run=False).points_added == 3
 
 
 def test_a_ballot_on_its_way_while_its_key_is_revoked_is_refused(store: Store) -> None:

@@ -112,7 +112,7 @@ def test_the_map_becomes_that_of_a_history_without_the_vehicle(store: Store, hon
     with ThreadPoolExecutor(2) as executor:
         done = replay(store, "liar", dry_run=False, executor=executor)
     assert (done.version, done.published, done.tiles) == (newest + 1, True, shown.tiles)
-    assert (done.added, done.deleted) == (shown.added, shown.deleted)
+    assert (done.points_added, done.points_deleted) == (shown.points_added, shown.points_deleted)
     assert content(store) == content(honest)
     assert set(store.point_map(newest).tiles) == set(two_walls().tiles), "older versions can still be read whole"
     version = store.versions()[-1]

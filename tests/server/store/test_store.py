@@ -77,7 +77,7 @@ def test_two_vehicles_take_a_wall_down_and_the_manifest_says_what_changed(store:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
     outcome = publish(store, POLICY)
-    assert (outcome.version, outcome.published, outcome.deleted) == (2, True, 3)
+    assert (outcome.version, outcome.published, outcome.points_deleted) == (2, True, 3)
     assert heights(store) == 0
     assert heights(store, NEXT) == 3
     assert list(store.manifest(since=1).tiles) == ["0,0"]
@@ -153,7 +153,7 @@ def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: 
     send(store, says(base, "c", EMPTY, **other))
     assert not publish(store, POLICY).published, "a's vote was cast otherwise"
     send(store, says(base, "d", EMPTY, **other))
-    assert publish(store, POLICY).deleted == 3
+    assert publish(store, POLICY).points_deleted == 3
     assert [(change.by, change.reason) for change in store.policy_changes()][-1] == ("ann", "a new release")
 
 
@@ -183,7 +183,7 @@ def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> No
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
     strict = FuseSettings(max_deleted_share=0.01)
     dry = preview(store, strict)
-    assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
+    assert (dry.published, dry.points_deleted, len(dry.held)) == (False, 3, 1)
     with pytest.raises(Held, match="deletes 25% of the points"):
         publish(store, strict)
     seen: list[PointMap] = []
