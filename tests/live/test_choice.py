@@ -111,7 +111,6 @@ def test_types_that_hold_points_but_are_not_read_have_a_hint() -> None:
     for kind, hint in (
         ("livox_ros_driver2/msg/CustomMsg", "xfer_format"),
         ("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"),
-        ("point_cloud_interfaces/msg/CompressedPointCloud2", "point_cloud_transport"),
         ("ouster_sensor_msgs/msg/PacketMsg", "driver"),
     ):
         topic = PublishedTopic("/lidar", kind, 1, True, False)

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 
 from live.loopback_dds import until
+from mapvote.codec.planes import zstd
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
+from mapvote.formats.drives.compressed_cloud import COMPRESSED
 from mapvote.formats.drives.frames import matrix_of
 from mapvote.formats.drives.packets import direction_of
 from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, from_cdr
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, blank_message, cloud_of, from_cdr, to_cdr
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.road_map import OneMap
@@ -95,6 +97,27 @@ def test_whole_revolutions_and_lidars_that_look_ahead_are_no_packets(start_deg: 
     middle, coverage = direction_of(point_cloud_table("a cloud", clouds[0].message))
     assert coverage == pytest.approx(width_deg / 360.0, abs=0.06)
     assert width_deg == 360.0 or abs(middle) < 0.05
+
+
+def test_clouds_compressed_by_zstd_arrive_as_scans(domain: int) -> None:
+    sender = Network(domain).publish("/points/zstd", COMPRESSED)
+    topics = Subscriptions(
+        Network(domain), Chosen((PublishedTopic("/points/zstd", COMPRESSED, 1, True, False),), None), SENSORS["hdl32e"]
+    )
+    until(lambda: sender.readers == 1)
+    points = np.random.default_rng(0).uniform(5, 30, (200, 3)).astype("<f4")
+    plain = vars(cloud_of({axis: points[:, k] for k, axis in enumerate("xyz")}, START, "lidar"))
+    members = {name: value for name, value in plain.items() if name not in ("data", "__msgtype__")}
+    data = np.frombuffer(zstd.compress(points.tobytes()), np.uint8)
+    sender.send(to_cdr(COMPRESSED, blank_message(COMPRESSED, **members, compressed_data=data, format="zstd")))
+    scans: list[list[Cloud]] = []
+
+    def arrived() -> bool:
+        scans.extend(topics.take_scans())
+        return bool(scans)
+
+    until(arrived)
+    assert np.array_equal(topics.waiting(scans[0]).read().points, points)
 
 
 def test_the_scan_of_packets_has_all_points_at_the_times_at_which_they_were_measured(domain: int) -> None:

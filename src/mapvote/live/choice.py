@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from mapvote.core.types import MapvoteError
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, mend_of, one_of_each_cloud, unread_format
 from mapvote.live.dds import Network, PublishedTopic, Subscription, TopicRate
-from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
+from mapvote.live.messages import CLOUD, CLOUDS, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
 from mapvote.live.names import RosNames
 
 
@@ -37,7 +38,6 @@ _LISTED = 12
 """Topics that a sentence lists at most."""
 _UNREAD = {
     "CustomMsg": "set the Livox driver's xfer_format to 0, so that it sends PointCloud2",
-    "CompressedPointCloud2": "run `ros2 run point_cloud_transport republish` to send PointCloud2",
     "Packet": "start the part of the driver that makes PointCloud2 of packets",
     "VelodyneScan": "start velodyne_pointcloud, which makes PointCloud2 of packets",
     "PandarScan": "start the part of the driver that makes PointCloud2 of packets",
@@ -149,7 +149,7 @@ def _choose(
     seen_s = float("inf")
     while not ended():
         published = network.published()
-        clouds = _of_kinds(published, (CLOUD,), wish.points, wish.names)
+        clouds = _clouds(published, wish)
         poses = _poses(published, wish)
         now_s = time.monotonic()
         if clouds:
@@ -179,6 +179,13 @@ def _of_kinds(
         for one in published
         if one.kind in kinds and (one.topic in wanted if wanted else names.holds(one.topic) and one.topic != own)
     ]
+
+
+def _clouds(published: Sequence[PublishedTopic], wish: Wish) -> list[PublishedTopic]:
+    """The topics of clouds: those of ``wish``, else one for each LiDAR."""
+    clouds = _of_kinds(published, CLOUDS, wish.points, wish.names)
+    one_each = one_of_each_cloud({one.topic: one.kind for one in clouds})
+    return [one for one in clouds if (one.topic in one_each or wish.points) and not unread_format(one.topic)]
 
 
 def _poses(published: Sequence[PublishedTopic], wish: Wish) -> list[PublishedTopic]:
@@ -229,16 +236,22 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
             "CYCLONEDDS_URI names an interface that the senders use; or type --domain N"
         )
     for name in wish.points:
-        text = _lack_of(name, (CLOUD,), published, "--points")
+        form = unread_format(name) if any(one.topic == name and one.kind == COMPRESSED for one in published) else ""
+        text = f"{name} is compressed by {form}: {mend_of(form)}" if form else ""
+        text = text or _lack_of(name, CLOUDS, published, "--points")
         if text:
             return text
-    if wish.points or _of_kinds(published, (CLOUD,), (), wish.names):
+    if wish.points or _clouds(published, wish):
         return ""
+    compressed = [one for one in _of_kinds(published, CLOUDS, (), wish.names) if unread_format(one.topic)]
+    if compressed:
+        form = unread_format(compressed[0].topic)
+        return f"{compressed[0].topic} is compressed by {form}: {mend_of(form)}"
     unread = [(one, hint) for one in published for part, hint in _UNREAD.items() if part in one.kind]
     if unread:
         one, hint = unread[0]
         return f"no {CLOUD} is sent, but {one.topic} [{one.kind}], which is not read: {hint}"
-    elsewhere = [one.topic for one in published if one.kind == CLOUD]
+    elsewhere = [one.topic for one in published if one.kind in CLOUDS]
     if elsewhere:
         return f"no {CLOUD} is sent below {wish.names.namespace}, but {elsewhere[0]}: type --points {elsewhere[0]}"
     return f"no {CLOUD} is sent: start the LiDAR's driver. Heard: {_listed(published)}"
@@ -292,7 +305,7 @@ def missing_for_drive(rates: Sequence[TopicRate], domain: int = 0) -> list[str]:
         return [text]
     received = {one.published.kind for one in rates if one.messages}
     out = [text] if text else []
-    if not text and CLOUD not in received:
+    if not text and not received & set(CLOUDS):
         out.append(f"no {CLOUD} comes, though its topic is announced: start the LiDAR's driver")
     if not received & set(POSES):
         out.append(f"no {ODOMETRY} or other pose comes: without a prior the whole map is searched at the start")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, MEMBERS
 from mapvote.formats.reading import first_line
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -24,10 +25,12 @@ POSES = (ODOMETRY, POSE_WITH_COVARIANCE, POSE)
 """Types of topics that say where a vehicle is."""
 POSE_TOPIC = "mapvote/pose"
 """Where a vehicle publishes its own pose, below its namespace."""
+CLOUDS = (CLOUD, COMPRESSED)
+"""Types of topics that hold the points of a LiDAR."""
 CLOCK = "rosgraph_msgs/msg/Clock"
 GNSS = "sensor_msgs/msg/NavSatFix"
 IMU = "sensor_msgs/msg/Imu"
-READ = {CLOUD, ODOMETRY, TF, IMU, GNSS, "std_msgs/msg/Header", CLOCK}
+READ = {*CLOUDS, ODOMETRY, TF, IMU, GNSS, "std_msgs/msg/Header", CLOCK}
 READ |= {f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")}
 READ |= {
     f"geometry_msgs/msg/{name}{stamped}"
@@ -40,7 +43,8 @@ LIDAR_FRAME = "lidar"
 _DATATYPES = {"<f4": 7, "<u2": 4}
 """Types of a sensor_msgs/PointField."""
 _MAP_MSGS = "autoware_map_msgs"
-_AUTOWARE = {
+_LACKING = {
+    COMPRESSED: MEMBERS,
     f"{_MAP_MSGS}/msg/AreaInfo": "float32 center_x, float32 center_y, float32 radius",
     f"{_MAP_MSGS}/msg/PointCloudMapCellMetaData": "float32 min_x, float32 min_y, float32 max_x, float32 max_y",
     f"{_MAP_MSGS}/msg/PointCloudMapCellMetaDataWithID": "string cell_id, CELL metadata",
@@ -68,7 +72,7 @@ def typestore() -> Any:
     """Every message type, by its full name such as sensor_msgs/msg/PointCloud2."""
     types = require("rosbags.typesys", "ros2", "messages of ROS 2")
     store = types.get_typestore(types.Stores.LATEST)
-    for name, members in _AUTOWARE.items():
+    for name, members in _LACKING.items():
         for short, long in _SHORT.items():
             members = members.replace(short, long)
         (found,) = types.get_types_from_msg(members.replace(", ", "\n"), name).values()

@@ -253,10 +253,10 @@ class Subscriptions:
         if self.mounts() is None or self.T_base_lidar() is None:  # a joint that is fixed, but sent on /tf
             self._take_moving_frames()
         clouds: list[Cloud] = []
-        for lidar, reader in enumerate(self._points):
+        for lidar, (one, reader) in enumerate(zip(self.chosen.points, self._points, strict=True)):
             for sent_ns, data in reader.take():
                 with self._some_unusable(CLOUD):
-                    message = from_cdr(CLOUD, data)
+                    message = from_cdr(one.kind, data)
                     self.lidar_frames[lidar] = message.header.frame_id.strip("/")
                     clouds.append(Cloud(lidar, stamp_ns(message.header), sent_ns, message))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())

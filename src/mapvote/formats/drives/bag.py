@@ -15,6 +15,7 @@ from mapvote.core import geometry
 from mapvote.core.extras import require
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, MEMBERS
 from mapvote.formats.drives.frames import Edges, pose_of_message
 from mapvote.formats.drives.point_fields import livox_table, point_cloud_table
 from mapvote.formats.reading import first_line
@@ -22,7 +23,7 @@ from mapvote.formats.reading import first_line
 CLOUD = "sensor_msgs/msg/PointCloud2"
 LIVOX = "livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"
 """Clouds of Livox's drivers: decoded points, each with its time."""
-CLOUDS = (CLOUD, *LIVOX)
+CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
 PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
 """Parts of the names of messages in which drivers record what came over the wire."""
 TF = "tf2_msgs/msg/TFMessage"
@@ -40,6 +41,7 @@ class Bag:
         reader = require("rosbags.highlevel", "ros", str(path))
         stores = require("rosbags.typesys", "ros", str(path))
         typestore = stores.get_typestore(stores.Stores.LATEST)
+        typestore.register(stores.get_types_from_msg(MEMBERS.replace(", ", "\n"), COMPRESSED))
         files = bag_files(path)
         try:
             self.reader = reader.AnyReader(files.paths, default_typestore=typestore)
@@ -85,7 +87,7 @@ class Bag:
             yield time_ns, self.decode(connection, data)
 
     def points(self, where: str, connection: Any, data: bytes) -> NDArray[np.void]:
-        """The points (n,) of a serialised PointCloud2 or CustomMsg, with their fields."""
+        """The points (n,) of a serialised cloud of one of CLOUDS, with their fields."""
         if connection.msgtype in LIVOX:
             return livox_table(where, data, ros2=self.reader.is2)
         return point_cloud_table(where, self.decode(connection, data))

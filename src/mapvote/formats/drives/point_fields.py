@@ -19,6 +19,7 @@ from mapvote.core.points import Values, point_fields
 from mapvote.core.record import record
 from mapvote.core.sensors import UPRIGHT, Sensor
 from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
+from mapvote.formats.drives.compressed_cloud import decompressed
 from mapvote.formats.drives.point_times import (
     ClockDifference,
     FieldTimes,
@@ -315,11 +316,13 @@ def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F
 
 
 def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
-    """The points of a sensor_msgs PointCloud2 as a structured array (n,), little-endian.
+    """The points of a PointCloud2 or CompressedPointCloud2 as a structured array (n,), little-endian.
 
-    ``message``: rosbags', rclpy's or any object with its fields. MapvoteError if its sizes contradict each other.
+    ``message``: rosbags', rclpy's or any object with its fields. MapvoteError if its sizes contradict each other, or
+    its points are compressed in a format that is not read.
     """
-    raw = message.data if isinstance(message.data, np.ndarray) else bytes(message.data)  # an array is not copied
+    sent = decompressed(where, message) if hasattr(message, "compressed_data") else message.data
+    raw = sent if isinstance(sent, np.ndarray) else bytes(sent)  # an array is not copied
     data = np.frombuffer(raw, dtype=np.uint8)
     row = message.width * message.point_step
     if message.height > 1 and message.row_step != row and len(data) == message.height * message.row_step:

@@ -19,6 +19,7 @@ from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.bag import CLOUD, CLOUDS, PACKETS, Bag, frame_id, stamps_of, static_frames
 from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
+from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
 from mapvote.formats.drives.frames import T_from
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
 from mapvote.formats.drives.packets import PACKET_RULE, SWEEP_RULE, Packets, direction_of, scan_of_packets
@@ -90,12 +91,13 @@ def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
     if not topics:
         others = ", ".join(sorted(bag.reader.topics)) or "none"
         raise MapvoteError(f"{bag.path}: no topic of {CLOUD} or Livox's CustomMsg; topics: {others}")
-    if wanted is None and len(topics) > 1:
+    clouds = one_of_each_cloud({name: str(bag.reader.topics[name].msgtype) for name in topics})
+    if wanted is None and len(clouds) > 1:
         raise MapvoteError(
             f"{bag.path}: several PointCloud2 topics; choose with --topic or drive.toml, several LiDARs of one vehicle "
             f"with commas: {listed}"
         )
-    chosen = [name.strip() for name in wanted.split(",")] if wanted is not None else [next(iter(topics))]
+    chosen = [name.strip() for name in wanted.split(",")] if wanted is not None else clouds
     for topic in chosen:
         if topic not in topics:
             raise MapvoteError(f"{bag.path}: no PointCloud2 topic {topic}; there are: {listed}")
