@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from mapvote_lab.evaluation.tables import Sheet
 
 
+LabSensor = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="vlp16, hdl32e, hdl64e, beams128, rosette70 or mems120; default: the scenario's"),
+]
+
+
 def register(app: typer.Typer) -> None:
     """Add demo, simulate and evaluate."""
     app.command(rich_help_panel=Panel.EVALUATE)(demo)
@@ -37,16 +43,17 @@ def simulate(
     scenario: Scenario,
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="what to write; it must not exist yet")],
     seed: Seed = 1,
+    sensor: LabSensor = None,
 ) -> None:
     """Simulate a street before and after: survey drives, voting vehicles' drives, and the truth apart from them.
 
-    mapvote simulate corner my_street --seed 2
+    mapvote simulate corner my_street --seed 2 --sensor rosette70
     """
     _need_lab("simulate")
     from mapvote_lab.simulation import simulate as run
 
     with progress(f"simulating {scenario}") as tell:
-        run(scenario, out, seed, progress=tell)
+        run(scenario, out, seed, progress=tell, overrides={"sensor": sensor} if sensor else None)
     print(f"{out}: drives {', '.join(sorted(p.name for p in out.iterdir() if p.name != 'truth'))}; truth in truth/")
 
 
@@ -72,9 +79,7 @@ def evaluate(
     cache: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="where drives, maps and ballots are kept")
     ] = None,
-    sensor: Annotated[
-        str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e, hdl64e or beams128; else the scenario's")
-    ] = None,
+    sensor: LabSensor = None,
     cars: Annotated[
         int | None, typer.Option(metavar="N", min=0, help="cars that park during one vehicle's pass only, for each")
     ] = None,

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F32, F64
+from mapvote.core.sensors import NAMED, SENSORS
+from mapvote.core.types import F32, F64, Scan
+from mapvote.formats.drives.sensor_estimate import estimate_sensor
 from mapvote_lab.simulation import shapes
-from mapvote_lab.simulation.lidar import Caster, measure, sweep
+from mapvote_lab.simulation.lidar import Caster, SlicedCaster, Sweep, measure, sweep
+from mapvote_lab.simulation.patterns import in_view
 from mapvote_lab.simulation.truth import TRUTH_RULE, passed_surfaces
 
 
@@ -69,6 +71,40 @@ def test_within_the_revolution_rays_leave_from_where_the_sensor_is() -> None:
     expected = 11.0 * (2.0 - azimuth / (2 * np.pi) / sensor.rate_hz)
     ahead = np.abs(azimuth) < 3.1  # -pi and pi are the same direction, fired at both ends
     np.testing.assert_allclose(rays.origins[ahead, 0], expected[ahead], atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "rays_a_scan"), [("rosette70", 24_000), ("mems120", 75_000)])
+def test_sensors_that_look_ahead_fire_in_their_field_of_view_and_time_and_on_no_rings(
+    name: str, rays_a_scan: int
+) -> None:
+    sensor = NAMED[name]
+    first, second = (sweep(sensor, lambda t: at(np.eye(4)), s, 0.3, distortion=False) for s in (0.0, 0.1))
+    assert len(first.directions) == rays_a_scan
+    np.testing.assert_allclose(np.linalg.norm(first.directions, axis=1), 1.0, atol=1e-6)
+    assert in_view(sensor, first.directions).mean() > 0.99
+    azimuth = np.degrees(np.arctan2(first.directions[:, 1], first.directions[:, 0]))
+    elevation = np.degrees(np.arcsin(first.directions[:, 2]))
+    wide_deg = 120.0 if name == "mems120" else 70.4
+    assert np.ptp(azimuth) == pytest.approx(wide_deg, abs=0.5)
+    assert np.ptp(elevation) == pytest.approx(sensor.fov_top_deg - sensor.fov_bottom_deg, abs=0.5)
+    assert np.all(np.diff(first.time_s) >= 0)
+    assert 0.0 <= first.time_s[0] < first.time_s[-1] <= 1.0 / sensor.rate_hz
+    found = estimate_sensor([Scan(0, 20.0 * first.directions), Scan(1, 20.0 * second.directions)], sensor.rate_hz)
+    assert not found.sensor.rings
+    repeated = np.einsum("ij,ij->i", first.directions, second.directions) > np.cos(np.radians(0.1))
+    assert (repeated.mean() < 0.05) == (name == "rosette70")
+
+
+def test_a_body_that_moves_is_met_where_it_is_when_the_ray_leaves() -> None:
+    boxes = [shapes.box(4.0 + k, 5.0 + k, -9, 9, -9, 9).astype(np.float32) for k in range(3)]
+    slices = [Caster(box, np.full(len(box), 7, np.int32)) for box in boxes]
+    ahead = np.tile(np.array([[1.0, 0.0, 0.0]], np.float32), (6, 1))
+    rays = Sweep(np.zeros((6, 3), np.float32), ahead, ahead, np.arange(6.0), 1)
+    caster = SlicedCaster(slices, np.array([0, 2, 4]))
+    ranges, objects, _ = caster.cast(rays.origins, rays.directions)
+    assert ranges.tolist() == [4.0, 4.0, 5.0, 5.0, 6.0, 6.0]
+    assert (objects == 7).all()
+    np.testing.assert_allclose(np.abs(caster.normals(rays, np.array([5, 0, 3]))), np.tile([1.0, 0.0, 0.0], (3, 1)))
 
 
 def test_ranges_carry_two_centimetres_of_noise_and_some_returns_are_lost() -> None:

@@ -12,7 +12,7 @@ UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A spinning LiDAR. Beams are listed from the top down; azimuths are counter-clockwise from x forward."""
+    """A LiDAR. Beams are listed from the top down; azimuths are counter-clockwise from x forward."""
 
     name: str
     elevations_deg: tuple[float, ...]
@@ -64,6 +64,13 @@ SENSORS: dict[str, Sensor] = {
     )
 }
 """Models by name: those that scans are recognised as."""
-NAMED = SENSORS | {"beams128": Sensor("beams128", _even(15.0, -25.0, 128), 0.2)}
-"""Sensors that a drive or a scenario may name: these, and 128 beams over the field of view of several makes. No scan is
-recognised as that one: it is no real sensor, and its beams are so dense that the rings of others lie on them."""
+_OF_THE_LABORATORY = (
+    Sensor("beams128", _even(15.0, -25.0, 128), 0.2),
+    Sensor("rosette70", _even(35.2, -35.2, 156), 0.45, rings=False, blind_sectors_deg=((35.2, 324.8),)),
+    Sensor("mems120", _even(12.5, -12.5, 125), 0.2, rings=False, blind_sectors_deg=((60.0, 300.0),)),
+)
+NAMED = SENSORS | {s.name: s for s in _OF_THE_LABORATORY}
+"""Sensors that a drive or a scenario may name: these, 128 beams over the field of view of several makes, and two that
+look ahead only: a rosette that never repeats itself in a cone of 70 deg, and mirrors that scan 120 x 25 deg. No scan is
+recognised as one of the three. They are no real sensors, and the beams of the first are so dense that the rings of
+others lie on them."""

@@ -18,7 +18,7 @@ import numpy as np
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, Bool
-from mapvote_lab.simulation.lidar import Caster, Sweep
+from mapvote_lab.simulation.lidar import Caster, SlicedCaster, Sweep
 from mapvote_lab.simulation.scenario import Flaws
 
 
@@ -53,6 +53,10 @@ class Kinds:
     glazed: Bool
     painted: Bool
     seed: int
+
+
+Casts = Caster | SlicedCaster
+"""What moves is cast in slices of a scan where the sensor does not turn."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def swallowed(
 
 
 def reflected(
-    rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Caster], wanted: int, sensor: Sensor,
+    rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Casts], wanted: int, sensor: Sensor,
     rng: np.random.Generator,
 ) -> tuple[I64, F32]:  # fmt: skip
     """(indices, ranges) of at most ``wanted`` rays of those that met a ``smooth`` surface (rays,): the range over it.
@@ -126,7 +130,7 @@ def reflected(
     for caster, its_rays in zip(casters, (~hits.moving[chosen], hits.moving[chosen]), strict=True):
         met = chosen[its_rays]
         if len(met):
-            normals = caster.normals(rays.origins[met], rays.directions[met])
+            normals = caster.normals(rays, met)
             away = rays.directions[met]
             bounced = away - 2.0 * np.einsum("ij,ij->i", away, normals)[:, None] * normals
             mirror = rays.origins[met] + hits.ranges[met, None] * away
@@ -139,12 +143,12 @@ def reflected(
     return index[seen], way[seen]
 
 
-def mixed(ranges: F32, beams: int, share: float, rng: np.random.Generator, sizes: FlawSizes = FLAW_SIZES) -> Bool:
+def mixed(ranges: F32, together: int, share: float, rng: np.random.Generator, sizes: FlawSizes = FLAW_SIZES) -> Bool:
     """Mix ranges (rays,) in place where the beam beside meets something else within a pulse; which were, (rays,).
 
-    Rays are in firing order, ``beams`` of one azimuth together: the neighbour in azimuth is ``beams`` rays on.
+    Rays are in firing order, and so many leave ``together``: the neighbour of a ray is as many rays on.
     """
-    beside = np.roll(ranges, -beams)
+    beside = np.roll(ranges, -together)
     with np.errstate(invalid="ignore"):
         apart = np.abs(beside - ranges)
     edge: Bool = (apart > sizes.edge_m) & (apart < sizes.pulse_m) & (rng.random(len(ranges)) < share)
@@ -182,7 +186,7 @@ def shortened(
 
 
 def spoil(
-    rays: Sweep, hits: Hits, kinds: Kinds, casters: tuple[Caster, Caster], tails: F64, sensor: Sensor, flaws: Flaws,
+    rays: Sweep, hits: Hits, kinds: Kinds, casters: tuple[Caster, Casts], tails: F64, sensor: Sensor, flaws: Flaws,
     rng: np.random.Generator,
 ) -> tuple[F32, Bool, Bool]:  # fmt: skip
     """(ranges as reported, false, lost), each (rays,): what becomes of the true ``hits`` of one revolution.
@@ -194,7 +198,7 @@ def spoil(
     points = (rays.origins + np.where(np.isfinite(ranges), ranges, 0.0)[:, None] * rays.directions).astype(np.float64)
     wet, glass, paint, dark = surfaces(hits, points, kinds, flaws)
     lost = swallowed(wet, glass, dark, hits, sensor, rng)
-    false = mixed(ranges, sensor.beams, flaws.mixed_share, rng)
+    false = mixed(ranges, rays.together, flaws.mixed_share, rng)
     wanted = round(flaws.reflection_share * np.count_nonzero(hits.ranges < sensor.max_range_m))
     if wanted:
         index, way = reflected(rays, hits, wet | glass | paint, casters, wanted, sensor, rng)

@@ -1,12 +1,11 @@
-"""A spinning LiDAR on Embree: rays, noise, drop-outs, and motion within the revolution (paper II).
+"""A LiDAR on Embree: rays, noise, drop-outs, and motion while a scan is taken (paper II).
 
-The sensor turns clockwise seen from above. The stamp is the middle of the revolution, when it faces
-forward; the ray at azimuth phi leaves at ``-phi / (2 pi) / rate`` from the stamp.
+Where the rays go, and when: mapvote_lab.simulation.patterns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,8 @@ from embreex.rtcore_scene import EmbreeScene
 from mapvote.core.kernel import allocating
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, Bool
+from mapvote.core.types import F32, F64, I32, I64, Bool
+from mapvote_lab.simulation.patterns import pattern_of
 
 NOTHING = -1
 """Object id of a ray that meets nothing."""
@@ -57,10 +57,35 @@ class Caster:
         hit = self._scene.run(origins, directions, output=1)
         return _first_hits(hit["tfar"], hit["primID"], hit["Ng"], directions, self._owners)
 
-    def normals(self, origins: F32, directions: F32) -> F32:
-        """(n, 3) unit normals of the surfaces that these rays hit, each of which must hit one."""
-        normals = self._scene.run(origins, directions, output=1)["Ng"]
+    def normals(self, rays: Sweep, met: I64) -> F32:
+        """(n, 3) unit normals of the surfaces that the rays ``met`` (n,) of a sweep hit, each of which must hit one."""
+        normals = self._scene.run(rays.origins[met], rays.directions[met], output=1)["Ng"]
         return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)).astype(np.float32)
+
+
+class SlicedCaster:
+    """Bodies that move while a scan is taken: a caster for each slice of its rays, which are in order of time."""
+
+    def __init__(self, slices: Sequence[Caster], first: I64) -> None:
+        """``first`` (slices,): the first ray of each slice."""
+        self._slices = slices
+        self._first = first
+
+    def cast(self, origins: F32, directions: F32) -> tuple[F32, I32, F32]:
+        """As :meth:`Caster.cast`, of all rays of a sweep."""
+        parts = zip(
+            self._slices, np.split(origins, self._first[1:]), np.split(directions, self._first[1:]), strict=True
+        )
+        ranges, objects, cosine = zip(*(caster.cast(o, d) for caster, o, d in parts), strict=True)
+        return np.concatenate(ranges), np.concatenate(objects), np.concatenate(cosine)
+
+    def normals(self, rays: Sweep, met: I64) -> F32:
+        """As :meth:`Caster.normals`."""
+        normals = np.empty((len(met), 3), np.float32)
+        slice_of = np.searchsorted(self._first, met, side="right") - 1
+        for k in np.unique(slice_of):
+            normals[slice_of == k] = self._slices[k].normals(rays, met[slice_of == k])
+        return normals
 
 
 @allocating
@@ -84,7 +109,7 @@ def _first_hits(far: F32, triangle: I32, normals: F32, directions: F32, owners: 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The rays of one revolution in firing order."""
+    """The rays of one scan in firing order."""
 
     origins: F32
     """(rays, 3) map frame."""
@@ -92,31 +117,34 @@ class Sweep:
     """(rays, 3) unit, map frame."""
     directions_lidar: F32
     """(rays, 3) unit, in the sensor's frame at the moment of firing."""
+    time_s: F64
+    """(rays,) when each leaves, from the stamp."""
+    together: int
+    """Rays that leave together: the neighbour of a ray is so many rays on."""
 
 
 def sweep(
     sensor: Sensor, T_map_lidar_at: Callable[[F64], F64], stamp_s: float, phase: float, distortion: bool
 ) -> Sweep:
-    """Rays of the revolution whose middle is ``stamp_s``; ``T_map_lidar_at`` takes (n,) seconds to (n, 4, 4).
+    """Rays of the scan with this stamp; ``T_map_lidar_at`` takes (n,) seconds to (n, 4, 4).
 
-    ``phase`` in [0, 1) turns the firing pattern by a share of the azimuth step, as it drifts from scan to scan.
-    Without ``distortion`` all rays leave from the pose at the stamp.
+    ``phase`` in [0, 1) turns the firing pattern by a share of its step, as it drifts from scan to scan. Without
+    ``distortion`` all rays leave from the pose at the stamp.
     """
-    step = 2.0 * np.pi / sensor.azimuths
-    azimuth = np.pi - (np.arange(sensor.azimuths) + 1.0 - phase) * step
-    elevation = np.radians(np.array(sensor.elevations_deg))
-    local = np.empty((sensor.azimuths, sensor.beams, 3), dtype=np.float32)
-    local[..., 0] = np.outer(np.cos(azimuth), np.cos(elevation))
-    local[..., 1] = np.outer(np.sin(azimuth), np.cos(elevation))
-    local[..., 2] = np.sin(elevation)
-    time_s: F64 = np.zeros(1)
-    if distortion:
-        time_s = np.asarray(-azimuth / (2.0 * np.pi) / sensor.rate_hz, dtype=np.float64)
+    firing = pattern_of(sensor)(sensor, stamp_s, phase)
+    local = firing.directions
+    time_s = firing.time_s if distortion else np.zeros(1)
     T = T_map_lidar_at(stamp_s + time_s)
     rotation = np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2), dtype=np.float32)
     directions = np.matmul(local, rotation)
     origins = np.broadcast_to(T[:, None, :3, 3].astype(np.float32), local.shape)
-    return Sweep(np.ascontiguousarray(origins).reshape(-1, 3), directions.reshape(-1, 3), local.reshape(-1, 3))
+    return Sweep(
+        np.ascontiguousarray(origins).reshape(-1, 3),
+        directions.reshape(-1, 3),
+        local.reshape(-1, 3),
+        np.repeat(firing.time_s, local.shape[1]),
+        local.shape[1],
+    )
 
 
 def measure(

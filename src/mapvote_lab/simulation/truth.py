@@ -31,6 +31,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool
 from mapvote.core.voxels import voxel_downsample
 from mapvote_lab.simulation.lidar import NOTHING, Caster
+from mapvote_lab.simulation.patterns import in_view
 from mapvote_lab.simulation.routes import Route
 from mapvote_lab.simulation.scenario import Scenario
 from mapvote_lab.simulation.shapes import sample
@@ -220,7 +221,8 @@ def _towards(T_map_lidar: F64, circles: F64, sensor: Sensor, rule: TruthRule) ->
     local[..., 0] = np.outer(np.cos(azimuth), np.cos(elevation))
     local[..., 1] = np.outer(np.sin(azimuth), np.cos(elevation))
     local[..., 2] = np.sin(elevation)
-    return (local.reshape(-1, 3) @ T_map_lidar[:3, :3].T).astype(np.float32)
+    rays = local.reshape(-1, 3)
+    return (rays[in_view(sensor, rays)] @ T_map_lidar[:3, :3].T).astype(np.float32)
 
 
 def label_cells(

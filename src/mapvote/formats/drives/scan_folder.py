@@ -349,7 +349,9 @@ class DriveWriter:
     prior_sigma_deg: float = 1.0
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
     motion_compensated: bool = True
-    """False: the times of points follow from their azimuths."""
+    """False: points have times, or these follow from their azimuths."""
+    with_times: bool = False
+    """Whether each scan has a time for every point, a fifth column."""
 
     @property
     def _partial(self) -> Path:
@@ -363,10 +365,13 @@ class DriveWriter:
         (self._partial / "velodyne").mkdir(parents=True)
         return self
 
-    def write_scan(self, index: int, points: F32, intensity: F32 | None = None) -> None:
-        """``points`` (n, 3) in the lidar frame, ``intensity`` (n,) in [0, 1] (0 where None)."""
-        rows = np.zeros((len(points), 4), dtype="<f4")
+    def write_scan(self, index: int, points: F32, intensity: F32 | None = None, time_s: F64 | None = None) -> None:
+        """``points`` (n, 3) in the lidar frame, ``intensity`` (n,) in [0, 1] (0 where None), ``time_s`` (n,) from the
+        stamp, for a drive ``with_times``."""
+        rows = np.zeros((len(points), 5 if self.with_times else 4), dtype="<f4")
         rows[:, :3] = points
+        if self.with_times:
+            rows[:, 4] = time_s
         if intensity is not None:
             rows[:, 3] = intensity
         rows.tofile(self._partial / "velodyne" / f"{index:06d}.bin")
@@ -390,6 +395,8 @@ class DriveWriter:
             "T_base_lidar": self.T_base_lidar[:3].ravel().tolist(),
             "motion_compensated": self.motion_compensated,
         }
+        if self.with_times:
+            about |= {"columns": ",".join((*KITTI, "time")), "time_field": "time", "time_unit": "s"}
         (self._partial / "drive.toml").write_text(tomli_w.dumps(about))
         os.replace(self._partial, self.path)
 
