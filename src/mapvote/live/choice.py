@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, mend_of, one_of_each_cloud, unread_format
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, one_of_each_cloud, republished, unread_format
 from mapvote.live.dds import Network, PublishedTopic, Subscription, TopicRate
 from mapvote.live.messages import CLOUD, CLOUDS, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
 from mapvote.live.names import RosNames
@@ -237,7 +237,7 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
         )
     for name in wish.points:
         form = unread_format(name) if any(one.topic == name and one.kind == COMPRESSED for one in published) else ""
-        text = f"{name} is compressed by {form}: {mend_of(form)}" if form else ""
+        text = f"{name} is compressed by {form}: {republished(form)}" if form else ""
         text = text or _lack_of(name, CLOUDS, published, "--points")
         if text:
             return text
@@ -246,7 +246,7 @@ def lack_of_clouds(published: Sequence[PublishedTopic], wish: Wish, domain: int)
     compressed = [one for one in _of_kinds(published, CLOUDS, (), wish.names) if unread_format(one.topic)]
     if compressed:
         form = unread_format(compressed[0].topic)
-        return f"{compressed[0].topic} is compressed by {form}: {mend_of(form)}"
+        return f"{compressed[0].topic} is compressed by {form}: {republished(form)}"
     unread = [(one, hint) for one in published for part, hint in _UNREAD.items() if part in one.kind]
     if unread:
         one, hint = unread[0]

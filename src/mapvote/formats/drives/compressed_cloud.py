@@ -40,7 +40,7 @@ def decompressed(where: str, message: Any) -> bytes:
     read."""
     form = str(message.format).strip().lower()
     if form not in _READ:
-        raise MapvoteError(f"{where}: its points are compressed by {form or 'nobody knows what'}: {mend_of(form)}")
+        raise MapvoteError(f"{where}: its points are compressed by {form or 'nobody knows what'}: {republished(form)}")
     size = int(message.height) * max(int(message.row_step), int(message.width) * int(message.point_step))
     try:
         data = _READ[form](bytes(message.compressed_data), size)
@@ -54,7 +54,7 @@ def decompressed(where: str, message: Any) -> bytes:
     return data
 
 
-def mend_of(form: str) -> str:
+def republished(form: str) -> str:
     """What to do about clouds in a format that is not read."""
     named = form or "FORMAT"
     return (
