@@ -64,12 +64,14 @@ SENSORS: dict[str, Sensor] = {
     )
 }
 """Models by name: those that scans are recognised as."""
-_OF_THE_LABORATORY = (
-    Sensor("beams128", _even(15.0, -25.0, 128), 0.2),
-    Sensor("rosette70", _even(35.2, -35.2, 156), 0.45, rings=False, blind_sectors_deg=((35.2, 324.8),)),
-    Sensor("mems120", _even(12.5, -12.5, 125), 0.2, rings=False, blind_sectors_deg=((60.0, 300.0),)),
-)
-NAMED = SENSORS | {s.name: s for s in _OF_THE_LABORATORY}
+NAMED = SENSORS | {
+    s.name: s
+    for s in (
+        Sensor("beams128", _even(15.0, -25.0, 128), 0.2),
+        Sensor("rosette70", _even(35.2, -35.2, 156), 0.45, rings=False, blind_sectors_deg=((35.2, 324.8),)),
+        Sensor("mems120", _even(12.5, -12.5, 125), 0.2, rings=False, blind_sectors_deg=((60.0, 300.0),)),
+    )
+}
 """Sensors that a drive or a scenario may name: these, 128 beams over the field of view of several makes, and two that
 look ahead only: a rosette that never repeats itself in a cone of 70 deg, and mirrors that scan 120 x 25 deg. No scan is
 recognised as one of the three. They are no real sensors, and the beams of the first are so dense that the rings of

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, MEMBERS
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, members
 from mapvote.formats.reading import first_line
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -44,7 +44,7 @@ _DATATYPES = {"<f4": 7, "<u2": 4}
 """Types of a sensor_msgs/PointField."""
 _MAP_MSGS = "autoware_map_msgs"
 _LACKING = {
-    COMPRESSED: MEMBERS,
+    COMPRESSED: members(),
     f"{_MAP_MSGS}/msg/AreaInfo": "float32 center_x, float32 center_y, float32 radius",
     f"{_MAP_MSGS}/msg/PointCloudMapCellMetaData": "float32 min_x, float32 min_y, float32 max_x, float32 max_y",
     f"{_MAP_MSGS}/msg/PointCloudMapCellMetaDataWithID": "string cell_id, CELL metadata",

@@ -20,7 +20,7 @@ from mapvote.formats.drives.scan_folder import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
 from mapvote_lab.simulation.flaws import Casts, Hits, Kinds, spoil
 from mapvote_lab.simulation.lidar import Caster, SlicedCaster, Sweep, measure, sweep
-from mapvote_lab.simulation.patterns import pattern_of, turning
+from mapvote_lab.simulation.patterns import MOVING_SLICES, pattern_of, turning
 from mapvote_lab.simulation.processes import Run, mapping
 from mapvote_lab.simulation.routes import Route, make_routes
 from mapvote_lab.simulation.scenario import Scenario, load_scenario
@@ -38,9 +38,6 @@ from mapvote_lab.simulation.world import Role, World, make_world
 
 _SCANS_A_TASK = 40
 """Small enough to keep two processes busy to the end."""
-
-_SLICES = 10
-"""Slices of a scan in which a moving body stands still, for a sensor that does not turn: 10 ms, .3 m at 100 km/h."""
 
 Progress = Callable[[int, int], None]
 """Called with (scans done, scans in all)."""
@@ -153,7 +150,7 @@ def _bodies(stage: Stage, traffic: Traffic, rays: Sweep, stamp_s: float, T_map_l
     if not _is_in_slices(stage):
         turns_hz = sensor.rate_hz if stage.scenario.motion_distortion else None
         return Caster(*traffic.mesh(stamp_s, T_map_lidar, turns_hz, sensor.max_range_m))
-    first = np.linspace(0, len(rays.time_s), _SLICES, endpoint=False).astype(np.int64)
+    first = np.linspace(0, len(rays.time_s), MOVING_SLICES.slices, endpoint=False).astype(np.int64)
     middle_s = [float(part.mean()) for part in np.split(rays.time_s, first[1:])]
     meshes = (traffic.mesh(stamp_s + later_s, T_map_lidar, None, sensor.max_range_m) for later_s in middle_s)
     return SlicedCaster([Caster(*mesh) for mesh in meshes], first)

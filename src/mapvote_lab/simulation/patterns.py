@@ -57,6 +57,16 @@ class RasterScan:
     """Fields side by side, each with a mirror."""
 
 
+@record()
+@dataclass(frozen=True, slots=True)
+class MovingSlices:
+    """How bodies move while a sensor that does not turn takes a scan."""
+
+    slices: int = 10
+    """Slices of a scan in which a body stands still: 10 ms, .3 m at 100 km/h."""
+
+
+MOVING_SLICES = MovingSlices()
 ROSETTE_SCAN = RosetteScan()
 RASTER_SCAN = RasterScan()
 
@@ -114,9 +124,7 @@ def _directions(azimuth: F64, elevation: F64) -> F32:
     return directions
 
 
-_PATTERNS: dict[str, Pattern] = {"rosette70": rosette, "mems120": raster}
-
-
 def pattern_of(sensor: Sensor) -> Pattern:
     """How this sensor scans; one that is not listed turns."""
-    return _PATTERNS.get(sensor.name, turning)
+    others: dict[str, Pattern] = {"rosette70": rosette, "mems120": raster}
+    return others.get(sensor.name, turning)

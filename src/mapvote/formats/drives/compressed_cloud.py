@@ -14,13 +14,13 @@ from mapvote.codec.planes import zstd
 from mapvote.core.types import MapvoteError
 
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
-MEMBERS = (
-    "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, bool is_bigendian, "
-    "uint32 point_step, uint32 row_step, uint8[] compressed_data, bool is_dense, string format"
-)
-"""Members of the message, which rosbags lacks."""
-_HEADER_FOUND = 32 + zlib.MAX_WBITS
-"""zlib's plug-in writes a gzip header; older ones wrote zlib's own."""
+
+
+def members() -> str:
+    """The definition of the message, which rosbags lacks."""
+    cloud = "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, bool is_bigendian, "
+    cloud += "uint32 point_step, uint32 row_step, uint8[] compressed_data, bool is_dense, string format"
+    return cloud.replace(", ", "\n")
 
 
 def _of_zstd(data: bytes, size: int) -> bytes:
@@ -28,7 +28,8 @@ def _of_zstd(data: bytes, size: int) -> bytes:
 
 
 def _of_zlib(data: bytes, size: int) -> bytes:
-    return zlib.decompressobj(_HEADER_FOUND).decompress(data, size + 1)
+    either_header = 32 + zlib.MAX_WBITS  # the plug-in writes gzip's, older ones wrote zlib's own
+    return zlib.decompressobj(either_header).decompress(data, size + 1)
 
 
 _READ: Mapping[str, Callable[[bytes, int], bytes]] = {"zstd": _of_zstd, "zlib": _of_zlib}
