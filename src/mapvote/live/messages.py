@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, members
+from mapvote.formats.drives.compressed_cloud import COMPRESSED
 from mapvote.formats.reading import first_line
+from mapvote.live.message_types import lacking_types
 
 CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -42,29 +43,6 @@ MAP_FRAME = "map"
 LIDAR_FRAME = "lidar"
 _DATATYPES = {"<f4": 7, "<u2": 4}
 """Types of a sensor_msgs/PointField."""
-_MAP_MSGS = "autoware_map_msgs"
-_LACKING = {
-    COMPRESSED: members(),
-    f"{_MAP_MSGS}/msg/AreaInfo": "float32 center_x, float32 center_y, float32 radius",
-    f"{_MAP_MSGS}/msg/PointCloudMapCellMetaData": "float32 min_x, float32 min_y, float32 max_x, float32 max_y",
-    f"{_MAP_MSGS}/msg/PointCloudMapCellMetaDataWithID": "string cell_id, CELL metadata",
-    f"{_MAP_MSGS}/msg/PointCloudMapCellWithID": "string cell_id, sensor_msgs/PointCloud2 pointcloud, CELL metadata",
-    f"{_MAP_MSGS}/msg/PointCloudMapMetaData": "Header header, PointCloudMapCellMetaDataWithID[] metadata_list",
-    f"{_MAP_MSGS}/srv/GetDifferentialPointCloudMap_Request": "NUMBERED, AREA, string[] cached_ids",
-    f"{_MAP_MSGS}/srv/GetDifferentialPointCloudMap_Response": "NUMBERED, Header header, TILES, string[] ids_to_remove",
-    f"{_MAP_MSGS}/srv/GetPartialPointCloudMap_Request": "NUMBERED, AREA",
-    f"{_MAP_MSGS}/srv/GetPartialPointCloudMap_Response": "NUMBERED, Header header, TILES",
-    f"{_MAP_MSGS}/srv/GetSelectedPointCloudMap_Request": "NUMBERED, string[] cell_ids",
-    f"{_MAP_MSGS}/srv/GetSelectedPointCloudMap_Response": "NUMBERED, Header header, TILES",
-    "tier4_external_api_msgs/msg/MapHash": "string lanelet, string pcd",
-}
-"""Message types that rosbags lacks. Requests and responses begin with the client's number and the request's."""
-_SHORT = {
-    "NUMBERED": "uint64 guid, int64 seq",
-    "AREA": f"{_MAP_MSGS}/AreaInfo area",
-    "TILES": f"{_MAP_MSGS}/PointCloudMapCellWithID[] new_pointcloud_with_ids",
-    "CELL": f"{_MAP_MSGS}/PointCloudMapCellMetaData",
-}
 
 
 @cache
@@ -72,10 +50,8 @@ def typestore() -> Any:
     """Every message type, by its full name such as sensor_msgs/msg/PointCloud2."""
     types = require("rosbags.typesys", "ros2", "messages of ROS 2")
     store = types.get_typestore(types.Stores.LATEST)
-    for name, members in _LACKING.items():
-        for short, long in _SHORT.items():
-            members = members.replace(short, long)
-        (found,) = types.get_types_from_msg(members.replace(", ", "\n"), name).values()
+    for name, definition in lacking_types().items():
+        (found,) = types.get_types_from_msg(definition, name).values()
         store.register({name: found})
     return store
 

@@ -15,7 +15,7 @@ from bag_recorder import CLOUD, START, Recorder
 from mapvote.codec.planes import zstd
 from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, members, one_of_each_cloud
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed, one_of_each_cloud
 from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.live.choice import Wish, lack_of_clouds
 from mapvote.live.dds import PublishedTopic
@@ -36,7 +36,7 @@ def compressed(form: str, data: bytes, ns: int = START) -> Any:
 def bag_of(folder: Path, clouds: Mapping[str, tuple[str, bytes]], scans: int) -> Path:
     """Compressed clouds by topic: (format, data) of each."""
     recorder = Recorder(folder)
-    recorder.register({COMPRESSED: members()})
+    recorder.register({COMPRESSED: definition_of_compressed()})
     for ns in START + np.arange(scans) * 10**8:
         for topic, (form, data) in clouds.items():
             recorder.write_raw(topic, COMPRESSED, int(ns), to_cdr(COMPRESSED, compressed(form, data, int(ns))))

@@ -15,7 +15,7 @@ from mapvote.core import geometry
 from mapvote.core.extras import require
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, members
+from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
 from mapvote.formats.drives.frames import Edges, pose_of_message
 from mapvote.formats.drives.point_fields import livox_table, point_cloud_table
 from mapvote.formats.reading import first_line
@@ -41,7 +41,7 @@ class Bag:
         reader = require("rosbags.highlevel", "ros", str(path))
         stores = require("rosbags.typesys", "ros", str(path))
         typestore = stores.get_typestore(stores.Stores.LATEST)
-        typestore.register(stores.get_types_from_msg(members(), COMPRESSED))
+        typestore.register(stores.get_types_from_msg(definition_of_compressed(), COMPRESSED))
         files = bag_files(path)
         try:
             self.reader = reader.AnyReader(files.paths, default_typestore=typestore)

@@ -16,7 +16,7 @@ from mapvote.core.types import MapvoteError
 COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
 
 
-def members() -> str:
+def definition_of_compressed() -> str:
     """The definition of the message, which rosbags lacks."""
     cloud = "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, bool is_bigendian, "
     cloud += "uint32 point_step, uint32 row_step, uint8[] compressed_data, bool is_dense, string format"
