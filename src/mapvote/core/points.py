@@ -86,14 +86,13 @@ class Field:
 
 FIELDS: dict[str, Field] = {"intensity": Field("|u1", scaled=True, spellings=("i",))}
 """The attributes of this package. :func:`point_fields` knows those of other distributions too."""
-GROUP = "mapvote.fields"
 
 
 @cache
 def point_fields() -> Mapping[str, Field]:
     """All attributes by name, those of this package first. MapvoteError if one of another distribution is none."""
     every = dict(FIELDS)
-    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+    for entry in sorted(entry_points(group="mapvote.fields"), key=lambda entry: entry.name):
         try:
             row = entry.load()
         except Exception as error:  # another distribution's module: anything can be wrong with it

@@ -26,8 +26,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 Record = TypeVar("Record", bound=type)
-_DECORATOR = "\n@record("
-_DECORATOR_OF_VOTES = "\n@record(votes=True)"
 _declared: dict[str, tuple[type, bool]] = {}
 
 
@@ -82,7 +80,7 @@ def numbers(
 @cache
 def modules_with_records(packages: tuple[str, ...], *, votes: bool = False) -> list[str]:
     """The modules whose source declares a record: no other is imported to find them."""
-    mark = _DECORATOR_OF_VOTES if votes else _DECORATOR
+    mark = "\n@record(votes=True)" if votes else "\n@record("
     names = []
     for package in packages:
         spec = find_spec(package)

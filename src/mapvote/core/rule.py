@@ -58,13 +58,12 @@ SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True,
 """Height at the cost of a 2D grid: a word of 0.3 m voxels a cell (docs/method.md)."""
 RULES: dict[str, Rule] = {"paper": PAPER, "surfaces": SURFACES}
 """The rules of this package. :func:`rule_names` and :func:`rule_named` know those of other distributions too."""
-RULE_GROUP = "mapvote.rules"
 
 
 @cache
 def plugged_in() -> dict[str, Any]:
     """The entry points of other distributions, by the rule's name."""
-    return {entry.name: entry for entry in entry_points(group=RULE_GROUP)}
+    return {entry.name: entry for entry in entry_points(group="mapvote.rules")}
 
 
 def rule_names() -> list[str]:

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,15 +64,6 @@ class BallotView:
 
 
 BALLOT_VIEW = BallotView()
-_OCCUPANCY = np.full(256, -1, dtype=np.int8)
-"""Value of a state in an OccupancyGrid; -1: no vote."""
-_OCCUPANCY[CellState.UNCHANGED_EMPTY] = 0
-_OCCUPANCY[CellState.CHANGED_EMPTY] = 25
-_OCCUPANCY[CellState.UNDETERMINED] = 50
-_OCCUPANCY[CellState.CHANGED_OCCUPIED] = 75
-_OCCUPANCY[CellState.UNCHANGED_OCCUPIED] = 100
-_TELLING = (-1, 0, 50, 100, 25, 75)
-"""Values in ascending order of what they tell: of a larger cell the last one counts."""
 
 
 class Stamped(NamedTuple):
@@ -169,7 +161,7 @@ def states_grid(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME, vie
     for tile, window in zip(ballot.tiles, windows, strict=True):
         rows, cols = window.slices_in(whole)
         inside = slice(rows.start // wider, rows.stop // wider), slice(cols.start // wider, cols.stop // wider)
-        values[inside] = _coarser(_OCCUPANCY[_states(unpack_planes(tile))], wider)
+        values[inside] = _coarser(_occupancy()[_states(unpack_planes(tile))], wider)
         mapped = point_map.tiles.get(tile.tile)
         if mapped is not None and np.isfinite(mapped.ground_z).any():
             lowest = min(lowest, float(np.nanmin(mapped.ground_z)))
@@ -184,14 +176,27 @@ def states_grid(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME, vie
     return message
 
 
+@cache
+def _occupancy() -> I8:
+    """(256,) the value of each state in an OccupancyGrid; -1: no vote."""
+    values = np.full(256, -1, dtype=np.int8)
+    values[CellState.UNCHANGED_EMPTY] = 0
+    values[CellState.CHANGED_EMPTY] = 25
+    values[CellState.UNDETERMINED] = 50
+    values[CellState.CHANGED_OCCUPIED] = 75
+    values[CellState.UNCHANGED_OCCUPIED] = 100
+    return values
+
+
 def _coarser(values: I8, wider: int) -> I8:
     """(rows / wider, cols / wider) the most telling value of each block."""
     if wider == 1:
         return values
+    ascending = np.array([-1, 0, 50, 100, 25, 75], dtype=np.int8)  # the last one tells most
     ranks = np.zeros(256, dtype=np.uint8)
-    ranks[np.array(_TELLING, dtype=np.int8).view(np.uint8)] = np.arange(len(_TELLING))
+    ranks[ascending.view(np.uint8)] = np.arange(len(ascending))
     blocks = ranks[values.view(np.uint8)].reshape(len(values) // wider, wider, -1, wider).max(axis=(1, 3))
-    return np.array(_TELLING, dtype=np.int8)[blocks]
+    return ascending[blocks]
 
 
 def path_message(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME) -> Any:

@@ -34,8 +34,6 @@ class Waits:
 
 
 WAITS = Waits()
-_LISTED = 12
-"""Topics that a sentence lists at most."""
 _UNREAD = {
     "CustomMsg": "set the Livox driver's xfer_format to 0, so that it sends PointCloud2",
     "Packet": "start the part of the driver that makes PointCloud2 of packets",
@@ -293,8 +291,9 @@ def _lack_of(name: str, kinds: Sequence[str], published: Sequence[PublishedTopic
 
 def _listed(published: Sequence[PublishedTopic]) -> str:
     """The topics that are heard, with their types."""
-    listed = ", ".join(f"{one.topic} [{one.kind}]" for one in published[:_LISTED])
-    more = len(published) - _LISTED
+    most = 12
+    listed = ", ".join(f"{one.topic} [{one.kind}]" for one in published[:most])
+    more = len(published) - most
     return f"{listed} and {more} more" if more > 0 else listed or "nothing"
 
 

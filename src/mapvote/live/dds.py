@@ -39,9 +39,6 @@ class DdsDepths:
 
 
 DDS_DEPTHS = DdsDepths()
-_DEFAULTS = '<Domain id="any"><Internal><SocketReceiveBufferSize max="8MB"/></Internal></Domain>'
-"""Cyclone DDS asks for 1 MB. A cloud of 64 beams has 3 MB, and waits in the socket while the process computes. The
-kernel gives no more than net.core.rmem_max."""
 _ALIVE, _ANY = 16, 0x7F
 """The instance state of a writer that exists; the mask of every sample, view and instance state."""
 
@@ -175,8 +172,11 @@ class Network:
 def _with_defaults(configuration: str) -> Iterator[None]:
     """CYCLONEDDS_URI, which Cyclone DDS reads when a process joins a domain: our defaults, then ROS 2's
     ``configuration``, then the user's. The last one counts."""
+    # Cyclone DDS asks for 1 MB. A cloud of 64 beams has 3 MB, and waits in the socket while the process computes. The
+    # kernel gives no more than net.core.rmem_max.
+    ours = '<Domain id="any"><Internal><SocketReceiveBufferSize max="8MB"/></Internal></Domain>'
     theirs = os.environ.get("CYCLONEDDS_URI")
-    os.environ["CYCLONEDDS_URI"] = ",".join(filter(None, (_DEFAULTS, configuration, theirs)))
+    os.environ["CYCLONEDDS_URI"] = ",".join(filter(None, (ours, configuration, theirs)))
     try:
         yield
     finally:

@@ -58,7 +58,6 @@ class OutboxSizes:
 
 OUTBOX_SIZES = OutboxSizes()
 _LAST = "the name of the last ballot"
-_NUMBERED = re.compile(r"(.+)-(\d{3,})")
 
 
 class Journal:
@@ -185,7 +184,8 @@ class Outbox:
         ballot of drive ``name``: one more than that of its last one, which an earlier process may have begun."""
         found = {file.stem for suffix in ("journal", "ballot") for file in self._state.glob(f"*.{suffix}")}
         last = self._state / ".last"
-        named = [m for m in map(_NUMBERED.fullmatch, [*found, last.read_text() if last.exists() else ""]) if m]
+        stretches = [*found, last.read_text() if last.exists() else ""]
+        named = [match for match in (re.fullmatch(r"(.+)-(\d{3,})", stretch) for stretch in stretches) if match]
         number = max((int(m[2]) for m in named if m[1] == name), default=0) + 1
         self._begin_ballot(stretch_name(name, number))
         for drive in sorted(found):

@@ -31,7 +31,6 @@ class DdsLimits:
 
 
 DDS_LIMITS = DdsLimits()
-_RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +90,9 @@ def _discovery(variables: Mapping[str, str]) -> str:
     if only not in ("", "0", "1"):
         raise MapvoteError(f"ROS_LOCALHOST_ONLY={only}: give 1 (this machine alone) or 0; ROS 2 ignores other values")
     reach = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip() or "SUBNET"
-    if reach not in _RANGES:
-        raise MapvoteError(f"ROS_AUTOMATIC_DISCOVERY_RANGE={reach}: give {', '.join(_RANGES[:-1])} or {_RANGES[-1]}")
+    if reach not in ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"):
+        mend = "give SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT"
+        raise MapvoteError(f"ROS_AUTOMATIC_DISCOVERY_RANGE={reach}: {mend}")
     peers = _peers(variables.get("ROS_STATIC_PEERS", ""))
     if only == "1":  # the older variable wins, and with it there are no static peers
         reach = "LOCALHOST"

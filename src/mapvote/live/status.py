@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,18 @@ from mapvote.live.subscriptions import Subscriptions
 
 log = logging.getLogger("mapvote.live")
 DIAGNOSTICS, POSE = "diagnostic_msgs/msg/DiagnosticArray", POSE_WITH_COVARIANCE
-_OK, _WARN, _ERROR = 0, 1, 2
+
+
+class Level(IntEnum):
+    """Levels of a diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+def _level(error: object, warning: object) -> Level:
+    return Level.ERROR if error else Level.WARN if warning else Level.OK
 
 
 @record()
@@ -97,23 +109,23 @@ class Status:
             + (f"; server away: {self.server_away}" if self.server_away else "")
         )
 
-    def troubles(self) -> list[tuple[int, str, str]]:
-        """(level of diagnostic_msgs, subject, message) of each part of the drive."""
+    def troubles(self) -> list[tuple[Level, str, str]]:
+        """(level, subject, message) of each part of the drive."""
         counts = self.counts
         silent = self.silent_s > STATUS_TIMES.silent_s
         arriving = f"{self.scans_hz:.1f} Hz, {counts.missing} never came"
         localised = f"{_percent(self.localised_share)} localised, sigma {_metres(self.sigma_m)}"
         spooled = f"{self.outbox.spooled} ballots in the spool"
+        too_little = self.localised_share < 0.5 or bool(counts.without_map)
+        silence = f"none for {self.silent_s:.0f} s"
+        waiting = f"{self.waiting_scans} scans wait, {counts.left_out} left out"
+        failed = self.outbox.failed_writes
         return [
-            (
-                _ERROR if silent else _WARN if counts.missing else _OK,
-                "clouds",
-                f"none for {self.silent_s:.0f} s" if silent else arriving,
-            ),
-            (_WARN if self.localised_share < 0.5 or counts.without_map else _OK, "localisation", localised),
-            (_WARN if counts.left_out else _OK, "load", f"{self.waiting_scans} scans wait, {counts.left_out} left out"),
-            (_ERROR if self.outbox.failed_writes else _OK, "disk", f"{self.outbox.failed_writes} failed writes"),
-            (_WARN if self.server_away else _OK, "server", self.server_away or spooled),
+            (_level(silent, counts.missing), "clouds", silence if silent else arriving),
+            (_level(False, too_little), "localisation", localised),
+            (_level(False, counts.left_out), "load", waiting),
+            (_level(failed, False), "disk", f"{failed} failed writes"),
+            (_level(False, self.server_away), "server", self.server_away or spooled),
         ]
 
     def table(self, name: str) -> Any:
@@ -121,7 +133,7 @@ class Status:
         from rich.table import Table
 
         table = Table(title=f"{name}: map version {self.map_version}", show_header=False)
-        colour = {_OK: "green", _WARN: "yellow", _ERROR: "red"}
+        colour = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
         for level, about, message in self.troubles():
             table.add_row(f"[{colour[level]}]{about}", message)
         counts = self.counts

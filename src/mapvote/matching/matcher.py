@@ -84,7 +84,6 @@ class MapAround(Protocol):
 
 MATCHERS = {"ndt": "mapvote.matching.ndt_map:MapWindow", "vgicp": "mapvote.matching.vgicp:VgicpWindow"}
 """``module:function`` of ``point_map -> MapAround`` by the name that ``ndt.matcher`` of the settings gives."""
-MATCHER_GROUP = "mapvote.matchers"
 
 
 def map_around(matcher: str, point_map: PointMap) -> MapAround:
@@ -97,7 +96,7 @@ def _loaded(name: str) -> Any:
     if name in MATCHERS:
         module, _, function = MATCHERS[name].partition(":")
         return getattr(import_module(module), function)
-    plugins = {entry.name: entry for entry in entry_points(group=MATCHER_GROUP)}
+    plugins = {entry.name: entry for entry in entry_points(group="mapvote.matchers")}
     if name not in plugins:
         raise MapvoteError(f"no matcher {name!r}; known are {', '.join([*MATCHERS, *plugins])}")
     return plugins[name].load()

@@ -256,18 +256,15 @@ class PaperVoter:
                 yield tile, TileVotes(tally, plurality(tally), None, new, None)
 
 
-_TRIED = {"n_min": (3, 5, 8), "window_m": (80.0, 60.0, 40.0)}
-"""Numbers that a sweep of the readings tries."""
-
-
 def readings_of(base: PaperSettings, only: str | None = None) -> dict[str, PaperSettings]:
     """By name ("as set", "occluded abstains", "n_min 3", ..): ``base``, and it with one sentence read otherwise.
 
     ``only``: the one setting that is varied; None: each in turn.
     """
+    numbers = {"n_min": (3, 5, 8), "window_m": (80.0, 60.0, 40.0)}
     readings = {"as set": base}
     for setting, field in PaperSettings.model_fields.items():
-        for value in _TRIED.get(setting) or get_args(field.annotation):
+        for value in numbers.get(setting) or get_args(field.annotation):
             if only in (None, setting) and value != getattr(base, setting):
                 readings[f"{setting} {value}"] = base.model_copy(update={setting: value})
     return readings

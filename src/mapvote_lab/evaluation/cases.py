@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
 
@@ -43,18 +43,6 @@ def untold(what: str, done: int, total: int) -> None:
     """A progress that is not reported."""
 
 
-OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
-    "": {},
-    " farthest_return": {"line_of_sight": "farthest"},
-    " column": {"line_of_sight": "column"},
-}
-"""Readings of sight that stand beside the one that is set, by what they add to a case's name."""
-
-
-AS_BEFORE = PaperSettings()
-"""The paper as it has been read from the start."""
-
-
 @dataclass(frozen=True, slots=True)
 class Case:
     """One line of the tables: a vote and how it is fused."""
@@ -62,14 +50,20 @@ class Case:
     name: str
     voting: VotingSettings
     min_votes: int
-    paper: PaperSettings = AS_BEFORE
+    paper: PaperSettings = field(default_factory=PaperSettings)
     """How the paper is read; only method "paper" uses it."""
 
 
 def paper_cases(settings: Settings) -> dict[str, Case]:
     """Cases 1 to 5 as ``[paper]`` reads them, named "1".., and under the other rules of sight, named "1 column".. ."""
     cases = {}
-    for added, differently in OCCLUSIONS.items():
+    # Readings of sight that stand beside the one that is set, by what they add to a case's name.
+    occlusions = {
+        "": {},
+        " farthest_return": {"line_of_sight": "farthest"},
+        " column": {"line_of_sight": "column"},
+    }
+    for added, differently in occlusions.items():
         paper = settings.paper.model_copy(update=differently)
         for number, booleans in CASES.items():
             voting = settings.voting.model_copy(update={"method": "paper", **booleans})
@@ -88,7 +82,6 @@ def rule_cases(settings: Settings) -> dict[str, Case]:
 
 
 DEFAULT_CASES = "1,2,3,4,5,surfaces"
-YARDSTICKS = ("nearest", "evidence")
 
 
 def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
@@ -100,7 +93,7 @@ def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
     every = {**paper_cases(settings), **rule_cases(settings)}
     names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
     for name in names:
-        if name not in every and name not in ("yardsticks", *YARDSTICKS):
+        if name not in every and name not in ("yardsticks", "nearest", "evidence"):
             raise MapvoteError(f"no case {name!r}: choose from all, yardsticks, {', '.join(every)}")
     chosen = [every[name] for name in names if name in every]
     if not chosen:

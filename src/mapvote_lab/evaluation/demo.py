@@ -336,16 +336,14 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
         (f"{100 * run.lost_share:.0f} %", "of the scans abstained"),
         (f"{100 * float(np.median(run.error_m)):.1f} cm", "median distance from the SLAM trajectory"),
     ]
-    text = page(f"Three vehicles voted on {folder.name}", _LEAD, facts, _sections(folder, street, length, pictures))
+    lead = (
+        "A street is mapped from a part of a recording and driven by the rest. Bodies that never stood there are cast "
+        "into the scans of the vehicles, so that the vote has something to find."
+    )
+    text = page(f"Three vehicles voted on {folder.name}", lead, facts, _sections(folder, street, length, pictures))
     write_whole(out / "report.html", text)
     lines = [f"{what}: {figure}" for figure, what in facts]
     return [*lines, f"{out / 'report.html'}: the story with pictures", f"{out / 'map'}: the map"]
-
-
-_LEAD = (
-    "A street is mapped from a part of a recording and driven by the rest. Bodies that never stood there are cast into "
-    "the scans of the vehicles, so that the vote has something to find."
-)
 
 
 def draw_scan(recording: Drive, path: Path) -> Path:

@@ -23,8 +23,6 @@ from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
 from mapvote_lab.evaluation.scores import NEIGHBOURS, PAPER_F1, CaseResult, Reliability, cells_with
 
-WIDTH, HEIGHT = 1400, 800
-
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -36,6 +34,16 @@ class Camera:
     azimuth_deg: float
     elevation_deg: float = 32.0
     fov_deg: float = 42.0
+    """From the left to the right edge."""
+    width: int = 1400
+    """Columns of the image."""
+    height: int = 800
+    """Rows of the image."""
+
+    @property
+    def focal(self) -> float:
+        """Pixels from the centre of the image per metre beside the axis, 1 m away."""
+        return float(0.5 * self.width / np.tan(np.radians(0.5 * self.fov_deg)))
 
     def project(self, points: F64) -> tuple[F64, F64]:
         """(pixels (n, 2) as x right and y down, depth (n,) metres in front of the camera)."""
@@ -46,10 +54,9 @@ class Camera:
         up = np.cross(back, right)
         from_camera = points - (np.asarray(self.target) + self.distance_m * back)
         depth = -(from_camera @ back)
-        focal = 0.5 * WIDTH / np.tan(np.radians(0.5 * self.fov_deg))
-        scale = focal / np.maximum(depth, 0.1)
+        scale = self.focal / np.maximum(depth, 0.1)
         pixels = np.column_stack(
-            [0.5 * WIDTH + (from_camera @ right) * scale, 0.5 * HEIGHT - (from_camera @ up) * scale]
+            [0.5 * self.width + (from_camera @ right) * scale, 0.5 * self.height - (from_camera @ up) * scale]
         )
         return pixels, depth
 
@@ -65,17 +72,16 @@ def shades(height: F64) -> F32:
 
 
 def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8:
-    """(HEIGHT, WIDTH, 4) opaque image of points (n, 3) in their ``colours`` (n, 3), each a square of ``size_m``.
+    """(height, width, 4) opaque image of points (n, 3) in their ``colours`` (n, 3), each a square of ``size_m``.
 
     Bytes with a fourth channel: matplotlib resamples them as float32, an image without one as float64."""
-    image = np.ones((HEIGHT, WIDTH, 3), dtype=np.float32)
-    depth_image = np.full((HEIGHT, WIDTH), np.inf, dtype=np.float32)
+    image = np.ones((camera.height, camera.width, 3), dtype=np.float32)
+    depth_image = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     pixels, depth = camera.project(points)
     order = np.argsort(-depth, kind="stable")
     order = order[depth[order] > 1.0]
     corner: I64 = np.floor(pixels[order]).astype(np.int64)
-    focal = 0.5 * WIDTH / np.tan(np.radians(0.5 * camera.fov_deg))
-    sizes = np.clip(np.ceil(size_m * focal / depth[order]), 2, 9).astype(np.int64)
+    sizes = np.clip(np.ceil(size_m * camera.focal / depth[order]), 2, 9).astype(np.int64)
     # Sizes fall into few groups; far ones first, so that nearer points overwrite.
     for size in np.unique(sizes):
         chosen = order[sizes == size]
@@ -84,7 +90,7 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
             for dy in range(size):
                 x = at[:, 0] + dx
                 y = at[:, 1] + dy
-                inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+                inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
                 xi = x[inside]
                 yi = y[inside]
                 who = chosen[inside]
@@ -95,7 +101,7 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
                 image[yi, xi] = colours[who]
                 depth_image[yi, xi] = depth[who]
     image *= _eye_dome(depth_image)[..., None]
-    opaque = np.full((HEIGHT, WIDTH, 4), 255, dtype=np.uint8)
+    opaque = np.full((camera.height, camera.width, 4), 255, dtype=np.uint8)
     opaque[..., :3] = np.rint(255.0 * image)
     return opaque
 
@@ -129,8 +135,8 @@ def draw(
             pixels, depth = camera.project(path)
             seen = depth > 2.0
             axis.plot(*pixels[seen].T, color=style.VEHICLE_COLOURS[i % 8], lw=2.0, solid_capstyle="round")
-        axis.set_xlim(0, WIDTH)
-        axis.set_ylim(HEIGHT, 0)
+        axis.set_xlim(0, camera.width)
+        axis.set_ylim(camera.height, 0)
         axis.set_title(title, loc="left")
         axis.set_xticks([])
         axis.set_yticks([])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -221,26 +221,16 @@ def precision_near(asked: Sequence[Asked], states: U8, grid: Grid, near_cells: i
     return ratio(np.count_nonzero(right), np.count_nonzero(is_changed(states) & near))
 
 
-RAIN = f"rain, {100 * STREET_RULE.rain_share:g} % of the rays"
+def _rain() -> str:
+    return f"rain, {100 * STREET_RULE.rain_share:g} % of the rays"
 
 
 class ChangedRun(StrEnum):
     """Runs in which something changed."""
 
     BUILT = "built"
-    BUILT_IN_RAIN = f"built in {RAIN}"
+    BUILT_IN_RAIN = f"built in {_rain()}"
     DEMOLISHED = "demolished"
-
-
-CASTS = {(ChangedRun.BUILT, ChangedRun.BUILT_IN_RAIN): built, (ChangedRun.DEMOLISHED,): demolished}
-"""The runs that each yields in turn."""
-PRIORS: Mapping[str, Edit] = {
-    "disturbed by 0.5 m, 2 deg": disturbed(),
-    **{f"late by {s:g} s": late(s) for s in (0.2, 0.5, 1.0, 2.0)},
-    **{f"off by {m:g} m": biased(m) for m in (3.0, 10.0)},
-    "drifting by 5 m": drifting(5.0),
-    "of another street": of_another_street(),
-}
 
 
 @dataclass(frozen=True)
@@ -302,7 +292,8 @@ def bench(
     street = lay_street(recording, settings, reference, block=BENCH_RULE.blocks[0])
     result = Bench(folder.resolve().name, len(recording), ground_of(street))
     jobs = _unchanged(recording, settings, reference, street, cases)
-    total = len(jobs) + sum(map(len, CASTS))
+    casts = {(ChangedRun.BUILT, ChangedRun.BUILT_IN_RAIN): built, (ChangedRun.DEMOLISHED,): demolished}
+    total = len(jobs) + sum(map(len, casts))
     for k, (name, job) in enumerate(jobs.items()):
         tell("real street", k, total)
         try:
@@ -311,7 +302,7 @@ def bench(
             result.skipped[name] = str(error)
     site = survey_site(street)
     tell("real street", len(jobs), total)
-    for names, cast in CASTS.items():
+    for names, cast in casts.items():
         try:
             for name, found in zip(names, cast(street, site, cases, seed, each), strict=True):
                 result.changed[name] = found
@@ -338,12 +329,22 @@ def _unchanged(
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
     jobs["every other beam"] = on(lambda: street, every_other_beam)
     jobs["70 % of the points lost"] = on(lambda: street, with_fewer_points(0.7))
-    jobs[RAIN] = on(lambda: street, in_rain(STREET_RULE.rain_share))
+    jobs[_rain()] = on(lambda: street, in_rain(STREET_RULE.rain_share))
     if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)
-        jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in PRIORS.items()}
+        jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in _wrong_priors().items()}
     jobs["no prior"] = on(lambda: street, without_prior)
     return jobs
+
+
+def _wrong_priors() -> dict[str, Edit]:
+    return {
+        "disturbed by 0.5 m, 2 deg": disturbed(),
+        **{f"late by {s:g} s": late(s) for s in (0.2, 0.5, 1.0, 2.0)},
+        **{f"off by {m:g} m": biased(m) for m in (3.0, 10.0)},
+        "drifting by 5 m": drifting(5.0),
+        "of another street": of_another_street(),
+    }
 
 
 def ground_of(street: Street) -> Ground:

@@ -50,8 +50,6 @@ from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.processes import processes
 from mapvote_lab.simulation.scenario import load_scenario
 
-_DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/scan_folder.py")
-"""Sources that the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives valid."""
 _MAP_FROM = ("core", "codec", "formats", "matching", "perception", "rules", "survey")
 BALLOTS_FROM = (
     *_MAP_FROM, "vehicle.py", "evaluation/scene.py",
@@ -96,7 +94,9 @@ class Scene:
         text = load_scenario(self.scenario, self.overrides).model_dump_json()
         name = f"{Path(self.scenario).stem}-{self.seed}"
         thinning = inspect.getsource(voxel_downsample)
-        return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM), GROUND_MARGIN_M, thinning)}"
+        # Drives and truth depend on few sources: most work on the program leaves gigabytes of drives valid.
+        sources = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/scan_folder.py")
+        return self.cache / f"{name}-{key_of(text, sources_digest(sources), GROUND_MARGIN_M, thinning)}"
 
     @property
     def work(self) -> Path:

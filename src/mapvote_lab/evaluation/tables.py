@@ -139,9 +139,6 @@ def _section(section: ReportSection) -> str:
     return "\n".join(parts)
 
 
-HEADINGS = {"unchanged": "unchanged", "changed_occupied": "changed (occ.)", "changed_empty": "changed (empty)"}
-
-
 def case_name(case: str) -> str:
     """A case's heading: "case 5" for "5", else as it is called."""
     return f"case {case}" if case[:1].isdigit() else case
@@ -162,12 +159,13 @@ def _by_truth(entry: CaseResult) -> dict[str, Scores]:
 def _class_table(title: str, scores: Mapping[str, Scores], of: Callable[[Scores], ByClass]) -> Sheet:
     """A line a case, our figure and the paper's for each class; ``of``: which figures."""
     rows = []
+    headings = ("unchanged", "changed (occ.)", "changed (empty)")
     for case, ours in scores.items():
-        printed = of(PAPER_SCORES[case]) if case in PAPER_SCORES else (None,) * len(HEADINGS)
+        printed = of(PAPER_SCORES[case]) if case in PAPER_SCORES else (None,) * len(headings)
         rows.append(
             [case_name(case), *(_share(value) for pair in zip(of(ours), printed, strict=True) for value in pair)]
         )
-    return Sheet(title, ["", *(h for heading in HEADINGS.values() for h in (heading, PAPER))], rows)
+    return Sheet(title, ["", *(h for heading in headings for h in (heading, PAPER))], rows)
 
 
 def tables(result: EvaluationResult) -> Iterator[Sheet]:

@@ -36,9 +36,6 @@ from mapvote_lab.simulation.truth import (
 )
 from mapvote_lab.simulation.world import Role, World, make_world
 
-_SCANS_A_TASK = 40
-"""Small enough to keep two processes busy to the end."""
-
 Progress = Callable[[int, int], None]
 """Called with (scans done, scans in all)."""
 
@@ -163,10 +160,11 @@ def _processes(stage: Stage) -> int:
 
 def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) -> Recorded:
     """Drive every route."""
+    scans_a_task = 40  # small enough to keep two processes busy to the end
     tasks = [
-        (stage.scenario, stage.seed, folder, drive, first, min(first + _SCANS_A_TASK, route.scans))
+        (stage.scenario, stage.seed, folder, drive, first, min(first + scans_a_task, route.scans))
         for drive, route in enumerate(stage.routes)
-        for first in range(0, route.scans, _SCANS_A_TASK)
+        for first in range(0, route.scans, scans_a_task)
     ]
     scans = sum(route.scans for route in stage.routes)
     totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)

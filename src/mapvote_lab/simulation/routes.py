@@ -12,8 +12,6 @@ from mapvote.core.types import F64, I64
 from mapvote_lab.simulation.scenario import LANES, Scenario
 from mapvote_lab.simulation.world import Terrain
 
-_SECOND_NS = 1_000_000_000
-
 
 @record()
 @dataclass(frozen=True, slots=True)
@@ -84,7 +82,7 @@ class Route:
     @property
     def stamps_ns(self) -> I64:
         """(scans,) stamps."""
-        return self.start_ns + np.round(self.time_s * _SECOND_NS).astype(np.int64)
+        return self.start_ns + np.round(self.time_s * 10**9).astype(np.int64)
 
     def poses(self, time_s: F64) -> F64:
         """T_map_lidar (n, 4, 4) at any times (n,) from the start of the drive."""
@@ -136,7 +134,7 @@ def make_routes(scenario: Scenario, terrain: Terrain, seed: int, plan: DrivePlan
                 name=name,
                 vehicle=vehicle,
                 lane=lane,
-                start_ns=(plan.first_s + after_s) * _SECOND_NS,
+                start_ns=(plan.first_s + after_s) * 10**9,
                 scans=scans,
                 rate_hz=scenario.rate_hz,
                 speed=speed,

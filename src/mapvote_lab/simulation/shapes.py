@@ -13,9 +13,6 @@ import numpy as np
 
 from mapvote.core.types import F64
 
-_BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-_BOX_FACES = np.concatenate([_BOX_QUADS[:, [0, 1, 2]], _BOX_QUADS[:, [0, 2, 3]]])
-
 
 def join(parts: Sequence[F64]) -> F64:
     """All triangles of ``parts`` in one array; (0, 3, 3) if there are none."""
@@ -30,7 +27,8 @@ def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> F64
 def taper(low: tuple[float, float, float, float, float], high: tuple[float, float, float, float, float]) -> F64:
     """A frustum between two rectangles (x0, x1, y0, y1, z), 12 triangles: cabins, roofs, wedges."""
     corners = np.array([[r[i], r[2 + j], r[4]] for i in (0, 1) for j in (0, 1) for r in (low, high)])
-    return corners[_BOX_FACES]
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    return corners[np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])]
 
 
 def cylinder(radius: float, z0: float, z1: float, sides: int = 8, top_radius: float | None = None) -> F64:
