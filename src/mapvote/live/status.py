@@ -32,7 +32,7 @@ log = logging.getLogger("mapvote.live")
 DIAGNOSTICS, POSE = "diagnostic_msgs/msg/DiagnosticArray", POSE_WITH_COVARIANCE
 
 
-class Level(IntEnum):
+class DiagnosticLevel(IntEnum):
     """Levels of a diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
@@ -40,8 +40,8 @@ class Level(IntEnum):
     ERROR = 2
 
 
-def _level(error: object, warning: object) -> Level:
-    return Level.ERROR if error else Level.WARN if warning else Level.OK
+def _level(error: object, warning: object) -> DiagnosticLevel:
+    return DiagnosticLevel.ERROR if error else DiagnosticLevel.WARN if warning else DiagnosticLevel.OK
 
 
 @record()
@@ -109,7 +109,7 @@ class Status:
             + (f"; server away: {self.server_away}" if self.server_away else "")
         )
 
-    def troubles(self) -> list[tuple[Level, str, str]]:
+    def troubles(self) -> list[tuple[DiagnosticLevel, str, str]]:
         """(level, subject, message) of each part of the drive."""
         counts = self.counts
         silent = self.silent_s > STATUS_TIMES.silent_s
@@ -133,7 +133,7 @@ class Status:
         from rich.table import Table
 
         table = Table(title=f"{name}: map version {self.map_version}", show_header=False)
-        colour = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
+        colour = {DiagnosticLevel.OK: "green", DiagnosticLevel.WARN: "yellow", DiagnosticLevel.ERROR: "red"}
         for level, about, message in self.troubles():
             table.add_row(f"[{colour[level]}]{about}", message)
         counts = self.counts
