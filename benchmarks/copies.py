@@ -26,9 +26,9 @@ from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, Bool, CellState
 from mapvote.fusion import copies
 from mapvote.fusion.copies import RULE, free_marks, masks_of, originals, point_marks, smoothed
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
-Votes = Mapping[TileIndex, TileVote]
+Votes = Mapping[TileIndex, Vote]
 RNG = np.random.default_rng(0)
 
 
@@ -38,12 +38,12 @@ def votes_in(folder: Path) -> dict[str, Votes]:
     for i, file in enumerate(sorted(folder.glob("*.ballot"))):
         ballot = decode(file.read_bytes())
         found[file.stem] = {
-            tile.tile: TileVote.of(unpack_planes(tile), file.stem, i, f"{i:064}") for tile in ballot.tiles
+            tile.tile: Vote(file.stem, i, f"{i:064}").with_planes(unpack_planes(tile)) for tile in ballot.tiles
         }
     return found
 
 
-def kept(vote: TileVote, cells: Bool) -> TileVote:
+def kept(vote: Vote, cells: Bool) -> Vote:
     """The vote in some cells (256, 256) only."""
     assert vote.states is not None
     points = vote.new_points
@@ -55,10 +55,10 @@ def kept(vote: TileVote, cells: Bool) -> TileVote:
     return replace(vote, states=states, new_points=points, free=free, fields={}, odds=None)
 
 
-def salted(share: float) -> Callable[[TileVote], TileVote]:
+def salted(share: float) -> Callable[[Vote], Vote]:
     """Cells set to undetermined at random; what lies in them is left out."""
 
-    def copy(vote: TileVote) -> TileVote:
+    def copy(vote: Vote) -> Vote:
         assert vote.states is not None
         hit = RNG.random(vote.states.shape) < share
         return replace(kept(vote, ~hit), states=np.where(hit, np.uint8(CellState.UNDETERMINED), vote.states))
@@ -66,20 +66,20 @@ def salted(share: float) -> Callable[[TileVote], TileVote]:
     return copy
 
 
-def thinned(vote: TileVote) -> TileVote:
+def thinned(vote: Vote) -> Vote:
     """Blocks of ten by ten cells left out, half of them."""
     blocks = RNG.random((TILE_CELLS // 10 + 1,) * 2) < 0.5
     return kept(vote, np.kron(blocks, np.ones((10, 10), dtype=np.bool_))[:TILE_CELLS, :TILE_CELLS].astype(np.bool_))
 
 
-def cut(vote: TileVote) -> TileVote:
+def cut(vote: Vote) -> Vote:
     """The western half of what it determined."""
     assert vote.states is not None
     cols = np.flatnonzero((vote.states < CellState.UNDETERMINED).any(axis=0))
     return kept(vote, np.arange(TILE_CELLS)[None, :] < np.median(cols) + np.zeros((TILE_CELLS, 1)))
 
 
-def shifted(vote: TileVote) -> TileVote:
+def shifted(vote: Vote) -> Vote:
     """Moved by a cell to the north."""
     assert vote.states is not None
     states = np.full_like(vote.states, NO_VOTE)
@@ -94,10 +94,10 @@ def shifted(vote: TileVote) -> TileVote:
     return replace(vote, states=states, new_points=points, free=free, fields={}, odds=None)
 
 
-def merged_with(own: Votes) -> Callable[[TileVote, TileIndex], TileVote]:
+def merged_with(own: Votes) -> Callable[[Vote, TileIndex], Vote]:
     """Every other block of ten by ten cells from a drive of the copier's own."""
 
-    def copy(vote: TileVote, index: TileIndex) -> TileVote:
+    def copy(vote: Vote, index: TileIndex) -> Vote:
         if index not in own:
             return vote
         blocks = RNG.random((TILE_CELLS // 10 + 1,) * 2) < 0.5
@@ -122,7 +122,7 @@ def merged_with(own: Votes) -> Callable[[TileVote, TileIndex], TileVote]:
     return copy
 
 
-def outline(a: TileVote, b: TileVote) -> float | None:
+def outline(a: Vote, b: Vote) -> float | None:
     """The difference of two outlines as a share of what a shift makes; None where it is not compared."""
     assert a.states is not None
     assert b.states is not None
@@ -132,19 +132,19 @@ def outline(a: TileVote, b: TileVote) -> float | None:
     return float(copies._differing(looked[0], looked[1], copies._RIM, CELLS)) / float(moved.min())
 
 
-def in_common(marks: Callable[[TileVote, int], np.ndarray], a: TileVote, b: TileVote) -> float | None:
+def in_common(marks: Callable[[Vote, int], np.ndarray], a: Vote, b: Vote) -> float | None:
     """The share of the smaller one's marks that both have; None where they are not compared."""
     ours, theirs = (marks(vote, RULE.least_shared) for vote in (a, b))
     smaller = min(len(ours), len(theirs))
     return None if smaller == 0 else len(np.intersect1d(ours, theirs)) / smaller
 
 
-def comparable(vote: TileVote) -> bool:
+def comparable(vote: Vote) -> bool:
     """Whether a drive and itself would be found alike."""
     return any(judge(vote, vote) is not None for judge in JUDGES.values())
 
 
-JUDGES: dict[str, Callable[[TileVote, TileVote], float | None]] = {
+JUDGES: dict[str, Callable[[Vote, Vote], float | None]] = {
     "outline": outline,
     "points": lambda a, b: in_common(point_marks, a, b),
     "free": lambda a, b: in_common(free_marks, a, b),

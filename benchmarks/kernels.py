@@ -238,7 +238,7 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
     from mapvote.core.rule import SURFACES
     from mapvote.fusion.change_time import lately_changed
     from mapvote.fusion.fuse import count
-    from mapvote.fusion.tile_vote import TileVote
+    from mapvote.fusion.tile_vote import Vote
     from mapvote.matching.global_search import GlobalSearch
     from mapvote.shapes.packed_cloud import make_levels
 
@@ -251,7 +251,7 @@ def works(folder: Path, laboratory: bool) -> list[Callable[[], object]]:
     def turns() -> None:
         """Five say that a wall stands, three who come later that it is gone."""
         says = [np.full((256, 256), 0 if i < 5 else 3, np.uint8) for i in range(8)]
-        drives = [TileVote(f"v{i}", i, f"{i}", states=states) for i, states in enumerate(says)]
+        drives = [Vote(f"v{i}", i, f"{i}", states=states) for i, states in enumerate(says)]
         lately_changed(says[0], drives, count(drives, SURFACES, 2)[1], 2)
 
     def evaluate() -> None:

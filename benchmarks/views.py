@@ -42,7 +42,7 @@ from mapvote.codec.ballot import Ballot, encode, pack_path
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 TILES_A_ROW = 20
 TILES_A_DRIVE = 5
@@ -327,7 +327,7 @@ def compare_liar(tiles: int) -> str:
     for i in range(tiles):
         lies = np.where(rng.random(empty.shape) < 0.5, np.uint8(CellState.CHANGED_OCCUPIED), empty)
         said = (("a", 0, empty), ("b", 1, empty), ("liar", 2, lies), ("c", 3, empty), ("d", 4, empty))
-        compared += compare((0, i), [TileVote(name, end_ns, "", states=states) for name, end_ns, states in said])
+        compared += compare((0, i), [Vote(name, end_ns, "", states=states) for name, end_ns, states in said])
     compared_s = time.process_time()
     *_, liar = standings_of(compared, Lattice())
     told_s = time.process_time()

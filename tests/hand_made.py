@@ -21,7 +21,7 @@ from mapvote.core.points import Fields
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, PosePrior, Scan
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
@@ -144,11 +144,11 @@ def two_walls() -> PointMap:
     return make_map({(0, 0): make_tile(points), (0, 1): make_tile(points.copy())})
 
 
-def unpack_all(ballot: Ballot) -> list[TileVote]:
+def unpack_all(ballot: Ballot) -> list[Vote]:
     """Every plane unpacked; MapvoteError on the first that is damaged or impossible."""
     if ballot.path is not None:
         check_path(ballot.path, [tile.tile for tile in ballot.tiles])
-    return [TileVote.of(unpack_planes(tile)) for tile in ballot.tiles]
+    return [Vote().with_planes(unpack_planes(tile)) for tile in ballot.tiles]
 
 
 class AtOnce:

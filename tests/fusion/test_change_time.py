@@ -16,7 +16,7 @@ from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import CellState
 from mapvote.fusion.change_time import DAY_S, history_days, remembered, temporary
 from mapvote.fusion.fuse import fuse_tile, unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
+from mapvote.fusion.tile_vote import DAY_NS, Vote, newest_votes
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 CELL, LAWN = (10, 10), (20, 20)
@@ -29,7 +29,7 @@ def decided(
 ) -> int:  # fmt: skip
     """The decision on a cell if vehicles pass one after the other with these votes; ``live``: as a server does."""
     votes = [
-        TileVote(
+        Vote(
             vehicle=f"v{i}" if whose is None else whose[i],
             end_ns=(i if ends_s is None else ends_s[i]) * 10**9,
             digest=f"{i:02}",
@@ -95,9 +95,9 @@ def memory(stays: int = 0, stayed_days: float = 0.0, came_s: int = 0, cell: tupl
     return Memory.of(planes)
 
 
-def drive(day: float, states: dict[tuple[int, int], int], vehicle: str = "v") -> TileVote:
+def drive(day: float, states: dict[tuple[int, int], int], vehicle: str = "v") -> Vote:
     end_ns = (START_S + round(day * DAY_S)) * 10**9
-    return TileVote(vehicle, end_ns, f"{vehicle}{day}", states=states_plane(states))
+    return Vote(vehicle, end_ns, f"{vehicle}{day}", states=states_plane(states))
 
 
 NEW = states_plane({CELL: CO})
@@ -141,14 +141,14 @@ def test_a_thing_never_left_before_it_came() -> None:
 @pytest.mark.parametrize(("end_ns", "came_s"), [(0, 1), (-(10**18), 1), (2**32 * 10**9, 2**32 - 2)])
 def test_a_time_that_32_bits_cannot_hold_is_the_nearest_that_they_can(end_ns: int, came_s: int) -> None:
     """0 would say that nothing was ever put there."""
-    vote = TileVote("a", end_ns, "a", states=states_plane({CELL: CO}))
+    vote = Vote("a", end_ns, "a", states=states_plane({CELL: CO}))
     assert remembered(Memory.none(), BARE, STANDS, [vote], NEW).came_s[CELL] == came_s
     assert remembered(Memory.none(), BARE, STANDS, [vote], NEW, (lambda: [vote], 2)).came_s[CELL] == came_s
     gone = drive(0, {CELL: CE})
     assert remembered(memory(came_s=came_s), STANDS, BARE, [gone], states_plane({CELL: CE})).stays[CELL] == 1
 
 
-def fused(tile: Tile, day: float, state: int, version: int, history: list[TileVote]) -> Tile:
+def fused(tile: Tile, day: float, state: int, version: int, history: list[Vote]) -> Tile:
     points = wall([CELL], [0.75]) if state == CO else None
     votes = [replace(drive(day, {CELL: state}, vehicle), new_points=points) for vehicle in "ab"]
     history += votes
@@ -157,7 +157,7 @@ def fused(tile: Tile, day: float, state: int, version: int, history: list[TileVo
 
 def test_a_skip_that_comes_and_goes_enters_the_map_once_and_then_only_after_a_month() -> None:
     """The first time it comes it may stay for good; after it went, the next one has to show that it does."""
-    history: list[TileVote] = []
+    history: list[Vote] = []
     tile = fused(make_tile(wall([], []), index=(0, 0)), 0, CO, 2, history)
     assert len(tile.points) == 1
     tile = fused(tile, 3, CE, 3, history)
@@ -183,7 +183,7 @@ def entered_after(
     """
     entered: dict[tuple[int, int], int] = {}
     waited, first = dict.fromkeys(histories, 0), dict[tuple[int, int], float]()
-    tile, seen, version = BARE, list[TileVote](), 1
+    tile, seen, version = BARE, list[Vote](), 1
     last = max(things[-1][0] for things in histories.values())
     for day in sorted(day + hour / 24 for day in range(int(last) + 45) for hour in rng.uniform(0, 24, 3)):
         says, new = {}, []

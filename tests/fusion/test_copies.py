@@ -29,17 +29,17 @@ from mapvote.fusion.copies import (
     smoothed,
 )
 from mapvote.fusion.fuse import decide_tile
-from mapvote.fusion.tile_vote import TileVote, silenced
+from mapvote.fusion.tile_vote import Vote, silenced
 
 UO, UE, CO, CE, UN = CellState
 SQUARE = np.ones((3, 3), dtype=np.bool_)
 
 
-def by_name(planes: dict[str, U8]) -> list[TileVote]:
-    return [TileVote(name, i, f"ballot of {name}", states=plane) for i, (name, plane) in enumerate(planes.items())]
+def by_name(planes: dict[str, U8]) -> list[Vote]:
+    return [Vote(name, i, f"ballot of {name}", states=plane) for i, (name, plane) in enumerate(planes.items())]
 
 
-def named(planes: list[U8]) -> list[TileVote]:
+def named(planes: list[U8]) -> list[Vote]:
     return by_name({f"v{i}": plane for i, plane in enumerate(planes)})
 
 
@@ -67,7 +67,7 @@ def moved(states: U8, rows: int, cols: int) -> U8:
     return out
 
 
-def copied(votes: list[TileVote], policy: FuseSettings = POLICY) -> dict[str, str]:
+def copied(votes: list[Vote], policy: FuseSettings = POLICY) -> dict[str, str]:
     """Who is not heard because of whom."""
     return {copy.vehicle: copy.heard_vehicle for copy in originals(votes, policy)[1]}
 
@@ -150,7 +150,7 @@ def test_of_a_copy_however_moved_or_added_to_and_its_original_the_original_is_he
 def test_several_drives_down_one_street_of_one_vehicle_or_with_more_holes_than_ground_are_no_copies() -> None:
     """Within a cell of every cell of such masks there is a hole and none: any two are alike."""
     assert copied(named([drive_along(i) for i in range(6)])) == {}
-    votes = [TileVote("v", i, f"{i}", states=drive_along(1)) for i in range(2)]
+    votes = [Vote("v", i, f"{i}", states=drive_along(1)) for i in range(2)]
     assert copied([*votes, *by_name({"w": drive_along(2)})]) == {}
     speckled = [np.where(np.random.default_rng(i).random(SHAPE) < 0.5, UE, UN).astype(np.uint8) for i in range(3)]
     assert copied(named(speckled)) == {}
@@ -158,7 +158,7 @@ def test_several_drives_down_one_street_of_one_vehicle_or_with_more_holes_than_g
 
 def test_a_vehicle_that_copies_one_drive_is_heard_by_its_other() -> None:
     votes = by_name({"honest": drive_along(1), "w": drive_along(2)})
-    mixed = [TileVote("liar", 7, "copied", states=drive_along(1)), TileVote("liar", 8, "own", states=drive_along(5))]
+    mixed = [Vote("liar", 7, "copied", states=drive_along(1)), Vote("liar", 8, "own", states=drive_along(5))]
     kept, copies = originals([*votes, *mixed], POLICY)
     assert [copy.digest for copy in copies] == ["copied"]
     assert {drive.digest for drive in kept} == {"ballot of honest", "ballot of w", "own"}
@@ -179,7 +179,7 @@ def test_where_one_vehicle_may_change_the_map_and_where_it_is_not_asked_nobody_i
     assert copied(votes) == {"b": "a"}
     assert copied(votes, FuseSettings(min_votes=1)) == {}
     assert copied(votes, FuseSettings(min_difference=0.0)) == {}
-    tallies = [TileVote(name, 0, name, tally=np.zeros((*SHAPE, 5), dtype=np.uint16)) for name in "ab"]
+    tallies = [Vote(name, 0, name, tally=np.zeros((*SHAPE, 5), dtype=np.uint16)) for name in "ab"]
     assert copied(tallies) == {}
 
 
@@ -201,7 +201,7 @@ def salted(states: U8, holes: float, islands: float, seed: int = 1) -> U8:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_salt_hides_no_copy_and_makes_none_of_honest_drives(holes: float, islands: float, seed: int) -> None:
     votes = named([salted(drive_along(i), holes, islands, seed + i) for i in range(4)])
-    copy = TileVote("copy", 9, "copy", states=salted(drive_along(0), holes, islands, seed + 9))
+    copy = Vote("copy", 9, "copy", states=salted(drive_along(0), holes, islands, seed + 9))
     assert copied(votes) == {}
     assert set(copied([*votes, copy]).items()) & {("copy", "v0"), ("v0", "copy")}
 
@@ -228,7 +228,7 @@ def test_drives_that_share_points_are_one_wherever_they_lie_and_those_of_one_wal
     own = surfaces(3)[surfaces(3)[:, 0] > 22.0]
     merged = np.concatenate([half + away, own]).astype(np.float32)
     one, other, copy = (
-        TileVote(name, i, name, states=drive_along(i), new_points=points)
+        Vote(name, i, name, states=drive_along(i), new_points=points)
         for i, (name, points) in enumerate((("one", surfaces(1)), ("other", surfaces(2)), ("copy", merged)))
     )
     assert originals([one, other], POLICY)[1] == []
@@ -239,7 +239,7 @@ def test_drives_that_share_points_are_one_wherever_they_lie_and_those_of_one_wal
 def test_drives_that_share_free_space_are_one_and_those_over_one_road_are_two() -> None:
     thinned = Words(rays(1).cells[200:], rays(1).words[200:])
     one, other, copy = (
-        TileVote(name, i, name, states=drive_along(i), free=free)
+        Vote(name, i, name, states=drive_along(i), free=free)
         for i, (name, free) in enumerate((("one", rays(1)), ("other", rays(2)), ("copy", thinned)))
     )
     assert originals([one, other], POLICY)[1] == []
@@ -248,16 +248,16 @@ def test_drives_that_share_free_space_are_one_and_those_over_one_road_are_two() 
 
 def test_free_space_that_is_the_same_everywhere_marks_no_drive() -> None:
     even = Words(rays(1).cells, np.full(len(rays(1).cells), 0b1111, dtype=np.uint64))
-    assert len(free_marks(TileVote("v", 0, "d", free=even), 2)) == 0
+    assert len(free_marks(Vote("v", 0, "d", free=even), 2)) == 0
     stripes = Words(even.cells, np.where(even.cells % 2, np.uint64(3), np.uint64(5)))
-    assert len(free_marks(TileVote("v", 0, "d", free=stripes), 2)) == 0, "each pattern occurs often"
+    assert len(free_marks(Vote("v", 0, "d", free=stripes), 2)) == 0, "each pattern occurs often"
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.permutations(range(6)), st.integers(0, 2))
 def test_the_order_of_ballots_does_not_decide_which_of_copies_is_heard(order: list[int], by: int) -> None:
     votes = by_name({f"v{i}": drive_along(i) for i in range(4)} | {"x": moved(drive_along(0), by // 2, by % 2)})
-    votes.append(TileVote("y", 9, "ballot of y", states=drive_along(3)))
+    votes.append(Vote("y", 9, "ballot of y", states=drive_along(3)))
     tile = Tile.empty(Lattice().tile((0, 0)))
     one, other = (decide_tile(tile, given, SURFACES, POLICY) for given in (votes, [votes[i] for i in order]))
     assert one.copies == other.copies

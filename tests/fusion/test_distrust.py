@@ -15,7 +15,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.distrust import borne_out, contradicts, denying
 from mapvote.fusion.fuse import count, fuse_tile, hear, unspent
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 UO, UE, CO, CE, UN = CellState
 OPPOSITE = np.array([CE, CO, UE, UO, UN], dtype=np.uint8)
@@ -40,15 +40,15 @@ def news_of(states: U8) -> U8:
     return states
 
 
-def by_name(planes: dict[str, U8]) -> list[TileVote]:
-    return [TileVote(name, i, f"ballot of {name}", states=states) for i, (name, states) in enumerate(planes.items())]
+def by_name(planes: dict[str, U8]) -> list[Vote]:
+    return [Vote(name, i, f"ballot of {name}", states=states) for i, (name, states) in enumerate(planes.items())]
 
 
-def named(planes: list[U8]) -> list[TileVote]:
+def named(planes: list[U8]) -> list[Vote]:
     return by_name({f"v{i}": states for i, states in enumerate(planes)})
 
 
-def not_heard(votes: list[TileVote], **policy: float) -> set[str]:
+def not_heard(votes: list[Vote], **policy: float) -> set[str]:
     heard = hear(votes, SURFACES, FuseSettings(**policy))[0]  # type: ignore[arg-type]
     return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
 
@@ -136,14 +136,14 @@ def test_what_waits_for_the_last_who_looked_still_waits_when_all_else_is_publish
     passed = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, UE))
     saw_it = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, CO))
     offered = wall(car, [0.45, 0.75])
-    votes = [TileVote(f"v{i}", i * 10**9, f"v{i}", states=saw_it, new_points=offered, version=1) for i in (1, 2)]
-    votes.append(TileVote("v3", 3 * 10**9, "v3", states=passed, version=1))
+    votes = [Vote(f"v{i}", i * 10**9, f"v{i}", states=saw_it, new_points=offered, version=1) for i in (1, 2)]
+    votes.append(Vote("v3", 3 * 10**9, "v3", states=passed, version=1))
     policy = FuseSettings(min_votes=2, min_difference=0.0)
     decision, published = fuse_tile(before, votes, SURFACES, policy, 2, lambda: votes)
     assert (decision.deleted, decision.added) == (300, 0)
     left = [unspent(vote, published) for vote in votes]
     assert fuse_tile(published, left, SURFACES, policy, 3, lambda: left)[1] is published
-    again = [*votes, TileVote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
+    again = [*votes, Vote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
     left = [unspent(vote, published) for vote in again]
     assert fuse_tile(published, left, SURFACES, policy, 3, lambda: left)[1] is published, "drives are folded"
 
@@ -161,6 +161,6 @@ def test_only_changes_that_count_no_more_can_have_come_true() -> None:
     tile = make_tile(wall([(10, 10)], [0.5, 1.5]))
     for at, came_true in (((10, 10), CO), ((99, 99), CE)):
         for sent in (UO, UE, CO, CE):
-            spent = TileVote("v", 0, "d", states=states_plane({}), unrestricted=states_plane({at: sent}))
+            spent = Vote("v", 0, "d", states=states_plane({}), unrestricted=states_plane({at: sent}))
             counts = replace(spent, states=states_plane({at: sent}))
             assert borne_out([spent, counts], tile).tolist() == [sent == came_true, 0]

@@ -19,7 +19,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, CellState
 from mapvote.fusion.edit import add_points, delete_points, words_gone
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 GRID = Lattice().tile((0, 0))
 SEEDS = st.integers(0, 2**32 - 1)
@@ -105,14 +105,14 @@ APART = [0.45, 1.05, 1.65]
 """Heights of voxels 1, 3 and 5, none of which touches another."""
 
 
-def says(masks: Sequence[int], states: Sequence[int], cell: Cell = CELL) -> list[TileVote]:
+def says(masks: Sequence[int], states: Sequence[int], cell: Cell = CELL) -> list[Vote]:
     return [
-        TileVote(f"v{i}", 0, f"d{i}", states=states_plane({cell: state}), gone=Words.of(words_plane({cell: mask})))
+        Vote(f"v{i}", 0, f"d{i}", states=states_plane({cell: state}), gone=Words.of(words_plane({cell: mask})))
         for i, (mask, state) in enumerate(zip(masks, states, strict=True))
     ]
 
 
-def gone(tile: Tile, votes: list[TileVote], decided: int = UO, cell: Cell = CELL) -> int:
+def gone(tile: Tile, votes: list[Vote], decided: int = UO, cell: Cell = CELL) -> int:
     """The voxels of a cell that go, of those that the tile has points in."""
     words, _ = words_gone(votes, states_plane({cell: decided}), 2, tile)
     return 0 if words is None else int(words[cell] & tile.obstacle_words[cell])
@@ -162,7 +162,7 @@ def test_a_voxel_that_stays_protects_what_touches_it_in_the_next_cell(
     tile = make_tile(np.concatenate([wall([CELL], APART), wall([beside], [0.75])]))
     masks, states = {CELL: 0b1010, beside: gone_there}, {CELL: UO, beside: other}
     votes = [
-        TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(masks if i else {})))
+        Vote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(masks if i else {})))
         for i in range(3)
     ]
     words, _ = words_gone(votes, states_plane(states), 2, tile)
@@ -176,7 +176,7 @@ def test_without_ground_any_mark_empties_the_column_so_that_nothing_of_it_protec
     states = {CELL: UO, beside: CE}
     marks = {CELL: 0b1010, beside: 0b1000}
     votes = [
-        TileVote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(marks if i else {})))
+        Vote(f"v{i}", 0, f"d{i}", states=states_plane(states), gone=Words.of(words_plane(marks if i else {})))
         for i in range(3)
     ]
     words, _ = words_gone(votes, states_plane(states), 2, bare)
@@ -195,7 +195,7 @@ def test_who_has_the_whole_cell_empty_counts_among_two_thirds_but_not_among_half
         tile = make_tile(wall([CELL], heights))
         assert gone(tile, says([mask, mask, 0b111110], [UO, UO, CE])) == mask, "all three say so"
         assert gone(tile, says([mask, 0b111110, 0], [UO, CE, UO])) == 0, "two of three, of whom one saw nothing stand"
-        whole = TileVote("w", 0, "w", states=states_plane({CELL: CE}))
+        whole = Vote("w", 0, "w", states=states_plane({CELL: CE}))
         assert gone(tile, [*says([mask, mask], [UO, UO]), whole]) == mask, "no mask is all of an emptied cell"
 
 
@@ -204,7 +204,7 @@ def test_in_one_stage_a_mask_of_a_cell_that_may_be_empty_says_nothing_of_one_tha
     for i, counts in enumerate(([3, 0, 0, 1, 0], [3, 0, 0, 0, 0], [3, 0, 0, 0, 0])):
         tally = np.zeros((*SHAPE, 5), np.uint16)
         tally[CELL] = counts
-        votes.append(TileVote(f"v{i}", 0, "d", tally=tally, gone=Words.of(words_plane({CELL: 0b1010}))))
+        votes.append(Vote(f"v{i}", 0, "d", tally=tally, gone=Words.of(words_plane({CELL: 0b1010}))))
     assert gone(tile, votes) == 0b1010
     votes[1].tally[CELL] = [3, 0, 0, 1, 0]  # type: ignore[index]
     assert gone(tile, votes) == 0

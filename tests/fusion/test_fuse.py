@@ -25,7 +25,7 @@ from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.formats import read_map, write_map
 from mapvote.fusion.fuse import count, differing, fuse_tile, states_over, unspent, update_map
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 LATTICE = Lattice()
 GRID = LATTICE.tile((0, 0))
@@ -34,15 +34,15 @@ KEEP, SURE = FuseSettings(min_votes=1), FuseSettings(min_votes=2)
 EMPTY, OCCUPIED = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 
 
-def vote(vehicle: str, states: U8, **more: object) -> TileVote:
-    return TileVote(vehicle, 0, vehicle, states=states, **more)  # type: ignore[arg-type]
+def vote(vehicle: str, states: U8, **more: object) -> Vote:
+    return Vote(vehicle, 0, vehicle, states=states, **more)  # type: ignore[arg-type]
 
 
 def marks(word: int) -> Words:
     return Words.of(words_plane({CELL: word}))
 
 
-def fuse(tile: Tile, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = SURFACES) -> tuple[U8, Tile]:
+def fuse(tile: Tile, votes: list[Vote], policy: FuseSettings = KEEP, rule: Rule = SURFACES) -> tuple[U8, Tile]:
     decision, edited = fuse_tile(tile, votes, rule, policy)
     return decision.states, edited
 
@@ -155,7 +155,7 @@ def test_one_stage_decides_the_sum_and_asks_for_vehicles_that_back_it(
     rng = np.random.default_rng(seed)
     tallies = np.zeros((voters, *SHAPE, 5), np.uint16)
     tallies[:, 0] = rng.integers(0, 4, (voters, 256, 5)) * rng.integers(0, 2, (voters, 256, 5))
-    states, total = count([TileVote(str(i), 0, "", tally=t) for i, t in enumerate(tallies)], rule, min_votes)
+    states, total = count([Vote(str(i), 0, "", tally=t) for i, t in enumerate(tallies)], rule, min_votes)
     for column in range(256):
         each = [[state for state in range(5) for _ in range(t[0, column, state])] for t in tallies]
         expected = plain_rule([state for mine in each for state in mine], rule, 1)
@@ -171,10 +171,10 @@ def test_one_loud_liar_takes_no_wall_down_because_others_once_looked_through_it(
     liar, honest = np.zeros((*SHAPE, 5), np.uint16), np.zeros((*SHAPE, 5), np.uint16)
     liar[CELL] = [0, 0, 0, 4000 * VOTE_UNIT, 0]
     honest[CELL] = [30 * VOTE_UNIT, 0, 0, VOTE_UNIT, 0]
-    votes = [TileVote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([liar, honest, honest, honest])]
+    votes = [Vote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([liar, honest, honest, honest])]
     tile = make_tile(wall([CELL], [0.45]))
     assert fuse(tile, votes, SURE, PAPER)[1] is tile
-    second = TileVote("w", 0, "w", tally=liar)
+    second = Vote("w", 0, "w", tally=liar)
     assert fuse(tile, [*votes, second], SURE, PAPER)[0][CELL] == EMPTY
 
 
@@ -202,12 +202,12 @@ def changed(**versions: int) -> Tile:
     return replace(TILE, memory=Memory.of(planes))
 
 
-def seen_in(version: int) -> TileVote:
+def seen_in(version: int) -> Vote:
     free = Words.of(words_plane({CELL: 0b100, OTHER: 0b1}))
     return vote("v", states_plane({CELL: EMPTY, OTHER: EMPTY}), free=free, version=version)
 
 
-def spoken(cast: TileVote) -> list[list[int]]:
+def spoken(cast: Vote) -> list[list[int]]:
     assert cast.states is not None
     return np.argwhere(cast.states != NO_VOTE).tolist()
 

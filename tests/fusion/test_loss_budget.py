@@ -29,7 +29,7 @@ from mapvote.fusion.loss_budget import (
     unpack_agreed,
     waypoints,
 )
-from mapvote.fusion.tile_vote import TileVote, fold, silenced
+from mapvote.fusion.tile_vote import Vote, fold, silenced
 
 CELL, FLAT = (10, 10), 10 * 256 + 10
 EMPTY, STANDS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
@@ -37,9 +37,9 @@ GRID = Lattice().tile((0, 0))
 DECIDED = states_plane({CELL: EMPTY})
 
 
-def vote(vehicle: str, steps: int | None, state: int = EMPTY) -> TileVote:
+def vote(vehicle: str, steps: int | None, state: int = EMPTY) -> Vote:
     odds = None if steps is None or state != EMPTY else Odds(np.array([FLAT]), np.array([steps], np.int8))
-    return TileVote(vehicle, 0, vehicle, states=states_plane({CELL: state}), odds=odds)
+    return Vote(vehicle, 0, vehicle, states=states_plane({CELL: state}), odds=odds)
 
 
 def taken(says: list[int | None], quorum: int, against: int = 0) -> int:
@@ -82,7 +82,7 @@ def test_liars_fewer_than_the_quorum_never_talk_it_above_what_an_honest_vehicle_
 
 def test_a_later_drive_says_how_sure_its_vehicle_is_and_a_silent_one_overrides_nothing() -> None:
     early, late = vote("a", 5), replace(vote("a", 50), end_ns=1, digest="late")
-    silent = TileVote("a", 2, "silent", states=states_plane({}, fill=NO_VOTE))
+    silent = Vote("a", 2, "silent", states=states_plane({}, fill=NO_VOTE))
     folded = fold([late, silent, early], GRID)
     assert folded.odds is not None
     assert folded.odds.at(np.array([FLAT])).tolist() == [50]

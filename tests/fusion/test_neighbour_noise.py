@@ -15,7 +15,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 WINDOW = Lattice().tile((0, 0))
@@ -53,8 +53,8 @@ def states_of(points: F32, state: CellState) -> U8:
     return states.reshape(TILE_CELLS, TILE_CELLS)
 
 
-def vote_for(points: F32, name: str = "a") -> TileVote:
-    return TileVote(vehicle=name, end_ns=0, digest=name, states=states_of(points, CO), new_points=points)
+def vote_for(points: F32, name: str = "a") -> Vote:
+    return Vote(vehicle=name, end_ns=0, digest=name, states=states_of(points, CO), new_points=points)
 
 
 def all_but_the_ends(found: set[int], cells: set[int]) -> bool:
@@ -178,11 +178,11 @@ def test_what_spilled_is_told_as_empty_and_goes_with_its_wall_as_was_voted() -> 
     tile, states = tile_of(points), states_of(points, CE)
     changed = np.flatnonzero(states == CE)
     votes = [
-        TileVote(name, 0, name, states=states, odds=Odds(changed, np.full(len(changed), 12, np.int8))) for name in "ab"
+        Vote(name, 0, name, states=states, odds=Odds(changed, np.full(len(changed), 12, np.int8))) for name in "ab"
     ]
     decision, edited = fuse_tile(tile, votes, SURFACES, FuseSettings())
     told = {int(cell) for cell in changed if decision.states.reshape(-1)[cell] == CellState.UNCHANGED_EMPTY}
     assert all_but_the_ends(told, cells_of(beyond))
     assert len(edited.points) == 0
-    unsaid = [TileVote(vote.vehicle, 0, vote.digest, states=states) for vote in votes]
+    unsaid = [Vote(vote.vehicle, 0, vote.digest, states=states) for vote in votes]
     assert (fuse_tile(tile, unsaid, SURFACES, FuseSettings())[0].states == states).all(), "of surfaces' ballots alone"

@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.rule import SURFACES
 from mapvote.fusion.change_time import history_days
 from mapvote.fusion.fuse import fuse_tile, unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
+from mapvote.fusion.tile_vote import DAY_NS, Vote, newest_votes
 from plain_rules import DAY_S, Cast, Cell, CellMap, Version, fuse
 
 WALL: list[Cell] = [(r, c) for r in (10, 11, 12) for c in (10, 11)]
@@ -25,10 +25,10 @@ HEIGHTS = (0.05, 0.45, 0.75, 1.05, 1.65)
 START_S = 1_700_000_000
 
 
-def as_vote(cast: Cast, masks: bool) -> TileVote:
+def as_vote(cast: Cast, masks: bool) -> Vote:
     points = [wall([cell], list(spoken.heights)) for cell, spoken in cast.says.items()]
     gone, free = (words_plane({c: getattr(s, name) or 0 for c, s in cast.says.items()}) for name in ("gone", "free"))
-    return TileVote(
+    return Vote(
         cast.vehicle,
         cast.end_s * 10**9,
         cast.drive,
@@ -53,7 +53,7 @@ def test_every_cell_of_every_version_is_as_the_rules_have_it(seed: int) -> None:
     first = {cell: CellMap(HEIGHTS) for cell in WALL} | {cell: CellMap() for cell in LAWN}
     versions = {1: Version("import", first, False, 0, 0.0, settings)}
     there, now_s = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False), START_S
-    casts, votes = list[Cast](), list[TileVote]()
+    casts, votes = list[Cast](), list[Vote]()
     for _ in range(9):
         for cell in rng.sample(WALL + LAWN, 2):
             there[cell] = not there[cell]

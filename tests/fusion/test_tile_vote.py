@@ -12,7 +12,7 @@ from mapvote.codec.planes import Words, nothing_reached
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, offered, silenced
+from mapvote.fusion.tile_vote import DAY_NS, Vote, fold, newest_votes, offered, silenced
 
 UO, UE, CO, CE, UN = CellState
 WINDOW = Lattice().tile((0, 0))
@@ -20,15 +20,15 @@ HERE, THERE = (3, 4), (200, 17)
 FLAT = np.array([3 * TILE_CELLS + 4, 200 * TILE_CELLS + 17])
 
 
-def drive(vehicle: str, end_ns: int, cells: dict[tuple[int, int], int], **more: object) -> TileVote:
-    return TileVote(vehicle, end_ns, f"{vehicle}{end_ns}", states=states_plane(cells), **more)  # type: ignore[arg-type]
+def drive(vehicle: str, end_ns: int, cells: dict[tuple[int, int], int], **more: object) -> Vote:
+    return Vote(vehicle, end_ns, f"{vehicle}{end_ns}", states=states_plane(cells), **more)  # type: ignore[arg-type]
 
 
-def counted(cells: dict[tuple[int, int], list[int]]) -> TileVote:
+def counted(cells: dict[tuple[int, int], list[int]]) -> Vote:
     tally = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.uint16)
     for cell, votes in cells.items():
         tally[cell] = votes
-    return TileVote("v", 0, "d", tally=tally)
+    return Vote("v", 0, "d", tally=tally)
 
 
 def test_a_drive_as_old_as_the_window_still_speaks_and_one_a_moment_older_does_not() -> None:
@@ -49,7 +49,7 @@ def test_of_too_many_vehicles_those_that_passed_last_speak_with_all_their_drives
 @pytest.mark.parametrize(
     "vote", [counted({HERE: [0, 0, 3, 1, 0], THERE: [0, 0, 2, 5, 0]}), drive("v", 0, {HERE: CO, THERE: CO})]
 )
-def test_a_vote_agrees_where_it_backs_what_was_decided_and_not_where_something_else_was(vote: TileVote) -> None:
+def test_a_vote_agrees_where_it_backs_what_was_decided_and_not_where_something_else_was(vote: Vote) -> None:
     decided = states_plane({HERE: CO, THERE: CE})
     assert vote.agreed(FLAT, decided, CO).tolist() == [0]
     assert vote.agreed(FLAT[::-1].copy(), decided, CO).tolist() == [1]
@@ -99,10 +99,10 @@ def test_what_is_marked_voter_by_voter_is_what_each_deletes_and_passed() -> None
     decided = rng.choice([UO, CE], shape).astype(np.uint8)
     states = rng.choice([UO, CE, UN, NO_VOTE], shape).astype(np.uint8)
     words = Words.of(np.where(rng.random(shape) < 0.1, rng.integers(1, 2**63, shape), 0).astype(np.uint64))
-    two_stage = TileVote("v", 1, "v", states=states, gone=words, free=words)
+    two_stage = Vote("v", 1, "v", states=states, gone=words, free=words)
     tally = np.zeros((*shape, 5), dtype=np.uint16)
     tally[states < UN, states[states < UN]] = 3
-    for vote in (two_stage, replace(two_stage, gone=None), TileVote("v", 1, "v", tally=tally, gone=words, free=words)):
+    for vote in (two_stage, replace(two_stage, gone=None), Vote("v", 1, "v", tally=tally, gone=words, free=words)):
         among = Words.whole(decided == CE)
         marked, passed = nothing_reached(1, len(among.cells)), nothing_reached(1)
         vote.mark_deleted(among, marked)
@@ -121,7 +121,7 @@ def test_folded_drives_say_cell_by_cell_what_the_last_that_spoke_there_says(seed
         states = rng.choice([UO, UE, CE, UN, NO_VOTE], shape).astype(np.uint8)
         gone, free = (np.where(rng.random(shape) < 0.5, rng.integers(1, 2**63, shape), 0) for _ in range(2))
         words = None if i == seed else Words.of(gone.astype(np.uint64))
-        vote = TileVote("v", i, str(i), states=states, gone=words, free=Words.of(free.astype(np.uint64)))
+        vote = Vote("v", i, str(i), states=states, gone=words, free=Words.of(free.astype(np.uint64)))
         drives.append(silenced(vote, np.flatnonzero(rng.random(shape) > 0.7)) if i != 1 else vote)
     folded = fold([drives[i] for i in rng.permutation(3)], Lattice().tile((0, 0)))
     planes = [at_least([Words.none() if w is None else w], 1) for d in (*drives, folded) for w in (d.gone, d.free)]

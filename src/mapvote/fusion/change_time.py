@@ -32,13 +32,13 @@ from mapvote.core.kernel import kernel
 from mapvote.core.tile import Memory, Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 DAY_S = 86_400
 _UO, _UE, _CO, _CE, _UN = map(int, CellState)
 
 
-def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: int) -> U8:
+def lately_changed(states: U8, drives: Sequence[Vote], tally: NDArray[Any], quorum: int) -> U8:
     """``states`` (256, 256) with the change in cells decided unchanged, or undecided, where more than ``quorum``
     vehicles, the last ones, vote for it, and all before them for no change.
 
@@ -58,7 +58,7 @@ def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], 
     return out
 
 
-def said_in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
+def said_in_order(drives: Sequence[Vote], cells: I64) -> tuple[U8, I64, I64]:
     """The votes of drives on flat ``cells`` (n,), in the order of their ends: (states (m, n), ends (m,) ns, vehicles
     (m,) as numbers)."""
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
@@ -117,7 +117,7 @@ def history_days(settings: FuseSettings) -> float:
     return max(2.0 * settings.stay_days, settings.max_age_days)
 
 
-def seen_since(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, I64]:
+def seen_since(drives: Sequence[Vote], cells: I64, breaks: int) -> tuple[I64, I64]:
     """(n,) the first and (n,) the last sighting, seconds, of the object seen in flat ``cells`` (n,) without a break; -1
     where there is none.
 
@@ -136,7 +136,7 @@ def seen_since(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64
     return since, last
 
 
-def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings) -> Bool:
+def temporary(states: U8, tile: Tile, drives: Sequence[Vote], settings: FuseSettings) -> Bool:
     """(256, 256) cells decided changed-occupied by temporary objects.
 
     ``drives``: every vote that counts on the tile and is no more than :func:`history_days` older than the newest. An
@@ -151,7 +151,7 @@ def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: Fuse
     return cells
 
 
-def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -> Bool:
+def denied_last(states: U8, memory: Memory | None, drives: Sequence[Vote]) -> Bool:
     """(256, 256) cells with a decided new object, or the decided end of what vehicles added, with which the last of
     ``drives`` that determined them disagrees."""
     out = np.asarray(states == _CO)
@@ -172,9 +172,9 @@ def remembered(
     memory: Memory,
     before: Tile,
     after: Tile,
-    votes: Sequence[TileVote],
+    votes: Sequence[Vote],
     states: U8,
-    past: tuple[Callable[[], Sequence[TileVote]], int] | None = None,
+    past: tuple[Callable[[], Sequence[Vote]], int] | None = None,
 ) -> Memory:
     """``memory`` with the objects that appeared and disappeared between two versions of a tile, by the votes that
     decided.
@@ -213,7 +213,7 @@ def emptied_and_filled(before: U64, after: U64) -> tuple[I64, I64]:
     return changed[emptied], changed[filled]
 
 
-def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.uint32]:
+def _first_s(votes: Sequence[Vote], cells: I64, state: int) -> NDArray[np.uint32]:
     """(n,) time of the first of ``votes`` for ``state`` on flat ``cells`` (n,), seconds; 0 without one."""
     first = np.full(len(cells), np.iinfo(np.uint32).max, dtype=np.uint32)
     for vote in votes:

@@ -37,7 +37,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import I64, U8, U64, Bool, CellState, read_only
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +80,8 @@ class Copy:
 
 
 def originals(
-    drives: Sequence[TileVote], settings: FuseSettings, rule: CopyRule = RULE
-) -> tuple[Sequence[TileVote], list[Copy]]:
+    drives: Sequence[Vote], settings: FuseSettings, rule: CopyRule = RULE
+) -> tuple[Sequence[Vote], list[Copy]]:
     """(the ``drives`` of a tile without copies, the copies); their order never matters.
 
     Nothing is judged where one vehicle may change the map, nor drives that send tallies, nor with ``min_difference`` 0.
@@ -100,13 +100,13 @@ def originals(
     return without(copies, drives), copies
 
 
-def without(copies: Sequence[Copy], drives: Sequence[TileVote]) -> Sequence[TileVote]:
+def without(copies: Sequence[Copy], drives: Sequence[Vote]) -> Sequence[Vote]:
     """The ``drives`` that are none of these copies."""
     silent = {(copy.vehicle, copy.digest) for copy in copies}
     return [drive for drive in drives if (drive.vehicle, drive.digest) not in silent]
 
 
-def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
+def liars_among(copies: Sequence[Copy], heard: Sequence[Vote]) -> int:
     """How many vehicles excluded by ``copies`` on a tile lie for sure: all but one of those that are alike. ``heard``:
     the remaining drives."""
     silent = {copy.vehicle for copy in copies} - {drive.vehicle for drive in heard}
@@ -114,7 +114,7 @@ def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
     return max(0, len(silent) - len(groups))
 
 
-def _alike(drives: Sequence[TileVote], least: float, rule: CopyRule) -> Bool:
+def _alike(drives: Sequence[Vote], least: float, rule: CopyRule) -> Bool:
     """(n, n) which pairs of drives, of two vehicles each, are one recorded drive; the lower half."""
     number = {name: i for i, name in enumerate(sorted({drive.vehicle for drive in drives}))}
     whose = np.array([number[drive.vehicle] for drive in drives])
@@ -144,7 +144,7 @@ def _groups(alike: Bool) -> I64:
 _NO_MARKS = read_only(np.empty(0, dtype=np.uint64))
 
 
-def point_marks(drive: TileVote, least: int) -> U64:
+def point_marks(drive: Vote, least: int) -> U64:
     """(n,) ascending: the heights of two new points of a column, the one next above the other, and their places in
     their voxels, in the steps of a ballot; none of fewer than ``least``."""
     if drive.new_points is None or len(drive.new_points) < least:
@@ -159,7 +159,7 @@ def point_marks(drive: TileVote, least: int) -> U64:
     return _enough(np.unique(lower << np.uint64(32) | (upper & np.uint64(0xFFFFFFFF))), least)
 
 
-def free_marks(drive: TileVote, least: int) -> U64:
+def free_marks(drive: Vote, least: int) -> U64:
     """(n,) ascending: patterns of three neighbouring free words that occur once in the drive; none of fewer than
     ``least``."""
     if drive.free is None or len(drive.free.cells) < least:
@@ -267,7 +267,7 @@ def _dilate(mask: U64, out: U64) -> None:
             out[r, w] = some
 
 
-def _agreement(drive: TileVote, others: Sequence[TileVote], every: int) -> int:
+def _agreement(drive: Vote, others: Sequence[Vote], every: int) -> int:
     """How many more of the others' votes a drive agrees with than it opposes, in one of ``every`` so many cells."""
     assert drive.sent is not None
     own = drive.sent.reshape(-1)[::every]

@@ -5,10 +5,10 @@ A publish writes one record a tile that it decided. So "who says so" is read, no
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,72 +22,41 @@ from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.gravity import Fallen
 from mapvote.fusion.loss_budget import unpack_agreed
+from mapvote.fusion.tile_vote import Vote, Why
 
 _BYTE_MAX = 255
 _MAX_STANDINGS_BYTES = 64 << 20
 
-Why = Literal["", "young", "window", "otherwise", "damaged", "copy", "opposes", "spent", "reviewed"]
-"""Why a ballot did not count on a tile, or on one of its cells; "" if it did. See :data:`REASONS`."""
-REASONS: Mapping[Why, str] = {
-    "young": "younger than the minimum age",
-    "window": "too old, or not of the vehicles that passed last",
-    "otherwise": "cast by another method or other settings than the policy asks for",
-    "damaged": "damaged, and set aside",
-    "copy": "a copy: its cells on this tile equal those of another vehicle's ballot, which counts for both",
-    "opposes": "opposes the others over most of this tile, or denies nearly all that changed on it",
-    "spent": "spent: a version had changed the cell since its vehicle drove",
-    "reviewed": "of a change that a reviewer held or rejected",
-}
+_Standing = tuple[int, Why, bytes, bytes, int]
+"""Ballot, why it did not count, its spent and its reviewed cells (flat, ascending, uint16 little-endian), the ballot
+that it is a copy of; see :class:`mapvote.fusion.tile_vote.Vote`."""
+_STANDINGS = msgspec.msgpack.Decoder(list[_Standing])  # made when the module is loaded: see codec/ballot.py
 
 
-class Standing(msgspec.Struct, frozen=True, array_like=True):
-    """The standing of one ballot on one tile in one version: counted, or why not."""
-
-    ballot: int
-    """Its ``seq``."""
-    why: Why = ""
-    """Why it did not count on the tile at all; "" if it did."""
-    spent: bytes = b""
-    """Cells of which it spoke, and which had changed since its vehicle drove: flat, ascending, uint16 little-endian."""
-    reviewed: bytes = b""
-    """Likewise, cells of a change that a reviewer held or rejected."""
-    alike: int = 0
-    """For a copy: the ballot that counted for both."""
-
-    def why_not(self, cell: int) -> Why:
-        """Why it did not count on a flat ``cell``; "" if it did, provided that the ballot speaks of the cell."""
-        if self.why:
-            return self.why
-        if cell in cells_in(self.spent):
-            return "spent"
-        return "reviewed" if cell in cells_in(self.reviewed) else ""
+def pack_standings(votes: Iterable[Vote]) -> bytes:
+    """All votes on a tile as one blob: their ballots, and why they did not count. Planes and names are left out."""
+    standings = [
+        (vote.ballot, vote.why, vote.spent.astype("<u2").tobytes(), vote.reviewed.astype("<u2").tobytes(), vote.alike)
+        for vote in votes
+    ]
+    return compress(msgspec.msgpack.encode(standings), 1)
 
 
-_STANDINGS = msgspec.msgpack.Decoder(list[Standing])  # made when the module is loaded: see codec/ballot.py
-
-
-def packed_cells(cells: I64) -> bytes:
-    """Flat cells (n,) of a tile as a :class:`Standing` holds them."""
-    return cells.astype("<u2").tobytes()
-
-
-def cells_in(data: bytes) -> NDArray[np.uint16]:
-    """The inverse of :func:`packed_cells`."""
-    return np.frombuffer(data, dtype="<u2")
-
-
-def pack_standings(standings: Iterable[Standing]) -> bytes:
-    """The standings of all ballots on a tile, as one blob."""
-    return compress(msgspec.msgpack.encode(list(standings)), 1)
-
-
-def unpack_standings(data: bytes) -> list[Standing]:
+def unpack_standings(data: bytes) -> list[Vote]:
     """The inverse of :func:`pack_standings`; MapvoteError if it is damaged."""
     raw = unpack_bytes(data, _MAX_STANDINGS_BYTES, "decision: standings")
     try:
-        return _STANDINGS.decode(raw)
+        standings = _STANDINGS.decode(raw)
     except msgspec.DecodeError as error:
         raise MapvoteError(f"decision: standings are damaged ({error})") from error
+    return [
+        Vote(ballot=ballot, why=why, spent=_cells_in(spent), reviewed=_cells_in(reviewed), alike=alike)
+        for ballot, why, spent, reviewed, alike in standings
+    ]
+
+
+def _cells_in(data: bytes) -> I64:
+    return np.frombuffer(data, dtype="<u2").astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -130,8 +99,9 @@ class Record:
         return unpack_fell(self.packed_fell)
 
     @cached_property
-    def standings(self) -> Sequence[Standing]:
-        """The standing of every ballot on the tile, in the order of the ballots."""
+    def standings(self) -> Sequence[Vote]:
+        """Every vote that stood on the tile, without its planes and names, and why it did not count; in the order of
+        the ballots."""
         return unpack_standings(self.packed_standings)
 
 

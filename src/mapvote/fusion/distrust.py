@@ -19,7 +19,7 @@ from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 _ASKED_CELLS = slice(None, None, 13)
 """The flat cells compared, enough for a share; the stride divides no tile's side, so that no column is left out."""
@@ -29,9 +29,7 @@ _CO, _CE, _UN = (int(CellState[name]) for name in ("CHANGED_OCCUPIED", "CHANGED_
 _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
 
-def contradictors(
-    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
-) -> Bool:
+def contradictors(votes: Sequence[Vote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings) -> Bool:
     """(n,) which of the votes :func:`contradicts` names, by all that they say; ``tally`` (256, 256, 5)
     in VOTE_UNITs of all of them, a vote each."""
     if settings.max_contradiction >= 1.0:
@@ -44,7 +42,7 @@ def contradictors(
 
 
 def deniers(
-    votes: Sequence[TileVote],
+    votes: Sequence[Vote],
     states: U8,
     tally: NDArray[Any],
     quorum: int,
@@ -61,7 +59,7 @@ def deniers(
     return denying(said, states.reshape(-1)[changed], settings.max_denial, came_true)
 
 
-def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
+def borne_out(votes: Sequence[Vote], tile: Tile) -> I64:
     """(n,) in how many cells each vote no longer counts because the map is now as voted: built on, or empty."""
     found = np.zeros(len(votes), dtype=np.int64)
     holds = tile.obstacle_words.reshape(-1)

@@ -21,7 +21,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.points import Fields, as_numbers, merged_values
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ def _before(points: F32, numbers: U64, one: int, other: int) -> bool:
     return False
 
 
-def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> tuple[U64 | None, EditVotes]:
+def words_gone(votes: Sequence[Vote], states: U8, quorum: int, tile: Tile) -> tuple[U64 | None, EditVotes]:
     """((256, 256) delete mask of ``tile``, None if there is nothing to delete; the votes for what is trimmed from cells
     that stand); ``states`` (256, 256) as decided.
 
@@ -226,7 +226,7 @@ def _deleted(gone: U64, tile: Tile) -> U64:
 def _remnants(
     left: Sequence[Words],
     emptied_by: Sequence[Words],
-    votes: Sequence[TileVote],
+    votes: Sequence[Vote],
     stays: U64,
     quorum: int,
     base: I32,

@@ -45,9 +45,9 @@ from mapvote.fusion.gravity import (
 )
 from mapvote.fusion.loss_budget import PendingDeletions, agreed_odds, beyond_budget
 from mapvote.fusion.neighbour_noise import without_spilled, without_spilled_in
-from mapvote.fusion.tile_vote import TileVote, by_voter, newest_votes, offered, one_each, silenced
+from mapvote.fusion.tile_vote import Vote, by_voter, newest_votes, offered, one_each, silenced
 
-History = Callable[[], Sequence[TileVote]]
+History = Callable[[], Sequence[Vote]]
 """Gives the votes of a tile over a longer time."""
 
 
@@ -65,7 +65,7 @@ class Decision:
     quorum: int
     heard: Collection[str] = ()
     """The voters whose votes were counted, see :func:`mapvote.fusion.tile_vote.voter_of`."""
-    votes: Sequence[TileVote] = ()
+    votes: Sequence[Vote] = ()
     """Their votes; as all that only the edit needs, none once the tile is edited."""
     denied: Bool | None = None
     """Changes that wait because the last vehicle that observed them disagrees."""
@@ -98,7 +98,7 @@ class Decision:
         return len(self.heard)
 
 
-def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
+def count(votes: Sequence[Vote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
     """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (docs/decisions/voting.md).
 
     Where ``rule.undetermined_competes`` a plain majority decides; else undetermined abstains, and a change needs a
@@ -125,7 +125,7 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
 
 def fuse_tile(
     tile: Tile,
-    drives: Iterable[TileVote],
+    drives: Iterable[Vote],
     rule: Rule,
     settings: FuseSettings,
     version: int = 0,
@@ -152,7 +152,7 @@ def fuse_tile(
 
 
 def decide_tile(
-    tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings, history: History | None = None
+    tile: Tile, drives: Iterable[Vote], rule: Rule, settings: FuseSettings, history: History | None = None
 ) -> Decision:
     """The decision of the votes: counted, then in the order of time, then within the budget of false deletions.
 
@@ -187,8 +187,8 @@ def decide_tile(
 
 
 def _originals_of(
-    history: History, drives: Sequence[TileVote], copies: Sequence[Copy], settings: FuseSettings
-) -> Sequence[TileVote]:
+    history: History, drives: Sequence[Vote], copies: Sequence[Copy], settings: FuseSettings
+) -> Sequence[Vote]:
     """The votes that ``history`` gives, without copies. Where they are those of the ``drives``, their ``copies`` are
     known."""
     votes = by_voter(history(), settings)
@@ -209,7 +209,7 @@ def deletions(tile: Tile, decided: Decision) -> tuple[U64 | None, EditVotes]:
     return gone, trimmed.and_of(EditVotes(cells, states, votes, against))
 
 
-def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int, gone: U64 | None) -> tuple[Tile, int, int]:
+def _edit(tile: Tile, votes: Sequence[Vote], states: U8, quorum: int, gone: U64 | None) -> tuple[Tile, int, int]:
     """(the tile as decided without the voxels ``gone`` (256, 256), points added, points deleted)."""
     edited = tile
     deleted = 0
@@ -272,12 +272,12 @@ def _without(fell: Fallen, decided: Decision, tile: Tile, edited: Tile, left: Re
 
 
 def hear(
-    votes: Sequence[TileVote],
+    votes: Sequence[Vote],
     rule: Rule,
     settings: FuseSettings,
     silenced: int = 0,
     tile: Tile | None = None,
-) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
+) -> tuple[Sequence[Vote], U8, NDArray[Any], int]:
     """(the votes that count, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
     The quorum falls by one for each excluded vehicle, because it is one of those that the quorum guards against, and by
@@ -298,7 +298,7 @@ def hear(
     return heard, states, tally, quorum
 
 
-def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
+def _learn_free(tile: Tile, votes: Sequence[Vote], min_votes: int, points_added: bool) -> Tile:
     """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
 
     Only in cells on which the vehicle voted. Free space is remembered once learned; a voxel that holds a point of the
@@ -331,7 +331,7 @@ def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tu
     return states, grid
 
 
-def unspent(vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None = None) -> TileVote:
+def unspent(vote: Vote, tile: Tile, misread: Mapping[int, Bool] | None = None) -> Vote:
     """The vote in the cells where it counts on ``tile``: those that have not changed since the version that its vehicle
     drove with. ``misread``: by version, (256, 256) cells in which that version showed what no longer is history."""
     spent = None if tile.memory is None else tile.memory.changed_after(vote.version)
@@ -493,8 +493,9 @@ def _method(ballot: Ballot) -> str:
     return f"{ballot.method}, {ballot.stage}, settings {ballot.settings_hash[:8]}"
 
 
-def _votes_on(index: TileIndex, ballots: Mapping[str, Ballot]) -> Iterator[TileVote]:
+def _votes_on(index: TileIndex, ballots: Mapping[str, Ballot]) -> Iterator[Vote]:
     for digest, ballot in ballots.items():
         for tile in ballot.tiles:
             if tile.tile == index:
-                yield TileVote.of(unpack_planes(tile), ballot.vehicle, ballot.end_ns, digest, ballot.version)
+                vote = Vote(ballot.vehicle, ballot.end_ns, digest, ballot.version)
+                yield vote.with_planes(unpack_planes(tile))

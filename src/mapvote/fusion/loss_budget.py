@@ -30,10 +30,10 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 
 
-def agreed_odds(votes: Sequence[TileVote], states: U8, quorum: int) -> Odds:
+def agreed_odds(votes: Sequence[Vote], states: U8, quorum: int) -> Odds:
     """The agreed confidence of the vehicles that voted for each changed cell of ``states`` (256, 256), one of ``votes``
     a vehicle. No confidence for a cell where fewer than ``quorum`` state theirs."""
     cells = changed_cells_of(states)

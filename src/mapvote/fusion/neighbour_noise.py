@@ -19,7 +19,7 @@ from mapvote.core.kernel import kernel
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, Bool, CellState
-from mapvote.fusion.tile_vote import TileVote, offered
+from mapvote.fusion.tile_vote import Vote, offered
 
 REACH_M = 0.45
 """How far about a point its plane is fitted, a voxel and a half: some eight points of a wall."""
@@ -47,7 +47,7 @@ class NoiseRule:
 NOISE_RULE = NoiseRule()
 
 
-def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
+def without_spilled(states: U8, tile: Tile, votes: Sequence[Vote]) -> U8:
     """The states (256, 256) as reported: cells that changed by noise alone are empty. ``tile``: before the edit; the
     rest as in :func:`spilled`. The same object where there is no such cell."""
     cells = spilled(tile, votes, states)
@@ -70,7 +70,7 @@ def without_spilled_in(cells: I64, states: U8, tile: Tile) -> U8:
     return without_spilled(np.where(near == int(CellState.CHANGED_EMPTY), near, np.uint8(NO_VOTE)), tile, ())
 
 
-def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
+def spilled(tile: Tile, votes: Sequence[Vote], states: U8) -> I64:
     """(n,) flat cells, ascending, that ``states`` (256, 256) call changed and that hold what spilled over.
 
     Demolished surfaces are points of the ``tile``, built ones points that ``votes`` offer; points in the next tile are

@@ -5,9 +5,9 @@ Pure, and independent of order: drives fold by a commutative rule.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +23,66 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 DAY_NS = 86_400_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class TileVote(Planes):
-    """The vote of one drive, or of one vehicle after :func:`fold`, on one tile."""
+Why = Literal["", "young", "window", "otherwise", "damaged", "copy", "opposes", "spent", "reviewed"]
+"""Why a vote does not count on a tile, or on one of its cells; "" if it does. See :data:`REASONS`."""
+REASONS: Mapping[Why, str] = {
+    "young": "younger than the minimum age",
+    "window": "too old, or not of the vehicles that passed last",
+    "otherwise": "cast by another method or other settings than the policy asks for",
+    "damaged": "damaged, and set aside",
+    "copy": "a copy: its cells on this tile equal those of another vehicle's ballot, which counts for both",
+    "opposes": "opposes the others over most of this tile, or denies nearly all that changed on it",
+    "spent": "spent: a version had changed the cell since its vehicle drove",
+    "reviewed": "of a change that a reviewer held or rejected",
+}
+_NO_CELLS = np.empty(0, dtype=np.int64)
 
-    vehicle: str
-    end_ns: int
-    digest: str
+
+@dataclass(frozen=True, slots=True)
+class Vote(Planes):
+    """The vote of one drive, or of one vehicle after :func:`fold`, on one tile, and why it does not count.
+
+    A server reads a vote without its planes first. It reads the planes of those that count (:meth:`with_planes`). A
+    decision record states a vote's ballot and why it did not count, no more.
+    """
+
+    vehicle: str = ""
+    end_ns: int = 0
+    digest: str = ""
     """Hash of the ballot: breaks ties between drives that end at the same moment."""
     version: int = 0
     """Version of the map that the vehicle drove with."""
+    ballot: int = 0
+    """Number of the ballot in a server's log; 0 where there is no server."""
+    drive: str = ""
+    first_seq: int = 0
+    """Event with which the drive first arrived at a server."""
     unrestricted: U8 | None = None
     """Its states as they were sent, where :func:`silenced` left some out."""
+    why: Why = ""
+    """Why it does not count on the tile at all; "" if it does, or if nobody has judged it."""
+    spent: I64 = field(default_factory=lambda: _NO_CELLS)
+    """(n,) flat cells on which it votes, ascending, and which have changed since its vehicle drove."""
+    reviewed: I64 = field(default_factory=lambda: _NO_CELLS)
+    """(n,) flat cells on which it votes, ascending, of a change that a reviewer held or rejected."""
+    alike: int = 0
+    """For a copy: the ballot that counts for both."""
 
     def __post_init__(self) -> None:
         if self.states is not None:
             object.__setattr__(self, "states", read_only(self.states))
 
-    @classmethod
-    def of(cls, planes: Planes, vehicle: str = "", end_ns: int = 0, digest: str = "", version: int = 0) -> TileVote:
-        """The vote of a ballot on one tile."""
-        said = {name: getattr(planes, name) for name in Planes.__slots__}
-        return cls(vehicle=vehicle, end_ns=end_ns, digest=digest, version=version, **said)
+    def with_planes(self, planes: Planes) -> Vote:
+        """The same vote with the planes of its ballot."""
+        return replace(self, **{name: getattr(planes, name) for name in Planes.__slots__})
+
+    def why_not(self, cell: int) -> Why:
+        """Why it does not count on a flat ``cell``; "" if it does, provided that it votes there."""
+        if self.why:
+            return self.why
+        if cell in self.spent:
+            return "spent"
+        return "reviewed" if cell in self.reviewed else ""
 
     @property
     def sent(self) -> U8 | None:
@@ -127,7 +165,7 @@ def voter_of(vote: Dated, settings: FuseSettings) -> str:
     return f"{vote.vehicle} on {np.datetime64(vote.end_ns // DAY_NS, 'D')}"
 
 
-def by_voter(votes: Iterable[TileVote], settings: FuseSettings) -> list[TileVote]:
+def by_voter(votes: Iterable[Vote], settings: FuseSettings) -> list[Vote]:
     """The votes, each under the name of its voter, see :func:`voter_of`."""
     if settings.one_vehicle == "once":
         return list(votes)
@@ -153,7 +191,7 @@ def newest_votes(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     return [v for v in recent if voter_of(v, settings) in chosen]
 
 
-def silenced(vote: TileVote, cells: I64) -> TileVote:
+def silenced(vote: Vote, cells: I64) -> Vote:
     """The vote without the flat ``cells`` (n,), ascending."""
     if not len(cells):
         return vote
@@ -173,7 +211,7 @@ def _but(plane: NDArray[Any], cells: I64, value: int) -> NDArray[Any]:
     return flat.reshape(plane.shape)
 
 
-def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
+def fold(drives: Sequence[Vote], grid: Grid) -> Vote:
     """One vehicle's drives as one vote: in every cell the drive that ended last counts, ties by hash; a drive
     without a vote there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
 
@@ -203,7 +241,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             points.append(drive.new_points[here])
             fields.append((len(points[-1]), {name: values[here] for name, values in drive.fields.items()}))
     free = [drive.free.within(said) for drive, said in zip(ordered, spoken, strict=True) if drive.free is not None]
-    return TileVote(
+    return Vote(
         vehicle=newest.vehicle,
         end_ns=newest.end_ns,
         digest=newest.digest,
@@ -218,7 +256,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     )
 
 
-def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
+def folded(drives: Sequence[Vote], last: Sequence[Bool]) -> Odds | None:
     """The confidence of a vehicle's ``drives``, each in the flat cells (65536,) in which it is the ``last`` to vote;
     None if none states any."""
     parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
@@ -248,7 +286,7 @@ def _laid_over(planes: Sequence[U8 | None]) -> U8:
     return out
 
 
-def _marked(drive: TileVote, mine: Bool) -> Words:
+def _marked(drive: Vote, mine: Bool) -> Words:
     """The voxels that a drive deletes, and its remnants, in the flat cells ``mine`` (65536,)."""
     if drive.gone is None:
         return drive.deletes(Words.whole(mine))
@@ -258,15 +296,15 @@ def _marked(drive: TileVote, mine: Bool) -> Words:
     return marked.at(drive.supports(emptied, marked.cells) | drive.supports(stands, marked.cells))
 
 
-def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
+def one_each(drives: Iterable[Vote], grid: Grid) -> list[Vote]:
     """One vote a vehicle, by name: :func:`fold` of all its drives on the tile whose window is ``grid``."""
-    by_vehicle: dict[str, list[TileVote]] = {}
+    by_vehicle: dict[str, list[Vote]] = {}
     for drive in drives:
         by_vehicle.setdefault(drive.vehicle, []).append(drive)
     return [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
 
 
-def offered(votes: Sequence[TileVote], decided: U8, grid: Grid) -> tuple[F32, dict[str, Values], I64, I32]:
+def offered(votes: Sequence[Vote], decided: U8, grid: Grid) -> tuple[F32, dict[str, Values], I64, I32]:
     """(points (n, 3), their attributes (n,), cells (n,), numbers of their votes (n,)) that ``votes`` offer for the
     cells ``decided`` (256, 256) as changed-occupied for which they voted so too."""
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)

@@ -18,8 +18,8 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.fusion.decision_record import Record, cells_in
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.decision_record import Record
+from mapvote.fusion.tile_vote import Vote
 from mapvote.shapes.change_objects import ChangedCells, ChangeObject, Decided, change_objects, changed_cells
 from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
 from mapvote.shapes.geojson import Changes, to_geojson
@@ -29,7 +29,6 @@ from mapvote_server.store.integrity import hurt_or_mended_since
 from mapvote_server.store.queries import load_tile, newest_seq, records_of, tile_of, tiles_that_differ, version_of
 from mapvote_server.store.retention import cleared_since
 from mapvote_server.store.store import PerStore, Store
-from mapvote_server.store.votes import StoredVote
 from mapvote_server.work import check_time
 
 
@@ -209,17 +208,17 @@ def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) ->
     """The decisions of the versions after ``old`` up to ``new`` on a tile, and the ballots that counted; MapvoteError
     if a record is damaged."""
     records = records_of(connection, index, after=old, upto=new)
-    counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
+    counted = {vote.ballot for record in records for vote in record.standings if not vote.why}
     sound = sound_votes(connection, index, counted)
     return [(record, _drives(record, sound)) for record in records]
 
 
-def _drives(record: Record, sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
+def _drives(record: Record, sound: Mapping[int, Vote]) -> list[tuple[int, U8]]:
     """(end_ns, states) of the ballots that counted, in the cells where they did. A cell that the version trimmed is
     CHANGED_EMPTY where the ballot marks voxels of it as gone."""
     found = []
     for standing in record.standings:
-        _, vote = sound.get(standing.ballot, (None, None))
+        vote = sound.get(standing.ballot)
         if not standing.why and vote is not None and vote.states is not None:
             states = vote.states.copy()
             if vote.gone is not None:
@@ -227,6 +226,6 @@ def _drives(record: Record, sound: Mapping[int, tuple[StoredVote, TileVote]]) ->
                 at = states.reshape(-1)[trimmed] == CellState.UNCHANGED_OCCUPIED
                 states.reshape(-1)[trimmed[at]] = CellState.CHANGED_EMPTY
             for cells in (standing.spent, standing.reviewed):
-                states.reshape(-1)[cells_in(cells)] = NO_VOTE
+                states.reshape(-1)[cells] = NO_VOTE
             found.append((vote.end_ns, states))
     return found

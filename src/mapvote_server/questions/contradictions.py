@@ -16,7 +16,7 @@ import scipy
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, U8, Bool, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 from mapvote.shapes.outlines import pieces
 from mapvote_server.questions.explain import said_by
 
@@ -124,7 +124,7 @@ class Compared:
         return len(self.largest) > 0 or len(self.border.parts) > 0
 
 
-def compare(index: TileIndex, votes: Iterable[TileVote]) -> list[Compared]:
+def compare(index: TileIndex, votes: Iterable[Vote]) -> list[Compared]:
     """Each vehicle's vote on a tile, all its drives as one, against the others'; one entry each, in order of name.
 
     In a cell the others agree if more of them vote one way (occupied or empty now) than the other, and at least one

@@ -16,7 +16,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError
 from mapvote.fusion.next_pass import Stretch, Waiting, Witness, lacks_quorum_only, one_vote_short, stretches
-from mapvote.fusion.tile_vote import TileVote, by_voter, one_each
+from mapvote.fusion.tile_vote import Vote, by_voter, one_each
 from mapvote.shapes.geojson import MAP_METRES, Geometry, PlacedFeature, Places
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import said_by
@@ -116,7 +116,7 @@ _VEHICLES = Question(
 )
 
 
-def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> dict[int, TileVote] | None:
+def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> dict[int, Vote] | None:
     """By ballot the votes on a tile of the newest version that count, in the cells where they do; None if the tile
     cannot be read."""
     try:
@@ -126,10 +126,10 @@ def _counting(connection: sa.Connection, newest: int, asked: Electorate, window:
     except MapvoteError:
         return None
     judged = from_sound_ballots(connection, asked, lambda now: judged_on(connection, tile, now))
-    return {one.stored.seq: one.vote for one in judged if one.vote is not None}
+    return {vote.ballot: vote for vote in judged if not vote.why}
 
 
-def _waits(drives: Sequence[TileVote], states: Sequence[U8], quorum: int) -> _Waits | None:
+def _waits(drives: Sequence[Vote], states: Sequence[U8], quorum: int) -> _Waits | None:
     """The changes that lack only the quorum, by the ``drives`` on a tile and the ``states`` (256, 256) of each voter;
     None if there are none."""
     if not states:

@@ -22,12 +22,12 @@ from mapvote.core.times import utc
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
-from mapvote.fusion.decision_record import REASONS, Record, Standing, Why
+from mapvote.fusion.decision_record import Record
 from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.fuse import Decision, decide_tile, deletions
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
 from mapvote.fusion.next_pass import Waiting, lacks_quorum_only
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, folded, one_each
+from mapvote.fusion.tile_vote import DAY_NS, REASONS, Vote, Why, folded, one_each
 from mapvote_server.questions.falls import fell_with
 from mapvote_server.store import schema
 from mapvote_server.store.fusion_jobs import standings_of
@@ -39,8 +39,6 @@ from mapvote_server.store.store import Store
 from mapvote_server.store.votes import (
     FOREVER,
     Electorate,
-    Judged,
-    StoredVote,
     electorate_now,
     from_sound_ballots,
     judged_on,
@@ -143,11 +141,10 @@ class _Now:
     tile: Tile
     cell: tuple[int, int]
     asked: Electorate
-    judged: Sequence[Judged]
-    standings: Sequence[Standing]
-    """Reasons of ``judged``, in the next version."""
-    said: Mapping[int, TileVote]
-    """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
+    standings: Sequence[Vote]
+    """Every standing vote on the tile, and why the next version does not count it."""
+    said: Mapping[int, Vote]
+    """The vote of each readable ballot on the tile as it was sent, by the ballot's number."""
     decided: Decision
     """The decision of the next version, if it were published now."""
 
@@ -198,7 +195,7 @@ def state_name(state: int) -> str:
     return "no_vote" if state == NO_VOTE else CellState(state).name.lower()
 
 
-def said_by(vote: TileVote) -> U8:
+def said_by(vote: Vote) -> U8:
     """(256, 256) the state of each cell by one vote: its states or, in one stage, the decision of its tally. A tie is
     undetermined, as in every decision."""
     if vote.states is not None:
@@ -207,48 +204,43 @@ def said_by(vote: TileVote) -> U8:
     return plurality(vote.tally.astype(np.int32))
 
 
-def sound_votes(
-    connection: sa.Connection, index: TileIndex, ballots: Collection[int]
-) -> dict[int, tuple[StoredVote, TileVote]]:
-    """The votes of some ballots on a tile, standing or not, by their ``seq``; without damaged and deleted ones."""
+def sound_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> dict[int, Vote]:
+    """The votes of some ballots on a tile, standing or not, by ballot; without damaged and deleted ones."""
     stored = stored_votes(connection, index, ballots) if ballots else []
     while True:
         try:
-            said = read_votes(connection, index, stored)
+            return {vote.ballot: vote for vote in read_votes(connection, index, stored)}
         except DamagedBallots as error:
             lost = {damage.name for damage in error.found}
-            stored = [one for one in stored if lost.isdisjoint((str(one.seq), ballot_name(one.seq, *index)))]
-        else:
-            return {one.seq: (one, vote) for one, vote in zip(stored, said, strict=True)}
+            stored = [vote for vote in stored if lost.isdisjoint((str(vote.ballot), ballot_name(vote.ballot, *index)))]
 
 
 def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], asked: Electorate) -> _Now:
     """The standing ballots on a tile, without those that cannot be read."""
 
-    def look(asked: Electorate) -> tuple[Electorate, Sequence[Judged], Mapping[int, TileVote]]:
+    def look(asked: Electorate) -> tuple[Electorate, Sequence[Vote], Mapping[int, Vote]]:
         judged = judged_on(connection, tile, asked)
-        readable = [one.stored for one in judged if one.why != "damaged"]
-        said = read_votes(connection, tile.index, readable)
-        return asked, judged, {stored.seq: vote for stored, vote in zip(readable, said, strict=True)}
+        readable = [vote for vote in judged if vote.why != "damaged"]
+        return asked, judged, {vote.ballot: vote for vote in read_votes(connection, tile.index, readable)}
 
     asked, judged, said = from_sound_ballots(connection, asked, look)
     policy = asked.policy
-    counting = [one.vote for one in judged if one.vote is not None]
+    counting = [vote for vote in judged if not vote.why]
 
-    def history() -> Sequence[TileVote]:
+    def history() -> Sequence[Vote]:
         return recent_votes(connection, tile, asked)
 
     past = history if policy.round.stage == "two-stage" else None
     decided = decide_tile(tile, counting, rule_named(policy.round.method), policy.fuse, past)
     standings = standings_of(judged, decided.copies, decided.heard, policy.fuse)
-    return _Now(tile, cell, asked, judged, standings, said, decided)
+    return _Now(tile, cell, asked, standings, said, decided)
 
 
 def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], known: bool) -> list[CellVote]:
     """Every standing vote, then those that some version counted on the cell and that stand no more."""
     flat = now.cell[0] * TILE_CELLS + now.cell[1]
     past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
-    said = {**now.said, **{seq: vote for seq, (_, vote) in past.items()}}
+    said = {**now.said, **past}
     counted = defaultdict[int, list[int]](list)
     left_out = defaultdict[int, list[LeftOut]](list)
     for record in records:
@@ -261,19 +253,20 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], know
                     counted[standing.ballot].append(record.version)
     gone = sorted(past.keys() & counted.keys())
     ended = _ended(connection, gone)
-    everyone = [(one.stored, _why_not(standing, now)) for one, standing in zip(now.judged, now.standings, strict=True)]
-    everyone += [(past[seq][0], ended.get(seq, "stands no more")) for seq in gone]
-    found = []
-    for stored, reason in everyone:
-        vote = said.get(stored.seq)
-        seq = stored.seq
+    everyone = [(standing, _why_not(standing, now)) for standing in now.standings]
+    everyone += [(past[ballot], ended.get(ballot, "stands no more")) for ballot in gone]
+    cell_votes = []
+    for standing, reason in everyone:
+        ballot = standing.ballot
+        vote = said.get(ballot)
         text: tuple[str, int | None, float | None] = UNREADABLE, None, None
         if vote is not None:
             text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
-        whose = (stored.vehicle, stored.drive, stored.version)
-        end = utc(seen(stored.end_ns, known))
-        found.append(CellVote(*whose, *text, end, not reason, reason, tuple(counted[seq]), tuple(left_out[seq])))
-    return found
+        whose = (standing.vehicle, standing.drive, standing.version)
+        end = utc(seen(standing.end_ns, known))
+        versions = tuple(counted[ballot]), tuple(left_out[ballot])
+        cell_votes.append(CellVote(*whose, *text, end, not reason, reason, *versions))
+    return cell_votes
 
 
 def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str]:
@@ -284,7 +277,7 @@ def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str
     return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
 
 
-def _why_not(standing: Standing, now: _Now) -> str:
+def _why_not(standing: Vote, now: _Now) -> str:
     """Why the next version would not count a standing ballot on the cell; "" if it would."""
     if not standing.why and not now.said[standing.ballot].spoken()[now.cell]:
         return "says nothing here"
@@ -298,7 +291,7 @@ def _why_not(standing: Standing, now: _Now) -> str:
     return REASONS[why] if why else ""
 
 
-def _standings(record: Record) -> Sequence[Standing]:
+def _standings(record: Record) -> Sequence[Vote]:
     """None of a record that is damaged."""
     try:
         return record.standings
@@ -405,14 +398,14 @@ def _waits(now: _Now) -> list[str]:
     return text
 
 
-def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:
+def _marks(vote: Vote, cell: tuple[int, int]) -> int | None:
     if vote.gone is None:
         return None
     mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
     return int(mine[0]).bit_count() if len(mine) else 0
 
 
-def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
+def _sure(vote: Vote, cell: tuple[int, int]) -> float | None:
     """The probability that a vehicle gives a change of the cell; None if it gives none."""
     if vote.odds is None:
         return None
@@ -420,21 +413,18 @@ def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
     return None if said[0] == UNSAID else round(1.0 / (1.0 + math.exp(-float(in_nats(said)[0]))), 4)
 
 
-def _said_on(
-    connection: sa.Connection, index: TileIndex, policy: Policy, wanted: Callable[[StoredVote, Why], bool]
-) -> list[TileVote]:
+def _said_on(connection: sa.Connection, index: TileIndex, policy: Policy, wanted: Callable[[Vote], bool]) -> list[Vote]:
     """The standing votes on a tile, of any age, that are ``wanted``; without damaged ones."""
 
-    def read(asked: Electorate) -> list[TileVote]:
-        chosen = [vote for vote, why in judged_votes(connection, index, asked) if wanted(vote, why)]
-        return read_votes(connection, index, chosen)
+    def read(asked: Electorate) -> list[Vote]:
+        return read_votes(connection, index, [*filter(wanted, judged_votes(connection, index, asked))])
 
     return from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), read)
 
 
-def votes_on(connection: sa.Connection, lattice: Lattice, index: TileIndex, policy: Policy) -> list[TileVote]:
+def votes_on(connection: sa.Connection, lattice: Lattice, index: TileIndex, policy: Policy) -> list[Vote]:
     """The standing votes on a tile inside the policy's window, one a vehicle."""
-    return one_each(_said_on(connection, index, policy, lambda vote, why: not why), lattice.tile(index))
+    return one_each(_said_on(connection, index, policy, lambda vote: not vote.why), lattice.tile(index))
 
 
 _NEVER_SEEN = 255
@@ -450,12 +440,12 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     with store.database.reading() as connection:
         policy = policy_in(connection)
 
-        def wanted(vote: StoredVote, why: Why) -> bool:
-            return why != "damaged" and vehicle in (None, vote.vehicle)
+        def wanted(vote: Vote) -> bool:
+            return vote.why != "damaged" and vehicle in (None, vote.vehicle)
 
         votes = _said_on(connection, index, policy, wanted)
-    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
-    newest: dict[str, TileVote] = {}
+    silent = Vote(states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
+    newest: dict[str, Vote] = {}
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
         states = said_by(vote)
@@ -468,7 +458,7 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
 
 
-def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
+def _summary(votes: Sequence[Vote], last: I64, now_ns: int, quorum: int) -> U8:
     counts = np.zeros((N_STATES, TILE_CELLS**2), dtype=np.int64)
     said = counts[:4].reshape(4, TILE_CELLS, TILE_CELLS)
     for vote in votes:
@@ -484,7 +474,7 @@ def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> 
     return out
 
 
-def _probabilities(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
+def _probabilities(said: I64, vehicles: Sequence[Vote], quorum: int) -> F64:
     """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where no
     vehicle votes for a change."""
     changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]

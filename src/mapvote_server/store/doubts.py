@@ -18,7 +18,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, by_voter, one_each
+from mapvote.fusion.tile_vote import DAY_NS, Vote, by_voter, one_each
 from mapvote_server.errors import Unavailable
 from mapvote_server.store import schema
 from mapvote_server.store.fusion_jobs import Fused
@@ -123,9 +123,7 @@ class _KnownVehicles:
         return self._known[vehicle]
 
 
-def _on_tile(
-    fused: Fused, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings, known: _KnownVehicles
-) -> Doubts:
+def _on_tile(fused: Fused, tile: Tile, drives: Sequence[Vote], settings: FuseSettings, known: _KnownVehicles) -> Doubts:
     """The doubts about one tile. ``drives``: all that count there, of every vehicle and of a longer time."""
     record = fused.record
     assert record is not None
@@ -155,7 +153,7 @@ def _on_tile(
     )
 
 
-def _states(vote: TileVote) -> U8:
+def _states(vote: Vote) -> U8:
     """(65536,) of a vote in two stages."""
     assert vote.states is not None
     return vote.states.reshape(-1)

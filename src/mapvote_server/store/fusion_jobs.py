@@ -31,23 +31,21 @@ from mapvote.fusion.change_time import emptied_and_filled
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.decision_record import (
     Record,
-    Standing,
     pack_edit_votes,
     pack_fell,
     pack_standings,
     pack_tally,
-    packed_cells,
 )
 from mapvote.fusion.fuse import Decision, fall_besides, fuse_tile
 from mapvote.fusion.gravity import Fallen, Falling, Remains, fall_across, remains_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
-from mapvote.fusion.tile_vote import TileVote, voter_of
+from mapvote.fusion.tile_vote import Vote, voter_of
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, address_of
 from mapvote_server.store.integrity import Damage, DamagedBallots
 from mapvote_server.store.queries import load_tile, tile_as_of
 from mapvote_server.store.round_file import Bulk, OnDisk, RoundFile
-from mapvote_server.store.votes import Electorate, Judged, Polled, judged_on, poll, recent_votes
+from mapvote_server.store.votes import Electorate, Polled, judged_on, poll, recent_votes
 
 
 @record()
@@ -221,10 +219,10 @@ def _plane_of(task: Task, error: str) -> str:
 def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open:
     tile = _tile(connection, task)
     judged = judged_on(connection, tile, task.asked, task.misread, polled)
-    votes = [one.vote for one in judged if one.vote is not None]
+    votes = [vote for vote in judged if not vote.why]
     cast = task.asked.policy.round
 
-    def history() -> list[TileVote]:
+    def history() -> list[Vote]:
         return recent_votes(connection, tile, task.asked, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
@@ -277,24 +275,22 @@ def _packed(task: Task, tile: Tile, edited: Tile, decision: Decision, standings:
 
 
 def standings_of(
-    judged: Sequence[Judged], copies: Iterable[Copy], heard: Collection[str], settings: FuseSettings
-) -> list[Standing]:
-    """The standing of every ballot on a tile, by the copies among them and the voters that counted."""
+    judged: Sequence[Vote], copies: Iterable[Copy], heard: Collection[str], settings: FuseSettings
+) -> list[Vote]:
+    """Every standing vote on a tile with the reason why it did not count, by the copies among them and the voters that
+    counted."""
     copied = {(copy.vehicle, copy.digest): copy for copy in copies}
-    seqs = {(voter_of(one.stored, settings), one.stored.digest): one.stored.seq for one in judged}
-    found = []
-    for one in judged:
-        why = one.why
-        alike = 0
-        voter = voter_of(one.stored, settings)
-        copy = copied.get((voter, one.stored.digest))
+    ballots = {(voter_of(vote, settings), vote.digest): vote.ballot for vote in judged}
+    standings = []
+    for vote in judged:
+        voter = voter_of(vote, settings)
+        copy = copied.get((voter, vote.digest))
         if copy is not None:
-            why = "copy"
-            alike = seqs[copy.heard_vehicle, copy.heard_digest]
-        elif not why and voter not in heard:
-            why = "opposes"
-        found.append(Standing(one.stored.seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike))
-    return found
+            vote = replace(vote, why="copy", alike=ballots[copy.heard_vehicle, copy.heard_digest])
+        elif not vote.why and voter not in heard:
+            vote = replace(vote, why="opposes")
+        standings.append(vote)
+    return standings
 
 
 def _tile(connection: sa.Connection, task: Task) -> Tile:

@@ -15,16 +15,15 @@ from typing import Any, TypeVar
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_planes
+from mapvote.codec.ballot import Planes, unpack_planes
 from mapvote.codec.tile_planes import unpack_cells
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool
 from mapvote.fusion.change_time import history_days
-from mapvote.fusion.decision_record import Why
 from mapvote.fusion.fuse import unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, silenced
+from mapvote.fusion.tile_vote import DAY_NS, Vote, Why, newest_votes, silenced
 from mapvote_server.errors import NotFound
 from mapvote_server.store import schema
 from mapvote_server.store.database import DATABASE_SIZES, Question, is_sound, remembered
@@ -76,8 +75,8 @@ _B, _T = schema.ballots, schema.ballot_tiles
 _ROW, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "mark"))
 _COLS: sa.BindParameter[list[int]] = sa.bindparam("cols", expanding=True)
 _VOTES = (
-    sa.select(_T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
-    .add_columns(_B.c.digest, _T.c.base, _B.c.version, _B.c.settings_hash, _B.c.cast_by)
+    sa.select(_T.c.col, _B.c.received_ns, _B.c.settings_hash, _B.c.cast_by)
+    .add_columns(_B.c.vehicle, _B.c.end_ns, _B.c.digest, _B.c.version, _B.c.seq, _B.c.drive, _B.c.first_seq)
     .join(_T, _T.c.ballot == _B.c.seq)
     .order_by(_B.c.seq)
 )
@@ -112,20 +111,20 @@ _TOUCHED = Question(
 class Polled:
     """Standing votes, reviews and damage on some tiles, each read by one statement."""
 
-    standing: Mapping[TileIndex, Sequence[StoredVote]]
-    """Ballots, in the order in which they came."""
+    standing: Mapping[TileIndex, Sequence[Vote]]
+    """Votes without planes, in the order in which their ballots came; judged by the policy alone."""
     bars: Mapping[TileIndex, Sequence[tuple[int | None, Bool]]]
     """(event, cells (256, 256)) of changes that reviewers rejected then, or hold: None."""
     rows: Rows
     """The stored planes of the votes that count there."""
-    read: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
-    """Votes by tile and ballot that were checked and unpacked: nothing is read twice for one round."""
-    fresh: dict[tuple[int, int, int], TileVote] = field(default_factory=dict)
-    """These in the cells in which they are not spent."""
+    read: dict[tuple[int, int, int], Planes] = field(default_factory=dict)
+    """Planes by tile and ballot that were checked and unpacked: nothing is read twice for one round."""
+    fresh: dict[tuple[int, int, int, Why], Vote] = field(default_factory=dict)
+    """Votes in the cells in which they are not spent."""
 
-    def unspent(self, seq: int, vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None) -> TileVote:
-        """The vote of a ballot in the cells of ``tile`` in which it is not spent."""
-        key = *tile.index, seq
+    def unspent(self, vote: Vote, tile: Tile, misread: Mapping[int, Bool] | None) -> Vote:
+        """The vote in the cells of ``tile`` in which it is not spent."""
+        key = *tile.index, vote.ballot, vote.why
         if key not in self.fresh:
             self.fresh[key] = unspent(vote, tile, misread)
         return self.fresh[key]
@@ -134,29 +133,37 @@ class Polled:
 def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
     """All that :func:`judged_on` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
     then."""
-    standing = _standing_on(connection, row, cols, asked.mark)
+    standing = _standing_on(connection, row, cols, asked)
     bars = defaultdict[TileIndex, list[Any]](list)
     reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
     for col, seq, verdict, cells in reviewed:
         bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
-    counting = [(c, vote) for c in cols for vote, why in _judged(standing[row, c], (row, c), asked) if not why]
+    counting = [(c, vote) for c in cols for vote in _judged(standing[row, c], (row, c), asked) if not vote.why]
     return Polled(standing, bars, read_rows(connection, row, counting))
 
 
 def _standing_on(
-    connection: sa.Connection, row: int, cols: Sequence[int], mark: int
-) -> Mapping[TileIndex, Sequence[StoredVote]]:
-    found = defaultdict[TileIndex, list[StoredVote]](list)
-    for col, *stored in connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": mark}).all():
-        found[row, col].append(StoredVote(*stored))
-    return found
+    connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate
+) -> Mapping[TileIndex, Sequence[Vote]]:
+    """The votes that stand on tiles of a row, without planes, and why the policy does not count them."""
+    standing = defaultdict[TileIndex, list[Vote]](list)
+    rows = connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
+    for stored in rows:
+        standing[row, stored.col].append(_vote_of(stored, _unready(stored, asked)))
+    return standing
 
 
-def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> list[StoredVote]:
-    """The votes of some ballots on a tile, whether they stand or not, in the order of the ballots; of those that were
-    cleared away nothing."""
-    mine = _VOTES.where(_T.c.row == index[0], _T.c.col == index[1], _B.c.seq.in_(ballots))
-    return [StoredVote(*stored) for _, *stored in connection.execute(mine).all()]
+def _vote_of(stored: Any, why: Why = "") -> Vote:
+    """The vote of a row of ``_VOTES``, without its planes."""
+    cast = stored.vehicle, stored.end_ns, stored.digest, stored.version
+    return Vote(*cast, ballot=stored.seq, drive=stored.drive, first_seq=stored.first_seq, why=why)
+
+
+def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> list[Vote]:
+    """The votes of some ballots on a tile without planes, whether they stand or not, in the order of the ballots; none
+    of ballots that were cleared away."""
+    wanted = _VOTES.where(_T.c.row == index[0], _T.c.col == index[1], _B.c.seq.in_(ballots))
+    return [_vote_of(stored) for stored in connection.execute(wanted).all()]
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
@@ -167,17 +174,22 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
     return sorted({(row.row, row.col) for row in rows})
 
 
-def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
-    """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
-    spent (:func:`mapvote.fusion.fuse.unspent`)."""
-    return _judged(_standing_on(connection, index[0], [index[1]], asked.mark)[index], index, asked)
+def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[Vote]:
+    """Every standing vote on a tile, without planes, and why it does not count there. A vote that counts does so in
+    cells where it is not spent (:func:`mapvote.fusion.fuse.unspent`)."""
+    return _judged(_standing_on(connection, index[0], [index[1]], asked)[index], index, asked)
 
 
-def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
-    found = [vote for vote in standing if vote.vehicle not in asked.without]
-    why = {vote.seq: _unready(vote, index, asked) for vote in found}
-    inside = {vote.seq for vote in newest_votes([vote for vote in found if not why[vote.seq]], asked.settings)}
-    return [(vote, why[vote.seq] or ("" if vote.seq in inside else "window")) for vote in found]
+def _judged(standing: Sequence[Vote], index: TileIndex, asked: Electorate) -> list[Vote]:
+    """The ``standing`` votes on a tile but those left out, and why each does not count: damaged ones and those outside
+    the window too."""
+    judged = [vote for vote in standing if vote.vehicle not in asked.without]
+    if asked.set_aside:
+        names = [{str(vote.ballot), ballot_name(vote.ballot, *index)} for vote in judged]
+        aside = [not named.isdisjoint(asked.set_aside) for named in names]
+        judged = [replace(vote, why="damaged") if out else vote for vote, out in zip(judged, aside, strict=True)]
+    inside = {vote.ballot for vote in newest_votes([vote for vote in judged if not vote.why], asked.settings)}
+    return [vote if vote.why or vote.ballot in inside else replace(vote, why="window") for vote in judged]
 
 
 def electorate_now(
@@ -203,28 +215,12 @@ def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
     return None if first is None else int(first) + age_ns
 
 
-def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> Why:
-    cast = asked.policy.round
-    if asked.set_aside and not {str(vote.seq), ballot_name(vote.seq, *index)}.isdisjoint(asked.set_aside):
-        return "damaged"
-    if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
+def _unready(stored: Any, asked: Electorate) -> Why:
+    """Why the policy does not count a row of ``_VOTES``, on whatever tile; "" if it does."""
+    round_now = asked.policy.round
+    if stored.cast_by != round_now.cast_by or not stored.settings_hash.startswith(round_now.settings_hash):
         return "otherwise"
-    return "young" if vote.received_ns > asked.received_by_ns else ""
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """One standing vote on a tile, and what becomes of it before the votes are compared with each other."""
-
-    stored: StoredVote
-    why: Why
-    """Why it does not count on the tile; "" if it does."""
-    vote: TileVote | None = None
-    """In the cells where it counts; None if it does not."""
-    spent: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """(n,) flat cells of which it speaks, and which have changed since its vehicle drove."""
-    reviewed: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """(n,) flat cells of which it speaks, of a change that a reviewer held or rejected."""
+    return "young" if stored.received_ns > asked.received_by_ns else ""
 
 
 def judged_on(
@@ -233,28 +229,31 @@ def judged_on(
     asked: Electorate,
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
-) -> list[Judged]:
-    """Every standing vote on ``tile`` as it is now, in the order of the ballots.
+) -> list[Vote]:
+    """Every standing vote on ``tile`` as it is now, in the order of the ballots; those that count with their planes, in
+    the cells where they count.
 
     ``misread``: see :func:`mapvote.fusion.fuse.unspent`. ``polled``: what stands there, if it was asked before.
     """
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
-    standing = _judged(polled.standing[index], index, asked)
-    votes = iter(read_votes(connection, index, [vote for vote, why in standing if not why], polled))
-    found = []
-    for stored, why in standing:
-        if why:
-            found.append(Judged(stored, why))
-            continue
-        sent = next(votes)
-        fresh = polled.unspent(stored.seq, sent, tile, misread)
-        obedient = _obedient(fresh, stored.first_seq, polled.bars[index])
-        found.append(Judged(stored, "", obedient, _cells_lost(sent, fresh), _cells_lost(fresh, obedient)))
-    return found
+    judged = _judged(polled.standing[index], index, asked)
+    votes = iter(read_votes(connection, index, [vote for vote in judged if not vote.why], polled))
+    return [vote if vote.why else _where_it_counts(next(votes), tile, misread, polled) for vote in judged]
 
 
-def _cells_lost(before: TileVote, after: TileVote) -> I64:
+def _where_it_counts(sent: Vote, tile: Tile, misread: Mapping[int, Bool] | None, polled: Polled) -> Vote:
+    """A vote in the cells of ``tile`` in which it is neither spent nor of a reviewed change; and the cells lost."""
+    fresh = polled.unspent(sent, tile, misread)
+    obedient = fresh
+    # Changes that reviewers held, or rejected after the drive first arrived.
+    for seq, cells in polled.bars[tile.index]:
+        if seq is None or sent.first_seq < seq:
+            obedient = silenced(obedient, np.flatnonzero(cells))
+    return replace(obedient, spent=_cells_lost(sent, fresh), reviewed=_cells_lost(fresh, obedient))
+
+
+def _cells_lost(before: Vote, after: Vote) -> I64:
     """(n,) flat cells that the vote ``before`` determines and ``after`` does not."""
     if before is after:
         return np.empty(0, dtype=np.int64)
@@ -263,31 +262,22 @@ def _cells_lost(before: TileVote, after: TileVote) -> I64:
     return np.flatnonzero(before.spoken() != after.spoken())
 
 
-def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
-    """The vote without the cells of changes that reviewers held, or rejected after its drive first arrived."""
-    for seq, cells in bars:
-        if seq is None or first_seq < seq:
-            vote = silenced(vote, np.flatnonzero(cells))
-    return vote
-
-
 def recent_votes(
     connection: sa.Connection,
     tile: Tile,
     asked: Electorate,
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
-) -> list[TileVote]:
+) -> list[Vote]:
     """The votes that count on ``tile``, in the cells where they are not spent, of every vehicle and of the last
     :func:`history_days`: what has come and gone here, and since when?"""
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
     judged = _judged(polled.standing[index], index, asked)
-    ready = [vote for vote, why in judged if why in ("", "window")]
+    ready = [vote for vote in judged if vote.why in ("", "window")]
     oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
-    votes = zip(chosen, read_votes(connection, index, chosen, polled), strict=True)
-    return [polled.unspent(stored.seq, vote, tile, misread) for stored, vote in votes]
+    return [polled.unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled)]
 
 
 def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
@@ -315,29 +305,11 @@ Rows = Mapping[tuple[int, int, int], Any]
 """The stored planes of a vote, by tile and ballot."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoredVote:
-    """A standing ballot's row for one tile, planes not read yet."""
-
-    seq: int
-    first_seq: int
-    vehicle: str
-    drive: str
-    end_ns: int
-    received_ns: int
-    digest: str
-    base: str
-    version: int
-    """Version of the map that its vehicle used."""
-    settings_hash: str
-    cast_by: str
-
-
-def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
+def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, Vote]]) -> Rows:
     """The stored votes on tiles of a ``row``, each with its column."""
     found: dict[tuple[int, int, int], Any] = {}
     cols = sorted({col for col, _ in votes})
-    ballots = sorted({vote.seq for _, vote in votes})
+    ballots = sorted({vote.ballot for _, vote in votes})
     for start in range(0, len(ballots), DATABASE_SIZES.variables):
         asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + DATABASE_SIZES.variables]}
         rows = connection.execute(_PLANES_OF, asked_of).all()
@@ -346,30 +318,29 @@ def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, St
 
 
 def read_votes(
-    connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote], polled: Polled | None = None
-) -> list[TileVote]:
-    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are.
+    connection: sa.Connection, index: TileIndex, votes: Sequence[Vote], polled: Polled | None = None
+) -> list[Vote]:
+    """The ``votes`` with their planes, in their order, nothing silenced. DamagedBallots, naming them, if some are.
 
     ``polled``: what was read before.
     """
-    known, read = ({}, {}) if polled is None else (polled.rows, polled.read)
-    new = {vote.seq: vote for vote in stored if (*index, vote.seq) not in read}
-    missing = [(index[1], vote) for vote in new.values() if (*index, vote.seq) not in known]
-    rows = {**known, **read_rows(connection, index[0], missing)} if missing else known
-    mine = [(vote, rows[*index, vote.seq]) for vote in new.values()]
+    stored, read = ({}, {}) if polled is None else (polled.rows, polled.read)
+    unread = {vote.ballot: vote for vote in votes if (*index, vote.ballot) not in read}
+    missing = [(index[1], vote) for vote in unread.values() if (*index, vote.ballot) not in stored]
+    rows = {**stored, **read_rows(connection, index[0], missing)} if missing else stored
+    rows_of = {ballot: rows[*index, ballot] for ballot in unread}
     # Whoever is remembered is read too, or what is decided would follow from what this process happened to read before
     # the disk lost it.
-    damaged = [ballot_name(vote.seq, *index) for vote, row in mine if not is_sound(_T, row)]
+    damaged = [ballot_name(ballot, *index) for ballot, row in rows_of.items() if not is_sound(_T, row)]
     if damaged:
         raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
-    unpacked = remembered.get(row.sum for _, row in mine)
-    for vote, row in mine:
+    unpacked = remembered.get(row.sum for row in rows_of.values())
+    for ballot, row in rows_of.items():
         if row.sum not in unpacked:
             unpacked[row.sum] = unpack_planes(row)
             remembered.put(row.sum, unpacked[row.sum])
-        planes = unpacked[row.sum]
-        read[*index, vote.seq] = TileVote.of(planes, vote.vehicle, vote.end_ns, vote.digest, vote.version)
-    return [read[*index, vote.seq] for vote in stored]
+        read[*index, ballot] = unpacked[row.sum]
+    return [vote.with_planes(read[*index, vote.ballot]) for vote in votes]
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:

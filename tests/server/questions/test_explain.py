@@ -13,9 +13,8 @@ from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.config import FuseSettings
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.decision_record import REASONS
 from mapvote.fusion.fuse import decide_tile
-from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.fusion.tile_vote import DAY_NS, REASONS
 from mapvote_server.questions import explain
 from mapvote_server.questions.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell
 from mapvote_server.questions.history import last_events

@@ -18,7 +18,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.rule import SURFACES
 from mapvote.core.types import CellState
 from mapvote.fusion.fuse import fuse_tile
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
+from mapvote.fusion.tile_vote import DAY_NS, Vote, newest_votes
 from mapvote_server.questions.coverage import waiting_votes, wanted_passes
 from mapvote_server.questions.explain import explain_cell
 from mapvote_server.store.policy import Policy
@@ -96,7 +96,7 @@ def test_by_days_two_drives_of_one_day_are_one_voter(tmp_path: Path) -> None:
 def test_by_days_a_tile_is_fused_as_if_each_day_of_a_vehicle_were_a_vehicle(said: list[tuple[str, int, int]]) -> None:
     tile = make_tile(wall(WALL, [0.45, 0.75]))
     votes = [
-        TileVote(name, (20_000 + day) * DAY_NS + i, f"d{i}", states=states_plane(dict.fromkeys(WALL, state)))
+        Vote(name, (20_000 + day) * DAY_NS + i, f"d{i}", states=states_plane(dict.fromkeys(WALL, state)))
         for i, (name, day, state) in enumerate(said)
     ]
     renamed = [replace(vote, vehicle=f"{vote.vehicle}{vote.end_ns // DAY_NS}") for vote in votes]

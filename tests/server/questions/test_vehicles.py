@@ -11,7 +11,7 @@ from scipy.stats import binom
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fusion.tile_vote import DAY_NS, TileVote
+from mapvote.fusion.tile_vote import DAY_NS, Vote
 from mapvote.shapes.packed_cloud import SIDE_M
 from mapvote_server.questions.contradictions import CONTRADICTIONS, Objects, compare
 from mapvote_server.questions.vehicles import VehicleStanding, _tail, standings_of
@@ -32,8 +32,8 @@ def ghosts(n: int, fill: int = CellState.UNCHANGED_EMPTY) -> U8:
     return states
 
 
-def said(name: str, day: int, states: U8) -> TileVote:
-    return TileVote(name, day * DAY_NS, "", states=states)
+def said(name: str, day: int, states: U8) -> Vote:
+    return Vote(name, day * DAY_NS, "", states=states)
 
 
 def standings(*votes: tuple[str, int, U8]) -> dict[str, VehicleStanding]:

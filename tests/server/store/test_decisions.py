@@ -19,8 +19,9 @@ from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.rule import rule_named
 from mapvote.core.types import N_STATES, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.decision_record import REASONS, Record, Standing, pack_tally, packed_cells, unpack_tally_plane
+from mapvote.fusion.decision_record import Record, pack_standings, pack_tally, unpack_standings, unpack_tally_plane
 from mapvote.fusion.fuse import decide_tile
+from mapvote.fusion.tile_vote import REASONS, Vote
 from mapvote_server.store import schema
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.publish import publish
@@ -112,7 +113,7 @@ def test_a_copy_names_the_ballot_that_counted_for_both_and_a_damaged_one_is_told
 def test_every_reason_has_words_and_a_cell_is_found_whatever_its_number() -> None:
     assert all(REASONS.values())
     assert "" not in REASONS
-    last = Standing(1, spent=packed_cells(np.array([0, CELLS - 1])))
+    (last,) = unpack_standings(pack_standings([Vote(ballot=1, spent=np.array([0, CELLS - 1]))]))
     assert [last.why_not(cell) for cell in (0, 1, CELLS - 1)] == ["spent", "", "spent"]
 
 
@@ -121,15 +122,15 @@ def heard_again(store: Store, connection: sa.Connection, version: Version) -> di
     tile = tile_as_of(connection, store.lattice.tile(HERE), version.number - 1)
     asked = Electorate.of(version)
     judged = from_sound_ballots(connection, asked, partial(judged_on, connection, tile))
-    votes = [one.vote for one in judged if one.vote is not None]
+    votes = [vote for vote in judged if not vote.why]
     policy = asked.policy
     heard = decide_tile(tile, votes, rule_named(policy.round.method), policy.fuse)
     copies = {(copy.vehicle, copy.digest) for copy in heard.copies}
     names = {vote.vehicle for vote in heard.votes}
     return {
-        one.stored.seq: np.flatnonzero(one.vote.spoken()).tolist()
-        for one in judged
-        if one.vote is not None and one.vote.vehicle in names and (one.vote.vehicle, one.vote.digest) not in copies
+        vote.ballot: np.flatnonzero(vote.spoken()).tolist()
+        for vote in votes
+        if vote.vehicle in names and (vote.vehicle, vote.digest) not in copies
     }
 
 
@@ -154,9 +155,8 @@ def test_the_records_of_a_random_history_say_what_fusing_it_again_finds(seed: in
 
 def _sent(connection: sa.Connection, seqs: list[int]) -> dict[int, list[int]]:
     """Ballot -> flat cells of which it speaks, as it was sent."""
-    stored = stored_votes(connection, HERE, seqs)
-    votes = read_votes(connection, HERE, stored)
-    return {s.seq: np.flatnonzero(v.spoken()).tolist() for s, v in zip(stored, votes, strict=True)}
+    votes = read_votes(connection, HERE, stored_votes(connection, HERE, seqs))
+    return {vote.ballot: np.flatnonzero(vote.spoken()).tolist() for vote in votes}
 
 
 @pytest.mark.parametrize(

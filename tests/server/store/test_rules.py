@@ -18,7 +18,7 @@ from histories import START_S, live, street
 from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
 from mapvote.fusion.copies import Copy
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import Vote
 from mapvote_server.store import schema, votes
 from mapvote_server.store.database import remembered
 from mapvote_server.store.store import Store
@@ -83,7 +83,7 @@ def test_store_and_rules_agree_on_postgresql(postgres_url: str, seed: int) -> No
 def test_the_rules_object_to_a_store_that_hears_copies(
     sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def whoever_speaks(drives: Sequence[TileVote], _: FuseSettings) -> tuple[Sequence[TileVote], list[Copy]]:
+    def whoever_speaks(drives: Sequence[Vote], _: FuseSettings) -> tuple[Sequence[Vote], list[Copy]]:
         return drives, []
 
     monkeypatch.setattr(fuse, "originals", whoever_speaks)
@@ -94,7 +94,7 @@ def test_the_rules_object_to_a_store_that_hears_copies(
 def test_the_rules_object_to_a_store_that_lets_votes_count_twice(
     sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def whatever_came_since(vote: TileVote, *_: object) -> TileVote:
+    def whatever_came_since(vote: Vote, *_: object) -> Vote:
         return vote
 
     monkeypatch.setattr(votes, "unspent", whatever_came_since)

@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Memory
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote.fusion.tile_vote import DAY_NS, TileVote
+from mapvote.fusion.tile_vote import DAY_NS, Vote
 from mapvote_server.store import reviews
 from mapvote_server.store.integrity import ballot_name
 from mapvote_server.store.policy import Policy, RoundPolicy
@@ -86,16 +86,16 @@ def asked(store: Store, **more: object) -> Electorate:
 
 def judged(store: Store, question: Electorate) -> dict[str, str]:
     with store.database.reading() as connection:
-        return {vote.vehicle: why for vote, why in judged_votes(connection, HERE, question)}
+        return {vote.vehicle: vote.why for vote in judged_votes(connection, HERE, question)}
 
 
-def counting(store: Store, question: Electorate, **more: object) -> list[TileVote]:
+def counting(store: Store, question: Electorate, **more: object) -> list[Vote]:
     tile = replace(store.point_map().tiles[HERE], **more)  # type: ignore[arg-type]
     with store.database.reading() as connection:
-        return [one.vote for one in judged_on(connection, tile, question) if one.vote is not None]
+        return [vote for vote in judged_on(connection, tile, question) if not vote.why]
 
 
-def spoken(vote: TileVote) -> list[tuple[int, int]]:
+def spoken(vote: Vote) -> list[tuple[int, int]]:
     assert vote.states is not None
     return [(int(r), int(c)) for r, c in np.argwhere(vote.states != NO_VOTE)]
 
@@ -224,7 +224,7 @@ def test_votes_are_read_in_the_order_asked_for_and_no_tile_has_too_many(store: S
     cast(store, "a", say=Say(states_plane({CELL: CE})))
     cast(store, "b", say=Say(states_plane({OTHER: UO})))
     with store.database.reading() as connection:
-        stored = [vote for vote, _ in judged_votes(connection, HERE, asked(store))]
+        stored = judged_votes(connection, HERE, asked(store))
         backwards = read_votes(connection, HERE, stored[::-1])
         many = read_votes(connection, HERE, stored * 600)  # more than one statement may ask for
         assert read_votes(connection, HERE, []) == []
