@@ -31,6 +31,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from mapvote.codec.planes import zstd
@@ -106,10 +107,17 @@ class Fleet:
         self.vehicles += vehicles
 
 
+def votes_on(connection: sqlite3.Connection, tile: TileIndex) -> list[dict[str, bytes]]:
+    """The packed planes of every vote on a tile, by name."""
+    rows = connection.execute("SELECT votes FROM ballot_tiles WHERE row = ? AND col = ?", tile)
+    return [msgspec.msgpack.decode(votes) for (votes,) in rows]
+
+
 def numpy_tile(connection: sqlite3.Connection, tile: TileIndex) -> U8:
     """The peer: one tile's states by the columns rule with two votes for a change, in plain numpy."""
-    rows = connection.execute("SELECT states FROM ballot_tiles WHERE row = ? AND col = ?", tile)
-    planes = np.stack([np.frombuffer(zstd.decompress(data), np.uint8) for (data,) in rows])
+    planes = np.stack(
+        [np.frombuffer(zstd.decompress(votes["states"]), np.uint8) for votes in votes_on(connection, tile)]
+    )
     counts = np.stack([(planes == state).sum(axis=0) for state in range(5)])
     determined = counts[:4]
     best = determined.max(axis=0)
@@ -132,10 +140,10 @@ def unpacked_words(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 def numpy_whole_tile(connection: sqlite3.Connection, tile: TileIndex) -> tuple[U8, np.ndarray, np.ndarray, np.ndarray]:
     """The peer with all planes: (states, bits that go, voxels that come, bits that are free), each by two vehicles."""
     decided = numpy_tile(connection, tile)
-    query = "SELECT states, gone, new_points, free FROM ballot_tiles WHERE row = ? AND col = ?"
     gone, free = np.zeros((2, 2, len(decided)), np.uint64)
     offered = []
-    for states, mask, points, passed in connection.execute(query, tile):
+    for votes in votes_on(connection, tile):
+        states, mask, points, passed = (votes[name] for name in ("states", "gone", "new_points", "free"))
         own = np.frombuffer(zstd.decompress(states), np.uint8)
         for data, reached, counts in ((mask, gone, (own == 3) & (decided == 3)), (passed, free, own != NO_VOTE)):
             cells, words = unpacked_words(data)

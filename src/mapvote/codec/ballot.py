@@ -114,7 +114,7 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
         return "one-stage" if any(tile.tally is not None for tile in self.tiles) else "two-stage"
 
 
-_BALLOT = msgspec.msgpack.Decoder(Ballot)
+_BALLOT, _BALLOT_TILE = msgspec.msgpack.Decoder(Ballot), msgspec.msgpack.Decoder(BallotTile)
 """Made when the module is loaded: msgspec makes what it knows of a type at its first use, and the process crashes where
 two threads do so at once."""
 
@@ -133,6 +133,19 @@ def tile_key(tile: TileIndex) -> str:
 def encode(ballot: Ballot) -> bytes:
     """The ballot as one self-contained file."""
     return msgspec.msgpack.encode(ballot)
+
+
+def encode_tile(tile: BallotTile) -> bytes:
+    """The votes on one tile as a ballot holds them."""
+    return msgspec.msgpack.encode(tile)
+
+
+def decode_tile(data: bytes) -> BallotTile:
+    """The inverse of :func:`encode_tile`; MapvoteError if it is damaged."""
+    try:
+        return _BALLOT_TILE.decode(data)
+    except msgspec.DecodeError as error:
+        raise MapvoteError(f"ballot: the votes on a tile are not readable ({error})") from error
 
 
 def is_ballot(data: bytes) -> bool:
@@ -232,8 +245,7 @@ class Planes:
 
 
 def unpack_planes(packed: BallotTile) -> Planes:
-    """The votes on one tile, of a ballot or of a server's row with its planes; MapvoteError if a plane is damaged or
-    impossible."""
+    """The votes on one tile of a ballot; MapvoteError if a plane is damaged or impossible."""
     new_points, fields = unpack_offer(packed.new_points, packed.fields)
     states = None if packed.states is None else unpack_states(packed.states)
     return Planes(

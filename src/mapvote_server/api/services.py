@@ -30,7 +30,7 @@ from mapvote_server.questions.clouds import Clouds
 from mapvote_server.questions.history import Feed
 from mapvote_server.store import keys
 from mapvote_server.store.admission import Intake, Quota, Receipt
-from mapvote_server.store.examination import Incoming
+from mapvote_server.store.examination import Examination
 from mapvote_server.store.fusion_jobs import Watched
 from mapvote_server.store.integrity import KINDS
 from mapvote_server.store.publish import Gate
@@ -356,7 +356,7 @@ class Services:
         """The executor that fuses tiles."""
         quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
         self.intake = Intake(store, quota)
-        self.writer: Batcher[Incoming, Receipt] = Batcher(self.intake.write, SERVICE_SIZES.batch, self._writing)
+        self.writer: Batcher[Examination, Receipt] = Batcher(self.intake.write, SERVICE_SIZES.batch, self._writing)
         """Writes ballots, many in one transaction."""
         self.newest: Batcher[None, int] = Batcher(
             lambda asked: [store.current()] * len(asked), SERVICE_SIZES.readers, self.lookups

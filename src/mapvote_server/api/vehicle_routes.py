@@ -34,7 +34,7 @@ from mapvote_server.api.schemas import (
 from mapvote_server.api.services import Known, Parts, own, services
 from mapvote_server.questions.history import DatedVersion, dated_versions
 from mapvote_server.store.admission import Intake, Receipt
-from mapvote_server.store.examination import Examination, Incoming
+from mapvote_server.store.examination import Examination
 from mapvote_server.store.votes import withdraw
 
 router = APIRouter()
@@ -166,10 +166,9 @@ _SLICE_S = 0.01
 ballot beside large ones would need several turns."""
 
 
-def _open(
-    intake: Intake, body: bytes, drive: tuple[str, str], key_hash: str | None
-) -> tuple[Examination, Incoming | None]:
-    """A ballot that nothing in its envelope forbids, and its first slice unpacked; its refusal is raised."""
+def _open(intake: Intake, body: bytes, drive: tuple[str, str], key_hash: str | None) -> tuple[Examination, bool]:
+    """A ballot that nothing in its envelope forbids, its first slice unpacked, and whether that is all; its refusal is
+    raised."""
     examined = Examination(body, drive, key_hash)
     refused = intake.refuse_early(examined)
     if refused is not None:
@@ -186,10 +185,10 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
     given = parts.intake, body, (vehicle, drive), request.state.key_hash
-    examined, incoming = await parts.vehicle.run(_open, *given)
-    while incoming is None:  # behind the other vehicles that wait
-        incoming = await parts.vehicle.run(examined.go_on, _SLICE_S)
-    receipt = await parts.writer.put(incoming)
+    examined, done = await parts.vehicle.run(_open, *given)
+    while not done:  # behind the other vehicles that wait
+        done = await parts.vehicle.run(examined.go_on, _SLICE_S)
+    receipt = await parts.writer.put(examined)
     parts.metrics.ballots.labels(receipt.result).inc()
     created = receipt.result == "created"
     return Response(msgspec.json.encode(receipt), 201 if created else 200, media_type="application/json")

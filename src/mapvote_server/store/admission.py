@@ -8,7 +8,7 @@ Where a vehicle can have been is checked too (:mod:`mapvote_server.store.place`)
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, tile_key
+from mapvote.codec.ballot import Ballot, encode_tile, tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import TileIndex
@@ -26,7 +26,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote_server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote_server.store import keys, schema
 from mapvote_server.store.database import Question, insert_rows
-from mapvote_server.store.examination import Examination, Incoming, Votes, cells_of
+from mapvote_server.store.examination import Examination, cells_of
 from mapvote_server.store.place import (
     PLACE_RULE,
     TWO_PLACES,
@@ -107,7 +107,7 @@ class RoundNow:
             self.tiles |= tiles_of(connection, newest, touched)
             self.newest = newest
 
-    def refusal(self, one: Incoming | Examination, now_ns: int) -> MapvoteError | None:
+    def refusal(self, one: Examination, now_ns: int) -> MapvoteError | None:
         """The reason why an envelope does not fit the round, the clock or the map; None if it does."""
         ballot = one.ballot
         asked = self._asked
@@ -189,7 +189,7 @@ class Intake:
                 _, standing = _heard_of(connection, [one])
         return None if standing.get(one.drive, (0, ""))[1] == one.digest else refused
 
-    def write(self, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
+    def write(self, ballots: Sequence[Examination]) -> list[Receipt | MapvoteError]:
         """Store the ballots that are admitted, in one durable transaction: for each a receipt, or why not.
 
         Conflict: another map, method, settings or base than the store's, or no cell that still counts. Unauthorised:
@@ -209,7 +209,7 @@ class Intake:
             valid = keys.of(connection, came_with, now) if came_with else {}
             first, standing = _heard_of(connection, ballots)
             rows: Rows = defaultdict(list)
-            admitted: list[Incoming] = []
+            admitted: list[Examination] = []
             for one in ballots:
                 old, old_digest = standing.get(one.drive, (None, ""))
                 if old is not None and old_digest == one.digest:
@@ -236,46 +236,44 @@ class Intake:
                 connection.execute(_REPLACED, replaced)
         return results
 
-    def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
+    def _refusal(self, connection: sa.Connection, one: Examination, now: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
         ballot = one.ballot
         tiles = self._round.tiles
-        refused = self._round.refusal(one, now) or refuse_out_of_reach(one.votes, tiles.keys())
-        refused = refused or self._out_of_height(connection, one.votes)
+        refused = self._round.refusal(one, now) or refuse_out_of_reach(one.spoken, tiles.keys())
+        refused = refused or self._out_of_height(connection, one.heights_m)
         if refused is not None:
             return refused
         counts = ballot.version == self._round.newest
-        for votes in one.votes:
-            now_there = tiles.get(votes.tile)
+        for tile, spoken in one.spoken.items():
             if ballot.version != self._round.newest:
-                refused = wrong_base(ballot, votes.tile, tile_of(connection, ballot.version, votes.tile))
+                refused = wrong_base(ballot, tile, tile_of(connection, ballot.version, tile))
                 if refused is not None:
                     return refused
-            counts = counts or _counts_somewhere(connection, votes, ballot.version, now_there)
+            counts = counts or _counts_somewhere(connection, tile, spoken, ballot.version, tiles.get(tile))
         if not counts:
-            stale = names(votes.tile for votes in one.votes)
+            stale = names(one.tiles)
             return Conflict(
                 f"every cell voted on has changed since version {ballot.version}: fetch tiles {stale} and vote again"
             )
         return self._count_in(connection, one, now)
 
-    def _out_of_height(self, connection: sa.Connection, votes: Sequence[Votes]) -> MapvoteError | None:
+    def _out_of_height(
+        self, connection: sa.Connection, heights_m: Mapping[TileIndex, tuple[float, float]]
+    ) -> MapvoteError | None:
         """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
 
         The nearest tiles tell: itself and its neighbours, else those in reach.
         """
         tiles = self._round.tiles
-        for one in votes:
-            if one.heights_m is None:
-                continue
-            low, high = one.heights_m
-            near = touched(one.tile, tiles) or [index for index in around(one.tile) if index in tiles]
+        for tile, (low, high) in heights_m.items():
+            near = touched(tile, tiles) or [index for index in around(tile) if index in tiles]
             ground_m = min((self._ground_m(connection, tiles[index].ground) for index in near), default=np.inf)
             if (
                 np.isfinite(ground_m)
                 and not ground_m - PLACE_RULE.below_m <= low <= high <= ground_m + PLACE_RULE.above_m
             ):
-                span = f"{low:.1f} to {high:.1f} m on tile {tile_key(one.tile)}"
+                span = f"{low:.1f} to {high:.1f} m on tile {tile_key(tile)}"
                 below = (
                     f"{PLACE_RULE.below_m:g} m below to {PLACE_RULE.above_m:g} m above the map's lowest ground there"
                 )
@@ -294,7 +292,7 @@ class Intake:
             self._lowest_m[ground] = float(plane[np.isfinite(plane)].min(initial=np.inf))
         return self._lowest_m[ground]
 
-    def _over_quota(self, one: Incoming | Examination, used: _Used | None) -> MapvoteError | None:
+    def _over_quota(self, one: Examination, used: _Used | None) -> MapvoteError | None:
         """The refusal of a ballot that is too much of its vehicle; None if it is not. ``used``: None if unknown."""
         if self._quota is None:
             return None
@@ -303,7 +301,7 @@ class Intake:
             return MapvoteError(f"{limit}: send each part of it as a drive of its own")
         return None if used is None else _exceeded(self._quota, used, one)
 
-    def _count_in(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
+    def _count_in(self, connection: sa.Connection, one: Examination, now: int) -> MapvoteError | None:
         """The refusal of a ballot that exceeds its vehicle's budget; None admits and counts it. A vehicle's use is
         counted in the store once an hour and before a refusal; in between, admitted ballots are added."""
         if self._quota is None:
@@ -336,11 +334,11 @@ _REPLACED = _REPLACED.values(gone_seq=sa.bindparam("by"))
 
 
 def _heard_of(
-    connection: sa.Connection, ballots: Sequence[Incoming | Examination]
+    connection: sa.Connection, ballots: Sequence[Examination]
 ) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], tuple[int, str]]]:
     """For the drives of these ballots: ({drive: its first event}, {drive: (number, digest) of its standing ballot})."""
     b = schema.ballots
-    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({incoming.drive for incoming in ballots})
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({examined.drive for examined in ballots})
     query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
     first: dict[tuple[str, str], int] = {}
     standing: dict[tuple[str, str], tuple[int, str]] = {}
@@ -355,14 +353,16 @@ Rows = dict[sa.Table, list[tuple[Any, ...]]]
 """Rows to insert, each in the order of its table's columns."""
 
 
-def _enter(rows: Rows, incoming: Incoming, seq: int, first_seq: int, now: int) -> None:
+def _enter(rows: Rows, examined: Examination, seq: int, first_seq: int, now: int) -> None:
     """Add those of a ballot."""
-    ballot = incoming.ballot
-    rows[schema.events].append((seq, now, "ballot", *incoming.drive))
+    ballot = examined.ballot
+    rows[schema.events].append((seq, now, "ballot", *examined.drive))
     times = ballot.start_ns, ballot.end_ns, now
-    how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
-    rows[schema.ballots].append((seq, first_seq, None, *incoming.drive, incoming.digest, *times, *how))
-    rows[schema.ballot_tiles] += [(*votes.tile, seq, *votes.stored) for votes in incoming.votes]
+    how = ballot.settings_hash[:128], examined.cast_by, examined.size, ballot.version
+    rows[schema.ballots].append((seq, first_seq, None, *examined.drive, examined.digest, *times, *how))
+    for tile in ballot.tiles:
+        content = ballot.base[tile_key(tile.tile)], encode_tile(tile), examined.sums[tile.tile]
+        rows[schema.ballot_tiles].append((*tile.tile, seq, *content))
     if ballot.path is not None:
         rows[schema.paths].append((seq, ballot.path))
 
@@ -377,7 +377,7 @@ _SAME_TIME = Question(
 """Standing ballots of other drives of a vehicle in a span of time."""
 
 
-def elsewhere(connection: sa.Connection, one: Incoming, beside: Sequence[Incoming]) -> list[str]:
+def elsewhere(connection: sa.Connection, one: Examination, beside: Sequence[Examination]) -> list[str]:
     """Drives of the same vehicle at another place at the same time: in the store, or ``beside`` it in its batch."""
     ballot = one.ballot
     window_ns = round(TWO_PLACES.window_s * 1e9)
@@ -386,12 +386,11 @@ def elsewhere(connection: sa.Connection, one: Incoming, beside: Sequence[Incomin
     others = [(row.drive, row.start_ns, row.end_ns, _tiles_of_ballot(connection, row.seq)) for row in rows]
     for other in beside:
         if other.ballot.vehicle == ballot.vehicle and other.ballot.drive != ballot.drive:
-            tiles = [votes.tile for votes in other.votes]
-            others.append((other.ballot.drive, other.ballot.start_ns, other.ballot.end_ns, tiles))
+            others.append((other.ballot.drive, other.ballot.start_ns, other.ballot.end_ns, other.tiles))
     warnings = []
     for drive, start_ns, end_ns, tiles in others:
         pause_s = max(0, start_ns - ballot.end_ns, ballot.start_ns - end_ns) / 1e9
-        distance_m = apart_m([votes.tile for votes in one.votes], tiles)
+        distance_m = apart_m(one.tiles, tiles)
         if are_two_places(distance_m, pause_s):
             both = f"drives {ballot.drive} and {drive}, {pause_s:.0f} s apart, lie {distance_m / 1e3:.1f} km apart"
             warnings.append(f"{both}: two vehicles send with one key; revoke it if it was stolen")
@@ -403,23 +402,26 @@ def _tiles_of_ballot(connection: sa.Connection, seq: int) -> list[TileIndex]:
     return [(row, col) for row, col in connection.execute(sa.select(t.row, t.col).where(t.ballot == seq))]
 
 
-def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
-    """Whether a ballot determines a cell that has not changed since ``version``.
+def _counts_somewhere(
+    connection: sa.Connection, tile: TileIndex, spoken: bytes, version: int, newest: TileHashes | None
+) -> bool:
+    """Whether a ballot votes on a cell of a tile that has not changed since ``version``. ``spoken``: the cells on which
+    it votes; ``newest``: the tile of the newest version.
 
     If the memory of the tile is damaged this is unknown: the votes are admitted and wait until the plane is restored.
     """
     try:
-        if now is None:
-            memory = memory_of(connection, (1 << 31) - 1, votes.tile)
+        if newest is None:
+            memory = memory_of(connection, (1 << 31) - 1, tile)
         else:
-            memory = None if now.memory is None else load_memory(connection, now.memory)
+            memory = None if newest.memory is None else load_memory(connection, newest.memory)
     except Unavailable:
         raise
     except MapvoteError:
         return True
     if memory is None or not len(memory.changed_after(version)):
         return True
-    return bool((cells_of(votes.spoken) & (memory.changed <= version)).any())
+    return bool((cells_of(spoken) & (memory.changed <= version)).any())
 
 
 @dataclass(frozen=True, slots=True)
@@ -440,7 +442,7 @@ class _Used:
     size: int
 
 
-def _exceeded(quota: Quota, used: _Used, one: Incoming | Examination) -> TooMany | None:
+def _exceeded(quota: Quota, used: _Used, one: Examination) -> TooMany | None:
     vehicle = one.ballot.vehicle
     if used.ballots >= quota.drives_a_day:
         said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"

@@ -5,17 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, Planes, check_path, decode, tile_key, unpack_planes
+from mapvote.codec.ballot import Ballot, BallotTile, check_path, decode, encode_tile, tile_key, unpack_planes
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import Bool, MapvoteError
-from mapvote_server.store import schema
 from mapvote_server.store.database import remembered, sum_of
 
 
@@ -38,43 +35,8 @@ class ExaminationRule:
 EXAMINATION_RULE = ExaminationRule()
 
 
-@dataclass(frozen=True, slots=True)
-class Votes:
-    """Facts of a ballot's votes on one tile, for admission."""
-
-    tile: TileIndex
-    spoken: bytes
-    """The cells that it votes on: 65536 bits, row by row."""
-    heights_m: tuple[float, float] | None
-    """Heights of its lowest and highest new point, map metres; None: it has none."""
-    stored: tuple[Any, ...] = field(repr=False)
-    """Base, planes and sum, as the last columns of ``ballot_tiles``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Incoming:
-    """A ballot that is sound in itself."""
-
-    ballot: Ballot
-    votes: Sequence[Votes]
-    """The votes on each of its tiles."""
-    digest: str
-    """SHA-256 of the bytes that the vehicle sent."""
-    cast_by: str
-    """Method and stage: all ballots of a round agree on them."""
-    size: int
-    """Bytes."""
-    key_hash: str | None = None
-    """Hash of the key that sent the ballot; None: a client of this machine that needs none."""
-
-    @property
-    def drive(self) -> tuple[str, str]:
-        """(vehicle, drive)."""
-        return self.ballot.vehicle, self.ballot.drive
-
-
 class Examination:
-    """A ballot whose envelope is sound; :meth:`go_on` unpacks its planes.
+    """A ballot as it arrives. Its envelope is sound; its planes are once :meth:`go_on` has unpacked them all.
 
     MapvoteError if the envelope is not, or if the ballot is of another ``drive`` (vehicle, drive) than its URL. The key
     is not checked.
@@ -91,10 +53,19 @@ class Examination:
             )
         self.ballot = ballot
         self.cast_by = f"{ballot.method}, {ballot.stage}"
+        """Method and stage: all ballots of a round agree on them."""
         self.size = len(data)
+        """Bytes."""
         self.digest = hashlib.sha256(data).hexdigest()
-        self._key_hash = key_hash
-        self._votes: list[Votes] = []
+        """SHA-256 of the bytes that the vehicle sent."""
+        self.key_hash = key_hash
+        """Hash of the key that sent the ballot; None: a client of this machine that needs none."""
+        self.spoken: dict[TileIndex, bytes] = {}
+        """The cells on which it votes, by tile: 65536 bits, row by row."""
+        self.heights_m: dict[TileIndex, tuple[float, float]] = {}
+        """Heights of the lowest and the highest new point on each tile that has any, map metres."""
+        self.sums: dict[TileIndex, str] = {}
+        """The sum of each tile's row of ``ballot_tiles``."""
         self._unpacked_bytes = 0
         if drive not in (None, self.drive):
             raise MapvoteError(f"the ballot is of {'/'.join(self.drive)}, not {drive[0][:64]}/{drive[1][:64]}")
@@ -109,42 +80,40 @@ class Examination:
         """The tiles that it votes on."""
         return [tile.tile for tile in self.ballot.tiles]
 
-    def go_on(self, for_s: float = math.inf) -> Incoming | None:
-        """Unpack tiles until all are done or ``for_s`` seconds of CPU are used; the ballot, or None if tiles remain.
+    def go_on(self, for_s: float = math.inf) -> bool:
+        """Unpack tiles until all are done or ``for_s`` seconds of CPU are used; whether all are done.
 
         MapvoteError on the first defect.
         """
-        if not self._votes and self.ballot.path is not None:
+        if not self.spoken and self.ballot.path is not None:
             check_path(self.ballot.path, self.tiles)
         ends_s = time.thread_time() + for_s
-        for tile in self.ballot.tiles[len(self._votes) :]:
-            planes = unpack_planes(tile)
-            self._unpacked_bytes += planes.nbytes
-            if self._unpacked_bytes > EXAMINATION_RULE.unpacked_bytes:
-                most = f"ballot: larger than {EXAMINATION_RULE.unpacked_bytes} bytes when decompressed"
-                raise MapvoteError(f"{most}; send a shorter drive")
-            self._votes.append(_votes_of(tile, self.ballot.base[tile_key(tile.tile)], planes))
+        for tile in self.ballot.tiles[len(self.spoken) :]:
+            self._unpack(tile)
             if time.thread_time() > ends_s:
                 break
-        if len(self._votes) < len(self.ballot.tiles):
-            return None
-        return Incoming(self.ballot, self._votes, self.digest, self.cast_by, self.size, self._key_hash)
+        return len(self.spoken) == len(self.ballot.tiles)
+
+    def _unpack(self, tile: BallotTile) -> None:
+        planes = unpack_planes(tile)
+        self._unpacked_bytes += planes.nbytes
+        if self._unpacked_bytes > EXAMINATION_RULE.unpacked_bytes:
+            most = f"ballot: larger than {EXAMINATION_RULE.unpacked_bytes} bytes when decompressed"
+            raise MapvoteError(f"{most}; send a shorter drive")
+        self.spoken[tile.tile] = np.packbits(planes.spoken()).tobytes()
+        if planes.new_points is not None and len(planes.new_points):
+            z = planes.new_points[:, 2]
+            self.heights_m[tile.tile] = (float(np.min(z)), float(np.max(z)))
+        # A publish soon after need not unpack them again.
+        self.sums[tile.tile] = sum_of(self.ballot.base[tile_key(tile.tile)], encode_tile(tile))
+        remembered.put(self.sums[tile.tile], planes)
 
 
-def examine(data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> Incoming:
+def examine(data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> Examination:
     """The whole of :class:`Examination` at once; MapvoteError as there."""
-    incoming = Examination(data, drive, key_hash).go_on()
-    assert incoming is not None
-    return incoming
-
-
-def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
-    packed = base, *(getattr(tile, plane) for plane in schema.BALLOT_PLANES)
-    digest = sum_of(*packed)
-    remembered.put(digest, planes)
-    z = () if planes.new_points is None else planes.new_points[:, 2]
-    heights = (float(np.min(z)), float(np.max(z))) if len(z) else None
-    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), heights, (*packed, digest))
+    examined = Examination(data, drive, key_hash)
+    examined.go_on()
+    return examined
 
 
 def _check_founded(ballot: Ballot) -> None:

@@ -4,7 +4,7 @@ the same time.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
-from mapvote_server.store.examination import Votes, cells_of
+from mapvote_server.store.examination import cells_of
 
 
 @record()
@@ -54,15 +54,16 @@ def _too_far(tile: TileIndex) -> MapvoteError:
     return MapvoteError(f"{far}: a vehicle votes on what it saw while it localised in the map")
 
 
-def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """The check of :func:`refuse_far_tiles`, by the cells on which a ballot votes."""
-    for votes in said:
-        if touched(votes.tile, map_tiles):
+def refuse_out_of_reach(spoken: Mapping[TileIndex, bytes], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
+    """The check of :func:`refuse_far_tiles`, by the cells of each tile on which a ballot votes (``spoken``, see
+    :class:`mapvote_server.store.examination.Examination`)."""
+    for tile, cells in spoken.items():
+        if touched(tile, map_tiles):
             continue  # the whole tile is within reach
-        near = [index for index in around(votes.tile) if index in map_tiles]
-        if not near or _farthest_m(votes, near) > PLACE_RULE.reach_m:
-            return _too_far(votes.tile)
-    return refuse_far_tiles([votes.tile for votes in said], map_tiles)
+        near = [index for index in around(tile) if index in map_tiles]
+        if not near or _farthest_m(tile, cells, near) > PLACE_RULE.reach_m:
+            return _too_far(tile)
+    return refuse_far_tiles(list(spoken), map_tiles)
 
 
 _AROUND = [
@@ -85,13 +86,13 @@ def touched(index: TileIndex, map_tiles: Collection[TileIndex]) -> list[TileInde
     return [tile for tile in beside if tile in map_tiles]
 
 
-def _farthest_m(votes: Votes, near: Collection[TileIndex]) -> float:
+def _farthest_m(tile: TileIndex, spoken: bytes, near: Collection[TileIndex]) -> float:
     """From the map's nearest tile to the cell that is farthest from all of them, of those voted on; metres."""
-    rows, cols = np.nonzero(cells_of(votes.spoken))
+    rows, cols = np.nonzero(cells_of(spoken))
     if not len(rows):
         return 0.0
-    y = (votes.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
-    x = (votes.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
+    y = (tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
+    x = (tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
     least: F64 = np.full(len(rows), np.inf)
     for row, col in near:
         dy = np.maximum(np.maximum(row * _TILE_M - y, y - (row + 1) * _TILE_M), 0.0)

@@ -123,9 +123,8 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
     window_ns = round(max(history_days(policy.fuse) for policy in policies) * DAY_NS)
     past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
-    size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in schema.BALLOT_PLANES), start=sa.literal(0))
     found = (
-        sa.select(t.c.row, t.c.col, t.c.ballot, size.label("size"))
+        sa.select(t.c.row, t.c.col, t.c.ballot, sa.func.length(t.c.votes).label("size"))
         .join(b, b.c.seq == t.c.ballot)
         .join(newest, (newest.c.row == t.c.row) & (newest.c.col == t.c.col), isouter=True)
     )

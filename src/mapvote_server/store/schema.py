@@ -21,8 +21,6 @@ metadata = sa.MetaData(
 _Hash = sa.String(64)
 TILE_PLANES = "points", "ground", "free", "memory", "fields"
 """Columns of version_tiles: hashes of planes."""
-BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "fields", "odds"
-"""Columns of ballot_tiles that hold planes."""
 
 maps = sa.Table(
     "maps",
@@ -145,11 +143,12 @@ ballot_tiles = sa.Table(
     sa.Column("col", sa.Integer, primary_key=True),
     sa.Column("ballot", sa.BigInteger, sa.ForeignKey("ballots.seq"), primary_key=True),
     sa.Column("base", sa.String(64), nullable=False),
-    *(sa.Column(plane, sa.LargeBinary) for plane in BALLOT_PLANES),
+    sa.Column("votes", sa.LargeBinary, nullable=False),
     sum_but("row", "col", "ballot"),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
-"""Two rows of the same sum say the same."""
+"""``votes``: the votes on the tile as the ballot holds them (:func:`mapvote.codec.ballot.encode_tile`). Two rows of the
+same sum say the same."""
 
 paths = sa.Table(
     "paths",

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Planes, unpack_planes
+from mapvote.codec.ballot import Planes, decode_tile, unpack_planes
 from mapvote.codec.tile_planes import unpack_cells
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
@@ -295,8 +295,7 @@ def ballots_aside(connection: sa.Connection) -> frozenset[str]:
     return frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
 
 
-_PLANES_OF = sa.select(_T.c.row, _T.c.col, _T.c.ballot, *(_T.c[p] for p in schema.BALLOT_PLANES), _T.c.base, _T.c.sum)
-_PLANES_OF = _PLANES_OF.where(
+_PLANES_OF = sa.select(_T).where(
     _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
     _T.c.col.in_(sa.bindparam("cols", expanding=True)),
     _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
@@ -337,7 +336,7 @@ def read_votes(
     unpacked = remembered.get(row.sum for row in rows_of.values())
     for ballot, row in rows_of.items():
         if row.sum not in unpacked:
-            unpacked[row.sum] = unpack_planes(row)
+            unpacked[row.sum] = unpack_planes(decode_tile(row.votes))
             remembered.put(row.sum, unpacked[row.sum])
         read[*index, ballot] = unpacked[row.sum]
     return [vote.with_planes(read[*index, vote.ballot]) for vote in votes]

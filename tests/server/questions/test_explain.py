@@ -66,7 +66,7 @@ def test_a_vote_that_a_version_counted_stays_in_the_story_when_it_is_taken_back(
     assert (found["a"].why, found["b"].why) == ("withdrawn", "its vehicle's key was revoked")
     assert found["c"].why.startswith("spent")
     with store.database.writing() as connection:
-        connection.execute(schema.ballot_tiles.update().values(states=b"rot"))
+        connection.execute(schema.ballot_tiles.update().values(votes=b"rot"))
     assert [vote.state for vote in story(store).votes] == ["unreadable"], "of those that stand"
 
 
@@ -116,7 +116,7 @@ def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
     with store.database.writing() as connection:
         t = schema.ballot_tiles
         first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
-        connection.execute(t.update().where(t.c.ballot == first).values(states=b"rot"))
+        connection.execute(t.update().where(t.c.ballot == first).values(votes=b"rot"))
     assert [(v.state, v.counts) for v in story(store).votes] == [
         ("unreadable", False), ("changed_empty", True), ("changed_empty", True)
     ]  # fmt: skip

@@ -147,7 +147,7 @@ class Street:
             if rows:
                 ballot, row, col = rows[which % len(rows)]
                 here = (t.c.ballot == ballot) & (t.c.row == row) & (t.c.col == col)
-                connection.execute(t.update().where(here).values(states=b"spoilt"))
+                connection.execute(t.update().where(here).values(votes=b"spoilt"))
         check(self.store, mend=True)
 
     def lose_plane(self, which: int) -> None:

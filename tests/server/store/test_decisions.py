@@ -103,7 +103,7 @@ def test_a_copy_names_the_ballot_that_counted_for_both_and_a_damaged_one_is_told
     )
     t = schema.ballot_tiles
     with store.database.writing() as connection:
-        connection.execute(t.update().where(t.c.ballot == rotten).values(states=b"rot"))
+        connection.execute(t.update().where(t.c.ballot == rotten).values(votes=b"rot"))
     assert publish(store).published
     found = {s.ballot: (s.why, s.alike) for s in records(store)[0].standings}
     assert sorted([found[a], found[liar]]) == [("", 0), ("copy", a if found[a] == ("", 0) else liar)]

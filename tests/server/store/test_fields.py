@@ -150,7 +150,7 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
     assert publish(store).published
     t = schema.ballot_tiles
     with store.database.writing() as connection:
-        connection.execute(t.update().values(fields=None))
+        connection.execute(t.update().values(votes=b""))
     assert {damage.kind for damage in check(store)} == {"ballot"}, "what a ballot said of it is covered too"
 
 

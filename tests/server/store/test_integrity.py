@@ -84,7 +84,7 @@ def test_what_is_damaged_hides_nothing_else_from_whoever_looks(store: Store) -> 
     t = schema.ballot_tiles
     with store.database.reading() as connection:
         first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
-    flip(store, t, "states", (t.c.ballot == first) & (t.c.col == 0))
+    flip(store, t, "votes", (t.c.ballot == first) & (t.c.col == 0))
     flip(store, schema.blobs, "data", schema.blobs.c.hash == ground)
     for _ in range(2):
         found = changes_between(store, 1, 2)
@@ -102,7 +102,7 @@ def test_a_tile_whose_deciding_ballots_are_set_aside_is_decided_anew(store: Stor
     receipts = send(store, *[make_ballot(base, deny, vehicle) for vehicle in "defg"])
     assert publish(store).tiles == ["0,1"], "three against four"
     for receipt in receipts:
-        flip(store, t, "states", t.c.ballot == receipt.seq)
+        flip(store, t, "votes", t.c.ballot == receipt.seq)
     assert len(check(store, mend=True)) == 4
     assert publish(store).tiles == ["0,0"]
 
@@ -112,7 +112,7 @@ def test_a_damaged_ballot_is_left_out_and_the_others_decide(store: Store) -> Non
     t = schema.ballot_tiles
     with store.database.reading() as connection:
         seq = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
-    flip(store, t, "states", (t.c.ballot == seq) & (t.c.col == 0))
+    flip(store, t, "votes", (t.c.ballot == seq) & (t.c.col == 0))
     name = ballot_name(seq, 0, 0)
     assert [damage.name for damage in check(store)] == [name]
     done = publish(store)
