@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from mapvote.survey.build import BuildReport
 
 Format = Literal["png", "svg", "pdf"]
-FORMATS: tuple[Format, ...] = "png", "svg", "pdf"
 
 
 class Colour(StrEnum):
@@ -59,9 +58,13 @@ STATE_NAMES = {
     CellState.CHANGED_EMPTY: "changed (empty)",
     CellState.UNDETERMINED: "undetermined",
 }
-STATE_MAP = ListedColormap([*STATE_COLOURS.values(), Colour.WHITE])
 VEHICLE_COLOURS = ("#22303c", "#e07b00", "#2a8f5b", "#8e44ad", "#7f5539", "#0b7a75", "#b5179e", "#6c757d")
 """Never red nor blue: those mean change."""
+
+
+def state_map() -> ListedColormap:
+    """The colour of each state, in their order, and white for no vote."""
+    return ListedColormap([*STATE_COLOURS.values(), Colour.WHITE])
 
 
 @record()
@@ -99,7 +102,7 @@ _FONT = {
 
 
 def state_image(states: U8) -> U8:
-    """States as indices of STATE_MAP."""
+    """States as indices of :func:`state_map`."""
     return np.where(states == NO_VOTE, len(CellState), states).astype(np.uint8)
 
 

@@ -38,8 +38,6 @@ from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.rules.voter import NewPoints, TileVotes, make_voter, points_in
 
-NOTHING = np.uint64(0)
-
 
 class ClosedStretch(NamedTuple):
     """The road of one ballot that is closed."""
@@ -287,7 +285,7 @@ def _ballot_tile(
     """One-stage, the server decides: then every cell that got a vote for changed-occupied may need its points."""
     built = CellState.CHANGED_OCCUPIED
     came = votes.states == built if two_stage else votes.tally[..., built] > 0
-    kept, sent = offered(point_map, tile, np.where(came, votes.new, NOTHING), points, names)
+    kept, sent = offered(point_map, tile, np.where(came, votes.new, np.uint64(0)), points, names)
     measured = {name: values for name, values in sent.items() if (values != point_field(name).unmeasured).any()}
     odds = None
     if two_stage and votes.looked is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -147,11 +147,11 @@ def evaluate(
         evaluation = run(scene, cases, with_yardsticks, told, sentences)
     _show(list(tables(evaluation.result)), evaluation.result, json)
     if figures is not None:
-        from mapvote.plots import FORMATS
+        from mapvote.plots import Format
         from mapvote_lab.evaluation.gallery import gallery
 
         with progress("drawing"):
-            drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
+            drawn = gallery(evaluation, evaluation.best, figures, get_args(Format))
         print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 

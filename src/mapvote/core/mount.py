@@ -12,21 +12,23 @@ from itertools import product
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy, poses_at
+from mapvote.core.record import record
 from mapvote.core.types import F64, Drive, Scan
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class MountRules:
-    """Limits of a mount."""
+    """Numbers by which the mount of a sensor is recognised."""
 
     usual_deg: float = 20.0
-    """A sensor that leans or is turned by no more is taken in its own axes."""
+    """Greatest lean or turn of a sensor that is taken in its own axes, degrees."""
     steady: float = 0.95
-    """Length of the mean of unit vectors: up, or ahead, in the axes of the sensor, scan by scan."""
+    """Least length of the mean of unit vectors (up, or ahead, in the sensor's axes) over the scans."""
     step_deg: int = 45
-    """Mounts are told apart so finely where a drive is localised."""
+    """Step between the mounts that localisation tells apart, degrees."""
     step_m: float = 1.0
-    """Positions so far apart show the way ahead."""
+    """Least distance between positions that show the direction of travel, metres."""
 
 
 MOUNT_RULES = MountRules()

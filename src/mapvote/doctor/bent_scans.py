@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding
 from mapvote.formats.drives.point_fields import spinning_time_s
@@ -23,22 +24,23 @@ from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, motion_at
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class BentScans:
-    """When other times of points fit better."""
+    """Numbers of the check that points have the times as read."""
 
     scans: int = 8
     """Scans that are registered again, evenly along the drive."""
     least_scans: int = 4
-    """Fewer tell nothing."""
+    """Least number of scans for a verdict."""
     least_speed_mps: float = 3.0
-    """A slower sensor hardly bends its scans."""
+    """Scans of a slower sensor are not used, metres per second: they hardly bend."""
     unsteady_mps: float = 1.5
-    """Nor does a scan whose speed, over two steps and over six, differs by more."""
+    """Scans whose speeds over two steps and over six differ by more are not used, metres per second."""
     better: float = 1.02
-    """By what factor the median score with other times must exceed the score as read."""
+    """Least ratio of the median score with other times to that with the times as read."""
     share: float = 0.75
-    """Share of the scans that must fit better."""
+    """Least share of the scans that must fit better."""
 
 
 BENT_SCANS = BentScans()

@@ -8,26 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.mount import mount_of_prior
+from mapvote.core.record import record
 from mapvote.core.types import Drive
 from mapvote.doctor import Finding
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class RoadBelow:
-    """Limits of a road below a sensor that leans."""
+    """Numbers of the search for a road below a sensor that leans."""
 
     lean_deg: float = 30.0
-    """Lean of the sensor from which a road is searched for."""
+    """Lean of the sensor above which a road is searched for, degrees."""
     near_m: float = 15.0
-    """The road is looked for in points no farther than this."""
+    """Greatest range of the points that are used, metres."""
     own_m: float = 2.0
-    """Nearer points may be the vehicle's."""
+    """Least range of the points that are used, metres: nearer ones may be the vehicle's."""
     depth_m: tuple[float, float] = (0.2, 12.0)
-    """Depth of a road below the sensor."""
+    """Least and greatest depth of a road below the sensor, metres."""
     bin_m: float = 0.2
-    """Thickness of a layer of points."""
+    """Thickness of a layer of points, metres."""
     share: float = 0.1
-    """Share of the near points in the layer that is the road."""
+    """Least share of the used points in the layer of the road."""
 
 
 RULES = RoadBelow()

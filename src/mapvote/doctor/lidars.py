@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from mapvote.core.geometry import exp, inverse, log, transform
+from mapvote.core.record import record
 from mapvote.core.types import F32, F64, Drive
 from mapvote.doctor import Finding
 from mapvote.matching.matcher import likelihood_at
@@ -21,21 +22,23 @@ from mapvote.matching.ndt_map import NDT_WINDOW, NdtMap
 from mapvote.matching.prepare import thin_for_levels
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class SweepRules:
-    """When the places of LiDARs are wrong."""
+    """Numbers of the check that several LiDARs sit as stated."""
 
     sweeps: int = 5
-    """Spread over the drive."""
+    """Number of sweeps that are compared, spread over the drive."""
     window_m: float = 60.0
-    """Half the side of the map of the first LiDAR's points."""
+    """Half the side of the map of the first LiDAR's points, metres."""
     better: float = 1.25
-    """Fit of exchanged places, as a multiple of that of the stated ones, from which on they are exchanged."""
+    """Least ratio of the fit of exchanged places to that of the stated ones that shows an exchange."""
     least_fit: float = 0.3
-    """Mean likelihood below which a LiDAR sees too little of what the first sees."""
+    """Mean likelihood below which a LiDAR sees too little of what the first one sees."""
     off_m: float = 0.15
+    """Greatest distance of a LiDAR from its stated place that is not reported, metres."""
     off_deg: float = 1.5
-    """A place that the points contradict by more is reported."""
+    """Greatest rotation of a LiDAR from its stated attitude that is not reported, degrees."""
 
 
 RULES = SweepRules()

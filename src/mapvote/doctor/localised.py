@@ -15,31 +15,33 @@ import scipy
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
 from mapvote.doctor import Finding
 from mapvote.perception.frontend import DriveReport
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class LocalisedRules:
-    """Limits that sound drives keep."""
+    """Numbers of the checks of a localised drive."""
 
     least_scans: int = 8
-    """Scans that show anything of a drive."""
+    """Least number of scans for a verdict."""
     least_share: float = 0.5
-    """Scans over the map's ground that must have a sure place."""
+    """Least share of the scans over the map's ground that must be localised."""
     leap_mps: float = 70.0
-    """No vehicle is faster between two sure scans ..."""
+    """Greatest speed between two localised scans, metres per second; a faster step is a leap."""
     leap_m: float = 5.0
-    """... and a track that is corrected moves by less than this. One such leap is one too many."""
+    """Steps up to this length are no leap, metres: a correction of the track moves it by less."""
     way_m: float = 10.0
-    """Ways are compared over so many metres, at least."""
+    """Least length of the stretches whose lengths are compared with the prior, metres."""
     way_share: float = 0.25
-    """By so much of itself, and four of its sigmas, the way by the prior may differ."""
+    """Greatest difference of a stretch by the prior, beside four of its sigmas, as a share of its length."""
     turn_deg: float = 20.0
-    """By so much, and four of its sigmas, the prior's attitude may differ."""
+    """Greatest difference of the prior's attitude, beside four of its sigmas, degrees."""
     off_m: float = 3.0
-    """By so much, and four of its sigmas, half of the prior's positions may scatter about their mean difference."""
+    """Greatest median scatter of the prior's positions about their mean offset, beside four of its sigmas, metres."""
 
 
 LOCALISED_RULES = LocalisedRules()

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.formats.drives.compressed_cloud import COMPRESSED, one_of_each_cloud, republished, unread_format
 from mapvote.live.dds import Network, PublishedTopic, Subscription, TopicRate
@@ -17,6 +18,7 @@ from mapvote.live.messages import CLOUD, CLOUDS, GNSS, IMU, ODOMETRY, POSE_TOPIC
 from mapvote.live.names import RosNames
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class Waits:
     """How long a vehicle waits for its topics."""

@@ -81,8 +81,6 @@ CROSSED, HIT, PASSES, PASSED = 0, COUNT_PLANES, 2 * COUNT_PLANES, 3 * COUNT_PLAN
 WORDS = PASSED + 1
 NO_VOXELS = np.uint64(0)
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
-_NEAR_GROUND = np.uint64(0b1111)
-_EIGHT_NEIGHBOURS = np.ones((3, 3))
 
 
 def count_scan(evidence: PackedTiles, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
@@ -273,7 +271,8 @@ def enough(voxels: U64, a_cell: int, others: Bool, balance: I32, rule: SurfaceRu
     ground (a bollard): it touches none of the ``others``, and its columns begin within 1.2 m of the ground."""
     cells = voxels != 0
     tall = voxels & (voxels >> np.uint64(1)) != 0
-    tied = ndimage.binary_dilation(others, _EIGHT_NEIGHBOURS) | (voxels & _NEAR_GROUND == 0)
+    near_ground = np.uint64(0b1111)
+    tied = ndimage.binary_dilation(others, np.ones((3, 3))) | (voxels & near_ground == 0)
     size, count, talls, ties, left = over_groups(cells, np.bitwise_count(voxels), cells, tall, tied, balance)
     large = size >= np.minimum(rule.support + a_cell * (count - 1), rule.new_enough)
     return np.asarray(cells & (left >= 0) & (large | ((talls > 0) & (ties == 0))))
@@ -288,5 +287,5 @@ def grown(strong: Bool, weak: Bool) -> Bool:
 
 def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
     """For each of ``amounts`` (rows, cols) its sum over the 8-connected group of ``cells`` that a cell is in."""
-    group, count = ndimage.label(cells, structure=_EIGHT_NEIGHBOURS)
+    group, count = ndimage.label(cells, structure=np.ones((3, 3)))
     return [np.bincount(group.ravel(), amount.ravel(), count + 1)[group] for amount in amounts]

@@ -54,13 +54,6 @@ BEGINS_ABOVE, REACHES_HIGHER = 1 << 14, 1 << 15
 N_WORDS = 1 << 16
 _BEHIND, _CLEAR, _UNSEEN = np.uint8(Sight.BEHIND), np.uint8(Sight.CLEAR), np.uint8(Sight.NEVER)
 LEVEL = np.array([0.0, 0.0, 1.0])
-_SIGHT = {
-    "points": CLEAR,
-    "cells": CLEAR_OF_CELLS,
-    "farthest": BEFORE_FARTHEST,
-    "column": THROUGH_COLUMN,
-}
-_TALL = {"bottom": BEGINS_ABOVE, "height": REACHES_HIGHER}
 
 
 @kernel
@@ -195,7 +188,8 @@ def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32
     words = np.arange(N_WORDS)
     n = words & COUNTED_POINTS
     shift = WITHOUT_MOVERS if paper.movers == "removed" else 0
-    visible = words & (_SIGHT[paper.line_of_sight] << shift) != 0
+    sights = {"points": CLEAR, "cells": CLEAR_OF_CELLS, "farthest": BEFORE_FARTHEST, "column": THROUGH_COLUMN}
+    visible = words & (sights[paper.line_of_sight] << shift) != 0
     fired = words & (FIRED << shift) != 0
     occupied = n >= paper.n_min
     empty = (n == 0) & visible
@@ -212,7 +206,8 @@ def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32
         states[mapped, empty] = if_empty
         states[mapped, occupied] = if_occupied
         if voting.skip_tall_cells:
-            states[mapped, words & _TALL[paper.tall_rule] != 0] = NO_VOTE
+            tall = {"bottom": BEGINS_ABOVE, "height": REACHES_HIGHER}[paper.tall_rule]
+            states[mapped, words & tall != 0] = NO_VOTE
     points = weight_table(voting.weighted, voting.a, voting.b, voting.k, paper.n_min, COUNTED_POINTS)
     return states, np.where(occupied, points[n], VOTE_UNIT).astype(np.int32)
 

@@ -251,7 +251,7 @@ def cell_states(panels: Sequence[tuple[str, U8]], grid: Grid, *, outlines: Seque
         image = style.state_image(states)
         for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
             image[_thicken(states == change)] = change
-        _panel(axis, image, grid, title, cmap=style.STATE_MAP, vmin=-0.5, vmax=len(CellState) + 0.5)
+        _panel(axis, image, grid, title, cmap=style.state_map(), vmin=-0.5, vmax=len(CellState) + 0.5)
         _outline(axis, outlines)
     for axis in axes[-1]:
         axis.set_xlabel("x (m)")

@@ -31,8 +31,6 @@ _METADATA = "metadata.yaml"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")
 """Opcode of a record, length of its content."""
-_CHUNK_HEAD = struct.Struct("<QQQI")
-"""Times of the first and last message of a chunk, its uncompressed size, its checksum."""
 
 
 def is_bag(path: Path) -> bool:
@@ -296,7 +294,8 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 def _chunk_head(stream: BinaryIO, start: int, end: int) -> bytes:
     """Times, place and sizes of the chunk record from ``start`` to ``end``, as its index begins and ends with them."""
-    first_ns, last_ns, size, _ = _CHUNK_HEAD.unpack(stream.read(_CHUNK_HEAD.size))
+    # Times of the first and last message of a chunk, its uncompressed size, its checksum.
+    first_ns, last_ns, size, _ = struct.unpack("<QQQI", stream.read(28))
     (letters,) = struct.unpack("<I", stream.read(4))
     compression = stream.read(letters)
     (compressed,) = struct.unpack("<Q", stream.read(8))
