@@ -21,7 +21,7 @@ from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 
 _Orders = Mapping[str, StampOrder]
 _Times = Mapping[str, I64]
-"""(messages, 2) of each topic: the stamp in its header and the time of its receipt, nanoseconds."""
+"""(messages, 3) of each topic: the stamp in its header and the time of its receipt, nanoseconds, and its bytes."""
 
 
 def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
@@ -29,7 +29,7 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
     try:
         bag = Bag(path)
         times = {topic: stamps_of(bag, topic) for topic in bag.topics(*CLOUDS, *POSES, *GNSS)}
-        orders = {topic: in_order_of_stamps(*rows.T) for topic, rows in times.items()}
+        orders = {topic: in_order_of_stamps(rows[:, 0], rows[:, 1]) for topic, rows in times.items()}
         files = [Finding("warning", what) for what in bag.mended]
         poses = _poses(bag, orders, drive_options(path, **said))
         return [*files, *_topics(bag, times), *_clocks(bag, times, orders), *poses]

@@ -108,9 +108,10 @@ class Bag:
 
 
 def stamps_of(bag: Bag, topic: str) -> I64:
-    """(n, 2) the stamp in the header and the time of receipt of every message, nanoseconds, as received."""
-    rows = [(bag.stamp_ns(data), received_ns) for _, received_ns, data in bag.raw(topic)]
-    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+    """(n, 3) the stamp in the header and the time of receipt of every message, nanoseconds, and its size in bytes, as
+    received."""
+    rows = [(bag.stamp_ns(data), received_ns, len(data)) for _, received_ns, data in bag.raw(topic)]
+    return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
 
 def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:

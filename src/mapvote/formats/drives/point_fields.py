@@ -76,6 +76,14 @@ class BadPoints:
             log.warning(message, self.where, self.points, self.what, len(self.seen))
 
 
+def tell_without_points(where: str, scans: int, names: Sequence[str]) -> None:
+    """A message on scans without a point, by their ``names``, that are left out. MapvoteError if all ``scans`` are."""
+    if len(names) == scans:
+        raise MapvoteError(f"{where}: none of its {scans} scans holds a point; record it again")
+    listed = ", ".join(names[:3]) + (", .." if len(names) > 3 else "")
+    log.warning("%s: %d of %d scans hold no point and are left out: %s", where, len(names), scans, listed)
+
+
 @dataclass(slots=True)
 class PointReader:
     """Makes scans of points with named fields, for one drive or one LiDAR, whatever its format."""
@@ -119,9 +127,7 @@ class PointReader:
             )
         self.bad_points.count(index, bad)
         if n == 0:
-            raise MapvoteError(
-                f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: {_unit_of_near(points)}"
-            )
+            raise MapvoteError(f"{where}: {_why_none_is_usable(points, near_m)}")
         keep: slice | I32 = slice(None) if n == len(points) else usable[:n]
         # Their times; where a point has none it is dropped.
         time_s, told = self._times(where, index, stamp_ns, table, keep, copied[:n], sensor)
@@ -271,14 +277,19 @@ def _sort_out(
     return n, measured, bad
 
 
-def _unit_of_near(points: F32) -> str:
-    """Possible causes of points that are all too near."""
+def _why_none_is_usable(points: F32, near_m: float) -> str:
+    """Possible causes why no point of a scan (n, 3) is a measurement, and what to do."""
+    if len(points) == 0:
+        return "it holds no points; leave this scan out with --scans"
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(points.astype(np.float64), axis=1)
     distance = distance[np.isfinite(distance) & (distance > 0.0)]
-    if len(distance) and float(np.median(distance)) > 0.001 and float(distance.max()) < POINT_RULE.far_m / 1000.0:
-        return f"they look like kilometres (the farthest {distance.max():.3f}); multiply x, y, z by 1000"
-    return "are they metres? Else leave this scan out with --scans"
+    if len(distance) == 0:
+        return f"none of {len(points)} rays has a return (a covered sensor?); leave this scan out with --scans"
+    none = f"no usable point among {len(points)}, all nearer than {near_m:.1f} m"
+    if float(np.median(distance)) > 0.001 and float(distance.max()) < POINT_RULE.far_m / 1000.0:
+        return f"{none}: they look like kilometres (the farthest {distance.max():.3f}); multiply x, y, z by 1000"
+    return f"{none}: are they metres? Else leave this scan out with --scans"
 
 
 def _likely_cause(points: F32) -> str:

@@ -23,7 +23,7 @@ from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
 from mapvote.formats.drives.frames import T_from
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
 from mapvote.formats.drives.packets import PACKET_RULE, SWEEP_RULE, Packets, direction_of, scan_of_packets
-from mapvote.formats.drives.point_fields import PointReader, log
+from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
 from mapvote.formats.drives.stamp_order import in_order_of_stamps
 
 
@@ -176,12 +176,27 @@ def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Messag
 
 def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
     """The messages of the ``k``-th topic by their stamps; what is left out is counted and reported."""
-    headers, received = stamps_of(bag, topic).T
+    headers, received, sizes = stamps_of(bag, topic).T
     order = in_order_of_stamps(headers, received)
     for what in order.told:
         log.warning("%s: %s %s", bag.path, topic, what)
     rows = zip(order.stamps_ns.tolist(), order.chosen.tolist(), strict=True)
-    return [_Message(stamp_ns, k, int(received[i]), int(headers[i])) for stamp_ns, i in rows]
+    every = [(_Message(stamp_ns, k, int(received[i]), int(headers[i])), int(sizes[i])) for stamp_ns, i in rows]
+    empty = {message.stamp_ns for message, size in every if _is_empty(bag, topic, message, size)}
+    if empty:
+        tell_without_points(f"{bag.path} {topic}", len(every), [f"{ns / 1e9:.3f} s" for ns in sorted(empty)])
+    return [message for message, _ in every if message.stamp_ns not in empty]
+
+
+def _is_empty(bag: Bag, topic: str, message: _Message, size: int) -> bool:
+    """Whether a cloud, ``size`` bytes serialised, holds no point, as of a driver that started before its sensor."""
+    with suppress(MapvoteError):  # a damaged cloud is reported when it is read as a scan
+        return size < SMALL_CLOUD_BYTES and len(_points_of(bag, topic, message, str(bag.path))) == 0
+    return False
+
+
+SMALL_CLOUD_BYTES = 1_024
+"""Smaller messages may be clouds without points; larger ones are not looked at before they are read."""
 
 
 def _mount_in(mounts: Mapping[str, list[float]], topic: str, where: str) -> F64 | None:

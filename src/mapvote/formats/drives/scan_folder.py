@@ -27,7 +27,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.times import has_date
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
-from mapvote.formats.drives.point_fields import PointReader, log
+from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, date_ns, of_scans, prior_of
 from mapvote.formats.listing import entry, files_like
@@ -119,29 +119,56 @@ def _tell_unread(files: Sequence[Path]) -> None:
             log.warning(what, room, len(others), suffix, taken)
 
 
+def _with_points(path: Path, folder: ScanFolder) -> I64:
+    """(m,) the numbers of the files that hold points, or that cannot be read. The others are named in a message.
+
+    A driver that starts before its sensor, and a recorder that is stopped, leave files without a point.
+    MapvoteError if no file holds one.
+    """
+
+    def is_empty(file: Path) -> bool:
+        size = file.stat().st_size if file.is_file() else SMALL_FILE_BYTES
+        if size >= SMALL_FILE_BYTES:
+            return False
+        with suppress(MapvoteError):  # a damaged file is reported when it is read as a scan
+            return size == 0 or len(folder.read_table(file)) == 0
+        return False
+
+    empty = np.array([is_empty(file) for file in folder.files], dtype=np.bool_)
+    if empty.any():
+        names = [folder.files[i].name for i in np.flatnonzero(empty)]
+        tell_without_points(str(path), len(folder.files), names)
+    return np.flatnonzero(~empty)
+
+
 def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
-    """The drive of a folder; scans are read one by one. MapvoteError says what is missing or does not fit."""
+    """The drive of a folder; scans are read one by one, those without a point are left out. MapvoteError says what is
+    missing or does not fit."""
     _tell_unread(folder.files)
-    reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
     own = folder.prior, folder.prior_name, folder.T_base_lidar
     prior = prior_of(path, options, folder.files, folder.stamps_ns, *own)
+    used = _with_points(path, folder)
+    stamps_ns = folder.stamps_ns[used]
+    reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
 
     def read_scan(i: int, sensor: Sensor) -> Scan:
-        file = folder.files[i]
-        return reader.scan(str(file), i, int(folder.stamps_ns[i]), folder.read_table(file), sensor)
+        file = folder.files[used[i]]
+        return reader.scan(str(file), i, int(stamps_ns[i]), folder.read_table(file), sensor)
 
     return make_drive(
         path,
         options,
-        stamps_ns=folder.stamps_ns,
-        T_map_lidar_prior=prior.T_map_lidar,
+        stamps_ns=stamps_ns,
+        T_map_lidar_prior=None if prior.T_map_lidar is None else prior.T_map_lidar[used],
         read_scan=read_scan,
         frame=prior.frame,
         T_base_lidar=folder.T_base_lidar,
-        prior_sigmas=prior.sigmas,
+        prior_sigmas=None if prior.sigmas is None else prior.sigmas[used],
     )
 
 
+SMALL_FILE_BYTES = 4_096
+"""Smaller files may be headers without points; larger ones are not looked at before they are read."""
 KITTI = ("x", "y", "z", "intensity")
 NUSCENES = (*KITTI, "ring")
 _SUFFIXES = (".ply", ".las", ".laz", ".npy", ".bin")
