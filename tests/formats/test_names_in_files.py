@@ -210,7 +210,7 @@ def test_no_name_in_a_file_opens_anything_else(folders: Path) -> None:
 @pytest.mark.slow
 def test_none_of_thousands_of_names_opens_anything_else(folders: Path) -> None:
     """`NAMES=10000 pytest -m slow` tries so many."""
-    open_nothing_else(folders, int(os.environ.get("NAMES", "2000")), 2)
+    open_nothing_else(folders, int(os.environ.get("NAMES", "1000")), 2)
 
 
 def test_a_map_folder_with_a_pipe_or_a_device_for_a_plane_is_refused(tmp_path: Path) -> None:

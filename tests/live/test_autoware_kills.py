@@ -100,7 +100,7 @@ def test_of_many_starts_and_kills_none_empties_a_client(tmp_path: Path, store: S
     from live.foreign_client import ForeignClient
 
     client, dice = ForeignClient(domain, OLD), random.Random(7)
-    starts = int(os.environ.get("STARTS", "12"))
+    starts = int(os.environ.get("STARTS", "8"))
     fewest, ended = [len(OLD)], threading.Event()
 
     def drive() -> None:

@@ -68,7 +68,7 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
         mend = "the drive is read so; record again with `use_sim_time` alike for all nodes, and one pass a bag"
         yield from (Finding("warning", f"{topic} {what}", mend) for what in order.told)
     for topic in bag.topics(*CLOUDS):
-        stamps, received = times[topic][orders[topic].chosen].T
+        stamps, received, _ = times[topic][orders[topic].chosen].T
         if len(stamps) < 3 or not stamps.any():
             continue
         late_s = float(np.median(received - stamps)) * 1e-9

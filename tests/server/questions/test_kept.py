@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -246,7 +247,7 @@ def test_what_is_kept_is_what_would_be_found_anew(template: Path, history: list[
 
 @pytest.mark.slow
 @given(histories)
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=int(os.environ.get("HISTORIES", "60")), deadline=None, suppress_health_check=list(HealthCheck))
 def test_what_is_kept_is_what_would_be_found_anew_in_many_histories(
     template: Path, history: list[tuple[Step, bool]]
 ) -> None:

@@ -28,16 +28,11 @@ def crash(kills: int, database: str) -> None:
 
 
 @pytest.mark.slow
-def test_three_kills() -> None:
-    crash(3, "sqlite")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
 def test_kills_lose_nothing_that_was_acknowledged(database: str) -> None:
     if database == "postgresql" and programs() is None:
         pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
-    crash(int(os.environ.get("KILLS", "8")), database)
+    crash(int(os.environ.get("KILLS", "5")), database)
 
 
 def test_the_postgresql_of_the_tests_is_durable(postgres_url: str) -> None:
