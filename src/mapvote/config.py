@@ -325,9 +325,9 @@ CASES: dict[str, dict[str, bool]] = {
 """The paper's five cases as settings of the one rule (paper V)."""
 
 
-def did_you_mean(key: str, known: Iterable[str]) -> str:
+def did_you_mean(key: str, names: Iterable[str]) -> str:
     """ "; did you mean 'x'?" for the known name nearest to ``key``, or "" if none is near."""
-    near = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
@@ -348,9 +348,9 @@ def load_with_sources(
     for section, key, value, source in (*_from_file(path), *_from_env(os.environ if env is None else env)):
         if section not in Settings.model_fields:
             raise MapvoteError(f"{source}: unknown section {section!r}{did_you_mean(section, Settings.model_fields)}")
-        known = type(getattr(Settings(), section)).model_fields
-        if key not in known:
-            raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, known)}")
+        fields = type(getattr(Settings(), section)).model_fields
+        if key not in fields:
+            raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, fields)}")
         values.setdefault(section, {})[key] = value
         sources[f"{section}.{key}"] = source
     try:

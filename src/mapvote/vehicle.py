@@ -315,8 +315,8 @@ def offered(
         return np.empty((0, 3), dtype=np.float32), {}
     window = point_map.lattice.tile(tile)
     mapped = point_map.tiles.get(tile)
-    known = mapped is not None and mapped.has_ground
-    base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
+    has_ground = mapped is not None and mapped.has_ground
+    base = mapped.base if mapped is not None and has_ground else reference_window(point_map, window).base
     return points_in(window, points, new, base, names)
 
 

@@ -81,10 +81,10 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a drive and a map looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
     ]
     with seldom_collecting():
-        for what, work in steps:
+        for step, work in steps:
             start = time.process_time()
             work()
-            yield what, time.process_time() - start
+            yield step, time.process_time() - start
 
 
 def compile_for_maps() -> None:

@@ -143,8 +143,8 @@ def evaluate(
         overrides["temporary_cars"] = cars
     sentences = "all" if readings else "occluded" if scenario == PUBLISHED else None
     scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, poses)
-    with stages() as told:
-        evaluation = run(scene, cases, with_yardsticks, told, sentences)
+    with stages() as report:
+        evaluation = run(scene, cases, with_yardsticks, report, sentences)
     _show(list(tables(evaluation.result)), evaluation.result, json)
     if figures is not None:
         from mapvote.plots import Format
@@ -175,8 +175,8 @@ def _evaluate_court(folder: Path, case: str | None, json: Path | None, settings:
     from mapvote_lab.evaluation.court import Court, court_table, evaluate_court
 
     cases, _ = choose_cases(settings, case or DEFAULT_CASES)
-    with stages() as told:
-        scores = evaluate_court(Court.read(folder), settings, cases, told)
+    with stages() as report:
+        scores = evaluate_court(Court.read(folder), settings, cases, report)
     _show([court_table(scores)], {"scores": scores}, json)
 
 
@@ -199,8 +199,8 @@ def _evaluate_real(
     cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))
     if len(cases) > 1:
         raise typer.BadParameter(f"{case}: of a recorded drive one case is judged at a time", param_hint="--case")
-    with stages() as told:
-        result = bench(drive, settings, cases, told, scans=scans, seed=seed)
+    with stages() as report:
+        result = bench(drive, settings, cases, report, scans=scans, seed=seed)
     sheets = real_tables(result, cases[0].name)
     _show(sheets, result.figures(cases[0].name), json)
     if out is not None:
@@ -242,16 +242,16 @@ def demo(
             raise typer.BadParameter("a recorded drive is not simulated: leave out --full and --keep")
         from mapvote_lab.evaluation.demo import demo_drive
 
-        with stages() as told:
-            lines = demo_drive(drive, out, told, show)
+        with stages() as report:
+            lines = demo_drive(drive, out, report, show)
         for line in lines:
             print(line)
         return
     from mapvote_lab.evaluation.demo import CASE, commands, drives_sentence
     from mapvote_lab.evaluation.demo import demo as run
 
-    with stages() as told:
-        evaluation, story = run(out, full=full, keep=keep, progress=told, show=show)
+    with stages() as report:
+        evaluation, story = run(out, full=full, keep=keep, progress=report, show=show)
     console.print("\n[bold]What changed[/]")
     for area, deleted, added in story.areas:
         console.print(f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added")

@@ -49,8 +49,8 @@ for other_package in entry_points(group="mapvote.verbs"):
     other_package.load()(app)
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(wanted: bool) -> None:
+    if wanted:
         from importlib.metadata import version
 
         print(f"mapvote {version('mapvote')}")

@@ -47,8 +47,8 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
                 continue
             item.parent.mkdir(parents=True, exist_ok=True)
             if parent is not None:
-                found = all_changes(server, f"from={parent}&to={number}&lonlat=true")
-                (item.parent / CHANGES).write_text(json.dumps(found, indent=1) + "\n")
+                changes = all_changes(server, f"from={parent}&to={number}&lonlat=true")
+                (item.parent / CHANGES).write_text(json.dumps(changes, indent=1) + "\n")
             with map_at(source, key_file, number) as point_map:
                 _write(folder, point_map, dict(about) | {"parent": parent}, has_changes=parent is not None)
         write_catalog(folder, map_id, numbers)

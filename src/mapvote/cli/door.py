@@ -114,12 +114,12 @@ def client_of(url: str, key: str | None) -> MapClient:
     return MapClient(url, key=key, home=cache_folder())
 
 
-def all_changes(server: Connection, asked: str) -> dict[str, Any]:
+def all_changes(server: Connection, query: str) -> dict[str, Any]:
     """The list of changes that a query of ``/v1/changes`` asks for, part by part."""
-    whole = server.ask_json("GET", f"/v1/changes?{asked}&limit=10000")
+    whole = server.ask_json("GET", f"/v1/changes?{query}&limit=10000")
     part = whole
     while part["features"] and len(whole["features"]) < whole["numberMatched"]:
-        versions = f"{asked}&to={whole['to_version']}"
+        versions = f"{query}&to={whole['to_version']}"
         part = server.ask_json("GET", f"/v1/changes?{versions}&limit=10000&offset={len(whole['features'])}")
         whole["features"] += part["features"]
     return {name: value for name, value in whole.items() if name not in ("numberMatched", "numberReturned")}
@@ -222,16 +222,16 @@ def usable_drives(drives: Sequence[Drive], *, unchecked: bool = False) -> Iterat
         if not unchecked:
             _warnings_of(watching, unchecked)
         raise
-    for path, found in _warnings_of(watching, unchecked):
-        _warn(path, found)
+    for path, findings in _warnings_of(watching, unchecked):
+        _warn(path, findings)
 
 
 def _warnings_of(watching: list[Looking], unchecked: bool) -> list[tuple[str, list[Finding]]]:
-    found = []
+    findings = []
     for one in watching:
         with progress(f"looking at {one.drive.path}") as tell:
-            found.append((str(one.drive.path), one.warnings(tell, unchecked=unchecked)))
-    return found
+            findings.append((str(one.drive.path), one.warnings(tell, unchecked=unchecked)))
+    return findings
 
 
 def require_straight(drive: Drive, report: DriveReport, point_map: PointMap, *, unchecked: bool = False) -> None:
@@ -272,9 +272,9 @@ def look_at_points(path: str, *, unchecked: bool = False) -> Look:
     from mapvote.doctor.maps import check_cloud
 
     def look(pieces: Pieces, ground: Pieces) -> None:
-        found = check_cloud(pieces, ground)
+        findings = check_cloud(pieces, ground)
         try:
-            _warn(path, found if unchecked else usable(path, found))
+            _warn(path, findings if unchecked else usable(path, findings))
         except MapvoteError as error:
             way = f"if they are right as they are: mapvote import '{path}' MAP --unchecked"
             raise MapvoteError(f"{error}; {way}") from None
@@ -282,6 +282,6 @@ def look_at_points(path: str, *, unchecked: bool = False) -> Look:
     return look
 
 
-def _warn(path: str, found: list[Finding]) -> None:
-    for finding in found:
+def _warn(path: str, findings: list[Finding]) -> None:
+    for finding in findings:
         print(f"warning: {path}: {finding.what}", file=sys.stderr)

@@ -131,7 +131,9 @@ def _frame(report: BuildReport) -> str:
 @with_drive_options
 def vote(
     drive_path: Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")],
-    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
+    map_source: Annotated[
+        str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")
+    ],
     out: Annotated[Path | None, typer.Option(metavar="BALLOT", help="write the ballot to this file")] = None,
     send: Annotated[
         str | None,
@@ -202,9 +204,9 @@ def vote(
     if case is not None:
         settings = choose_case(settings, case)
     with ExitStack() as open_map:
-        with waiting(f"reading {where}"):
+        with waiting(f"reading {map_source}"):
             wanted = None if region is None else region_in(region)
-            point_map = open_map.enter_context(map_at(where, key_file, region=wanted, or_kept=True))
+            point_map = open_map.enter_context(map_at(map_source, key_file, region=wanted, or_kept=True))
         if not has_open_ground(point_map):
             print(
                 "warning: the map has no ground: objects are found, but heights above the ground are "
@@ -391,33 +393,33 @@ def diff(
         map_b, registered = brought_into(map_a, map_b, unbend=unbend)
     with waiting("comparing"):
         compared = compare_cells(map_a, map_b, registered)
-        found = differences(compared, min_area)
-    told = registered.told()
+        changes = differences(compared, min_area)
+    lines = registered.told()
     by_free = bool(compared.a.free.any() or compared.b.free.any())
-    told.append(
+    lines.append(
         "gone and new are decided by free space and by ground that the other one shows"
         if by_free
         else "neither has free space: gone and new are decided by geometry alone (the other has ground there, and "
         "nothing that stands within two cells)"
     )
-    for line in told:
+    for line in lines:
         print(line)
-    listed = [one for one in found if show_not_seen or one.kind != "not seen"]
+    listed = [one for one in changes if show_not_seen or one.kind != "not seen"]
     rows = difference_rows(listed)
     shown = ("id", "kind", "x", "y", "area_m2", "height_m", "points", "confidence")
     print_table(shown, [tuple(str(row[name]) for name in shown) for row in rows])
-    _print_sums(found)
+    _print_sums(changes)
     left_out = float(compared.left_out.sum()) * 0.09
     if left_out:
         print(f"left out in bent parts: {left_out:.1f} m2 of cells")
     written = []
     if out is not None:
-        collection = difference_geojson(found, map_a.lattice, map_a.georeference, told)
+        collection = difference_geojson(changes, map_a.lattice, map_a.georeference, lines)
         written.append((out, json.dumps(collection, indent=1) + "\n"))
     if csv is not None:
-        written.append((csv, as_csv(difference_rows(found))))
+        written.append((csv, as_csv(difference_rows(changes))))
     if page is not None:
-        written.append((page, difference_page(f"{path_a.name} and {path_b.name}", found, map_a, map_b)))
+        written.append((page, difference_page(f"{path_a.name} and {path_b.name}", changes, map_a, map_b)))
     for file, text in written:
         write_whole(file, text)
         print(f"{file}")
@@ -450,7 +452,7 @@ def merge(
     print(f"{out}: {merged.point_map.n_points} points")
 
 
-def _print_sums(found: Sequence[CloudChange]) -> None:
+def _print_sums(changes: Sequence[CloudChange]) -> None:
     for kind in ("gone", "new", "not seen"):
-        areas_m2 = [one.area_m2 for one in found if one.kind == kind]
+        areas_m2 = [one.area_m2 for one in changes if one.kind == kind]
         print(f"{kind}: {len(areas_m2)} things, {sum(areas_m2):.1f} m2")

@@ -65,12 +65,12 @@ def info(
         raise MapvoteError(f"info: {path} is no STORE or URL; --vehicles needs one")
     if in_store:
         with api_at(path, key_file) as server, waiting(f"reading {path}"):
-            found = server.ask_json("GET", "/v1/vehicles" if vehicles else "/v1/info")
+            answer = server.ask_json("GET", "/v1/vehicles" if vehicles else "/v1/info")
         if vehicles:
-            _print_standings(found["vehicles"])
+            _print_standings(answer["vehicles"])
             return
-        found["published"] = utc(found.pop("published_ns"))
-        shown = [(key, f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
+        answer["published"] = utc(answer.pop("published_ns"))
+        shown = [(key, f"{value:,}" if isinstance(value, int) else value) for key, value in answer.items()]
         title = "store"
         rows = [(key.replace("_", " "), value) for key, value in shown]
     else:
@@ -80,9 +80,9 @@ def info(
     print_table(("", ""), [(Text(name, "cyan"), value) for name, value in rows])
 
 
-def _print_standings(found: list[dict[str, Any]]) -> None:
+def _print_standings(standings: list[dict[str, Any]]) -> None:
     rows = []
-    for s in found:
+    for s in standings:
         places = "; ".join(f"{e['says']} at {e['x']:.1f}, {e['y']:.1f} ({e['cells']} cells)" for e in s["evidence"][:3])
         counts = str(s["cells"]), str(s["objects"]), str(s["others_objects"]), f"{s['p_value']:.2g}"
         rows.append((s["vehicle"], s["verdict"], *counts, places))
@@ -97,7 +97,7 @@ def doctor(
     path: Annotated[
         str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot in any format; a store")
     ],
-    where: Annotated[
+    map_source: Annotated[
         str | None,
         typer.Option(
             "--map",
@@ -126,11 +126,11 @@ def doctor(
         raise MapvoteError(f"doctor: {path} is a server: mapvote check {path} looks at its store")
     with ExitStack() as open_map:
         point_map = None
-        if where is not None:
-            with waiting(f"reading {where}"):
-                served = is_url(where) or is_store(where)
+        if map_source is not None:
+            with waiting(f"reading {map_source}"):
+                served = is_url(map_source) or is_store(map_source)
                 # Faults of a map in files are reported beside the faults of the drive.
-                point_map = open_map.enter_context(map_at(where, key_file)) if served else read_map(where)
+                point_map = open_map.enter_context(map_at(map_source, key_file)) if served else read_map(map_source)
         if is_store(path):
             with waiting("reading every byte"):
                 diagnosis = Diagnosis(stores().findings_of(path))
@@ -164,8 +164,8 @@ def _lines(finding: Finding) -> list[str]:
     from rich.markup import escape
 
     colour = {"error": "bold red", "warning": "yellow", "note": "dim"}[finding.severity]
-    what = f"[{colour}]{finding.severity}[/] {escape(finding.what)}"
-    return [what, f"      [green]mend[/] {escape(finding.mend)}"] if finding.mend else [what]
+    first = f"[{colour}]{finding.severity}[/] {escape(finding.what)}"
+    return [first, f"      [green]mend[/] {escape(finding.mend)}"] if finding.mend else [first]
 
 
 def import_map(
@@ -210,17 +210,17 @@ def import_map(
         wanted = frame_wanted(crs, projector)
         look = look_at_points(str(source), unchecked=unchecked)
         beside = folder_beside(out)
-        point_map, told = import_cloud(source, wanted, from_crs, beside, look, marks_in(drop), unchecked=unchecked)
+        point_map, lines = import_cloud(source, wanted, from_crs, beside, look, marks_in(drop), unchecked=unchecked)
     if clean:
         from mapvote.survey.clean_map import without_lone_points
 
         point_map, lone = without_lone_points(point_map)
-        told = [*told, f"{lone} points above the ground dropped: they touch no other"]
+        lines = [*lines, f"{lone} points above the ground dropped: they touch no other"]
     point_map = named_after(out, point_map)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
-    for line in told:
+    for line in lines:
         print(line)
     print("known-free columns: none yet; each published version adds those that the fleet's drives saw")
 
@@ -318,9 +318,11 @@ def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str 
     from mapvote.formats.maps.autoware import lay_version, names_of
 
     cloud = autoware_pieces(point_map, out, projector)
-    known = frozenset(names_of(str(out), autoware_pieces(older, out, projector))) if older is not None else frozenset()
+    present = (
+        frozenset(names_of(str(out), autoware_pieces(older, out, projector))) if older is not None else frozenset()
+    )
     with waiting(f"writing {out}"):
-        change = lay_version(out, cloud, point_map.version or 0, known=known)
+        change = lay_version(out, cloud, point_map.version or 0, present=present)
     print(f"{out}: version {change.version}, {change.tiles} Autoware tiles, {change.written} written")
     if older is not None:
         print(
@@ -461,8 +463,8 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
     copies = Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
     for (vehicle, heard), tiles in sorted(copies.items()):
-        where = f"{tiles} tile{'s' if tiles > 1 else ''}"
-        print(f"{vehicle} sent a copy of {heard}'s ballot, on {where}: the two count as one vehicle there")
+        tiles_of = f"{tiles} tile{'s' if tiles > 1 else ''}"
+        print(f"{vehicle} sent a copy of {heard}'s ballot, on {tiles_of}: the two count as one vehicle there")
     if vehicles < min_votes:
         print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
 

@@ -36,19 +36,19 @@ def topics(
     from mapvote.live.dds import Network, measure_rates
 
     network = Network(domain)
-    found = measure_rates(network, seconds)
-    for one in found:
+    rates = measure_rates(network, seconds)
+    for one in rates:
         rate = "not read here" if one.rate_hz is None else f"{one.rate_hz:.1f} Hz"
         quality = "reliable" if one.published.reliable else "best effort"
         frame = f" in {one.frame}" if one.frame else ""
         print(f"{one.published.topic} [{one.published.kind}] {rate}, {quality}{frame}")
-    for sentence in missing_for_drive(found, network.domain):
+    for sentence in missing_for_drive(rates, network.domain):
         print(f"missing: {sentence}")
 
 
 def show(
     ballot: Annotated[Path, typer.Argument(metavar="BALLOT", help="a ballot")],
-    where: Annotated[str, typer.Option("--map", metavar="MAP|STORE|URL", help="the map that it was voted on")],
+    map_source: Annotated[str, typer.Option("--map", metavar="MAP|STORE|URL", help="the map that it was voted on")],
     mcap: Annotated[Path, typer.Option("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove or RViz")],
     key_file: KeyFile = None,
 ) -> None:
@@ -63,10 +63,10 @@ def show(
 
     with reading(ballot, "ballot"):
         shown = decode(read_whole(ballot))
-    with map_at(where, key_file) as point_map:
+    with map_at(map_source, key_file) as point_map:
         if shown.map_id != point_map.map_id:
             raise MapvoteError(
-                f"{ballot}: voted on map {shown.map_id}, not on {point_map.map_id} of {where}; name its map"
+                f"{ballot}: voted on map {shown.map_id}, not on {point_map.map_id} of {map_source}; name its map"
             )
         messages = [map_cloud(shown, point_map), *messages_of_ballot(shown, point_map)]
     write_mcap(mcap, messages)
@@ -95,7 +95,9 @@ def play(
 
 
 def drive(
-    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
+    map_source: Annotated[
+        str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")
+    ],
     vehicle: Annotated[str, typer.Option(metavar="NAME", help="name of the vehicle in its ballots")],
     sensor: Annotated[
         str | None, typer.Option(metavar="NAME", help="LiDAR model; default: measured in the first ten scans")
@@ -225,7 +227,7 @@ def drive(
         heartbeat()
         return stopped[-1]
 
-    with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
+    with _maps(map_source, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
         warm_vehicle(plan.settings)
         heartbeat.ready()
         on_earth = frame_of(maps.current().georeference)
@@ -262,15 +264,15 @@ def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
 
 
 @contextmanager
-def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
+def _maps(map_source: str, key_file: Path | None) -> Iterator[Maps]:
     """The tiles around the vehicle of a server's map, or a whole map from a file or store."""
     from mapvote.live.road_map import OneMap, RoadMap
 
-    if is_url(where):
-        with closing(RoadMap(lambda: client_of(where, key_in(key_file)))) as road_map:
+    if is_url(map_source):
+        with closing(RoadMap(lambda: client_of(map_source, key_in(key_file)))) as road_map:
             yield road_map
         return
-    with map_at(where, key_file, or_kept=True) as point_map:
+    with map_at(map_source, key_file, or_kept=True) as point_map:
         yield OneMap(point_map)
 
 

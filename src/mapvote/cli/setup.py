@@ -24,9 +24,9 @@ def warmup() -> None:
             step = next(steps, None)
         if step is None:
             break
-        what, seconds = step
+        name, seconds = step
         total += seconds
-        print(f"{seconds:6.1f} s  {what}", flush=True)
+        print(f"{seconds:6.1f} s  {name}", flush=True)
     print(f"{total:6.1f} s  of CPU time in all; later runs load the kernels from the cache")
 
 

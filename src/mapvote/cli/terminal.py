@@ -53,8 +53,8 @@ def print_table(headings: Sequence[str], rows: Iterable[Iterable[str | Text] | N
 
 
 @contextmanager
-def waiting(what: str) -> Iterator[None]:
-    """A turning wheel beside ``what`` for work that cannot say how far it is; nothing where there is no terminal."""
+def waiting(task: str) -> Iterator[None]:
+    """A turning wheel beside the name of a ``task`` that cannot say how far it is; nothing without a terminal."""
     if not sys.stderr.isatty():  # rich is not even imported
         yield
         return
@@ -65,12 +65,12 @@ def waiting(what: str) -> Iterator[None]:
     if not console.is_terminal:
         yield
         return
-    with console.status(escape(what)):
+    with console.status(escape(task)):
         yield
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[..., None]]:
+def progress(title: str) -> Iterator[Callable[..., None]]:
     """A bar for one piece of work, told (done, in all), perhaps a new name; gone at the end. Nothing where there is no
     terminal."""
     if not sys.stderr.isatty():  # rich is not even imported
@@ -82,10 +82,10 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
     console = Console(stderr=True)
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"{escape(what)}, getting ready", total=None)
+        task = bar.add_task(f"{escape(title)}, getting ready", total=None)
 
-        def tell(done: int, total: int, now: str = what) -> None:
-            bar.update(task, description=escape(now), completed=done, total=total)
+        def tell(done: int, total: int, stage: str = title) -> None:
+            bar.update(task, description=escape(stage), completed=done, total=total)
 
         yield tell
 

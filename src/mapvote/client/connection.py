@@ -89,8 +89,8 @@ class Connection:
                     raise Unreachable(f"{self.url}: {trouble}; ask again in {wait_s:.0f} s")
                 continue
             if answer.status_code >= 400:
-                why = f"{self.url}: refused ({answer.status_code}): {detail_of(answer)}{_mend(answer)}"
-                raise Refused(why, answer.status_code)
+                refusal = f"{self.url}: refused ({answer.status_code}): {detail_of(answer)}{_mend(answer)}"
+                raise Refused(refusal, answer.status_code)
             return answer
         raise Unreachable(f"{self.url}: no answer after {self._attempts} attempts ({trouble}); try again later")
 
@@ -101,8 +101,8 @@ class Connection:
             with self._http.stream("GET", path, timeout=self._longest_wait_s) as answer:
                 if answer.status_code >= 400:
                     answer.read()
-                    why = f"{self.url}: refused: {detail_of(answer)}{_mend(answer)}"
-                    raise Refused(why, answer.status_code)
+                    refusal = f"{self.url}: refused: {detail_of(answer)}{_mend(answer)}"
+                    raise Refused(refusal, answer.status_code)
                 yield from answer.iter_lines()
         except httpx2.TransportError as error:
             raise Unreachable(f"{self.url}: {error or type(error).__name__}") from error
@@ -118,10 +118,10 @@ class Connection:
 def detail_of(answer: httpx2.Response) -> str:
     """A server's reason for a refusal."""
     try:
-        found: Any = answer.json()["detail"]
+        detail: Any = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):
         return f"status {answer.status_code}"
-    return str(found)
+    return str(detail)
 
 
 def _mend(answer: httpx2.Response) -> str:

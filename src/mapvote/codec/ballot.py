@@ -203,9 +203,9 @@ class Odds(NamedTuple):
         plane[self.cells] = self.steps
         return plane[cells]
 
-    def within(self, mine: Bool) -> Odds:
+    def within(self, chosen: Bool) -> Odds:
         """Only those of the flat cells given (65536,)."""
-        keep = mine[self.cells]
+        keep = chosen[self.cells]
         return Odds(self.cells[keep], self.steps[keep])
 
 

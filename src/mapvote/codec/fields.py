@@ -24,22 +24,22 @@ def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
     return msgspec.msgpack.encode({name: (kind, raw_plane(c, kind)) for name, (kind, c) in columns.items()})
 
 
-def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
-    """The inverse, of ``n`` points; MapvoteError, by the name of ``what``, if it is damaged or not of so many."""
+def unpack_fields(raw: bytes, n: int, part: str) -> dict[str, NDArray[Any]]:
+    """The inverse, of ``n`` points; MapvoteError, which names the ``part``, if it is damaged or not of so many."""
     fields = {}
-    for name, (kind, values) in decode_fields(raw, what).items():
+    for name, (kind, values) in decode_fields(raw, part).items():
         if kind not in FIELD_TYPES:
-            raise MapvoteError(f"{what}: {name}: of type {kind[:20]!r}, which no field has; fetch or send it again")
+            raise MapvoteError(f"{part}: {name}: of type {kind[:20]!r}, which no field has; fetch or send it again")
         if len(values) != n * np.dtype(kind).itemsize:
             held = f"{name} has {len(values)} bytes, but there are {n} points"
-            raise MapvoteError(f"{what}: {held}; fetch or send it again")
+            raise MapvoteError(f"{part}: {held}; fetch or send it again")
         fields[name] = np.frombuffer(values, dtype=kind)
     return fields
 
 
-def decode_fields(raw: bytes, what: str) -> dict[str, tuple[str, bytes]]:
-    """Type and values of each column; MapvoteError, by the name of ``what``, if it is damaged."""
+def decode_fields(raw: bytes, part: str) -> dict[str, tuple[str, bytes]]:
+    """Type and values of each column; MapvoteError, which names the ``part``, if it is damaged."""
     try:
         return _FIELDS.decode(raw)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MapvoteError(f"{what}: no fields of points ({error}); fetch or send it again") from error
+        raise MapvoteError(f"{part}: no fields of points ({error}); fetch or send it again") from error

@@ -87,8 +87,8 @@ class Manifest(msgspec.Struct, omit_defaults=True, kw_only=True):
     def tag(self, since: int | None = None) -> str:
         """The ETag of the manifest, or of what changed ``since`` a version: of its number and what it consists of. A
         server that was set up anew has the numbers of the old one, and another map."""
-        told = f"{self.digest[:16]}-{self.fields_digest[:16]}"
-        return f'"{self.version}-{told}"' if since is None else f'"{self.version}-{since}-{told}"'
+        digests = f"{self.digest[:16]}-{self.fields_digest[:16]}"
+        return f'"{self.version}-{digests}"' if since is None else f'"{self.version}-{since}-{digests}"'
 
     def followed_by(self, since: Manifest) -> Manifest:
         """The newer manifest: this one with the changes in ``since``."""

@@ -61,44 +61,44 @@ def raw_plane(plane: NDArray[Any], dtype: DTypeLike) -> memoryview:
     return np.ascontiguousarray(plane, dtype=dtype).reshape(-1).view(np.uint8).data
 
 
-def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
+def unpack_bytes(data: bytes, limit: int, part: str) -> bytes:
     """Decompress at most ``limit`` bytes of one frame. MapvoteError beyond ``limit`` (a decompression bomb stops here),
     on damage, and where something follows the frame."""
     try:
         size = zstd.get_frame_info(data).decompressed_size
         if size is not None and size > limit:
-            raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
+            raise MapvoteError(f"{part} is larger than {limit} bytes when decompressed")
         frame = zstd.ZstdDecompressor()
         raw = frame.decompress(data, limit + 1 if size is None else size)
     except zstd.ZstdError as error:
-        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+        raise MapvoteError(f"{part} is damaged ({error}); fetch or send it again") from error
     if len(raw) > limit or not frame.eof:
-        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
+        raise MapvoteError(f"{part} is truncated or larger than {limit} bytes when decompressed")
     if frame.unused_data:
-        raise MapvoteError(f"{what} is damaged ({len(frame.unused_data)} bytes follow it); fetch or send it again")
+        raise MapvoteError(f"{part} is damaged ({len(frame.unused_data)} bytes follow it); fetch or send it again")
     return raw
 
 
-def frame_size(head: bytes, what: str) -> int:
+def frame_size(head: bytes, part: str) -> int:
     """How many bytes a frame of ours holds, from its header; MapvoteError if the header does not state it."""
     try:
         size = zstd.get_frame_info(head).decompressed_size
     except zstd.ZstdError as error:
-        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+        raise MapvoteError(f"{part} is damaged ({error}); fetch or send it again") from error
     if size is None:
-        raise MapvoteError(f"{what} does not say how large it is; fetch or send it again")
+        raise MapvoteError(f"{part} does not say how large it is; fetch or send it again")
     return size
 
 
-def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
+def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], part: str) -> NDArray[Any]:
     """The array that :func:`pack_plane` took; ``dtype`` little-endian, e.g. "<u8". MapvoteError if damaged.
 
-    ``what`` names the plane in messages, e.g. "ballot: states".
+    ``part`` names the plane in messages, e.g. "ballot: states".
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    raw = unpack_bytes(data, size, what)
+    raw = unpack_bytes(data, size, part)
     if len(raw) != size:
-        raise MapvoteError(f"{what} has {len(raw)} bytes, expected {size}")
+        raise MapvoteError(f"{part} has {len(raw)} bytes, expected {size}")
     return np.frombuffer(raw, dtype=dtype).reshape(shape)
 
 
@@ -150,18 +150,18 @@ class Words(NamedTuple):
 
 def pack_words(plane: U64) -> bytes:
     """A (256, 256) plane."""
-    some = Words.of(plane)
-    return compress(_by_byte(np.diff(some.cells, prepend=0), _WAY) + _by_byte(some.words, _WORD))
+    sparse = Words.of(plane)
+    return compress(_by_byte(np.diff(sparse.cells, prepend=0), _WAY) + _by_byte(sparse.words, _WORD))
 
 
-def unpack_sparse(data: bytes, what: str) -> Words:
-    """The words that are not 0. MapvoteError if damaged; ``what`` names the plane in messages, e.g. "gone"."""
-    raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
+def unpack_sparse(data: bytes, part: str) -> Words:
+    """The words that are not 0. MapvoteError if damaged; ``part`` names the plane in messages, e.g. "gone"."""
+    raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {part}"), dtype=np.uint8)
     n, left = divmod(len(raw), _WAY + _WORD)
     cells = np.empty(n, dtype=np.intp)
     words = np.empty(n, dtype=np.uint64)
     if left or not _ascending(raw, cells, words):
-        raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
+        raise MapvoteError(f"ballot: {part} is damaged ({len(raw)} bytes); fetch or send it again")
     return Words(cells, words)
 
 
@@ -190,13 +190,13 @@ def _by_byte(values: NDArray[np.integer], size: int) -> bytes:
 
 def union(marked: Sequence[Words]) -> Words:
     """The bits that any of ``marked`` sets."""
-    some = [mine for mine in marked if len(mine.cells)]
-    if len(some) < 2:
-        return some[0] if some else Words.none()
-    cells = np.concatenate([mine.cells for mine in some])
+    filled = [one for one in marked if len(one.cells)]
+    if len(filled) < 2:
+        return filled[0] if filled else Words.none()
+    cells = np.concatenate([one.cells for one in filled])
     order = np.argsort(cells, kind="stable")
     cells = cells[order]
-    words = np.concatenate([mine.words for mine in some])[order]
+    words = np.concatenate([one.words for one in filled])[order]
     first = np.flatnonzero(np.append(True, cells[1:] != cells[:-1]))
     return Words(cells[first], np.bitwise_or.reduceat(words, first))
 
@@ -209,8 +209,8 @@ def nothing_reached(k: int, cells: int = CELLS) -> U64:
 def counted(cells: NDArray[np.intp], marked: Sequence[Words]) -> I32:
     """(n, 64) how many of ``marked`` set each bit of the flat ``cells`` (n,), few, ascending, all they name."""
     counts = np.zeros((len(cells), 64), dtype=np.int32)
-    for mine in marked:
-        counts[np.searchsorted(cells, mine.cells)] += bits_of(mine.words)
+    for one in marked:
+        counts[np.searchsorted(cells, one.cells)] += bits_of(one.words)
     return counts
 
 

@@ -49,14 +49,14 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
     A tile ``edited_from`` another gives only the planes that the other lacks: the ground is never edited.
     """
     blobs: dict[str, bytes] = {}
-    old, known = edited_from or (None, TileHashes.none())
+    old, old_hashes = edited_from or (None, TileHashes.none())
 
-    def pack(raw: bytes | memoryview, what: str) -> str:
+    def pack(raw: bytes | memoryview, part: str) -> str:
         if len(raw) > TILE_PLANE_SIZES.plane_bytes:
             too_large = (
                 f"{len(raw)} bytes, {TILE_PLANE_SIZES.plane_bytes} are the most: thin the map out, or leave fields out"
             )
-            raise MapvoteError(f"tile {tile_key(tile.index)}: its {what} take {too_large}")
+            raise MapvoteError(f"tile {tile_key(tile.index)}: its {part} take {too_large}")
         digest, plane = _packed(raw)
         blobs.update(plane)
         return digest
@@ -66,10 +66,10 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
     )
     hashes = TileHashes(
         points=pack(raw_plane(tile.points, "<f4"), "points"),
-        ground=known.ground if same_ground else pack(raw_plane(tile.ground_z, "<f4"), "ground"),
-        free=known.free if same_free or tile.free is None else pack(raw_plane(tile.free, "<u8"), "free columns"),
+        ground=old_hashes.ground if same_ground else pack(raw_plane(tile.ground_z, "<f4"), "ground"),
+        free=old_hashes.free if same_free or tile.free is None else pack(raw_plane(tile.free, "<u8"), "free columns"),
         memory=None if tile.memory is None else pack(_raw_memory(tile.memory), "memory"),
-        fields=known.fields if same_fields else pack(pack_fields(tile.fields), "fields") if tile.fields else None,
+        fields=old_hashes.fields if same_fields else pack(pack_fields(tile.fields), "fields") if tile.fields else None,
     )
     return hashes, blobs
 

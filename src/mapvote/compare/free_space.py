@@ -41,9 +41,9 @@ def with_free_space_of(point_map: PointMap, maps: Sequence[PointMap], T: F64) ->
 def _is_free(one: PointMap, places: F64) -> Bool:
     """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
     out = np.zeros(len(places), dtype=np.bool_)
-    for part, mine, cell in one.by_tile(places):
+    for part, chosen, cell in one.by_tile(places):
         if part.free is not None:
-            bit = np.floor(places[mine, 2] / CELL_SIZE).astype(np.int64) - part.base[cell]
+            bit = np.floor(places[chosen, 2] / CELL_SIZE).astype(np.int64) - part.base[cell]
             words = part.free[cell] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
-            out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
+            out[chosen] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
     return out

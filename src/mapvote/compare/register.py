@@ -465,12 +465,14 @@ def register_maps(
     fit = replace(fit, T_a_b=_on_surfaces(points_a, points_b, patches, fit))
     # Bent parts patch by patch, on request.
     moved = None
-    why = ""
+    refusal = ""
     if unbend and fit.bent.any():
-        moved, why = _unbend(points_a, points_b, patches, fit, paths)
+        moved, refusal = _unbend(points_a, points_b, patches, fit, paths)
     rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
     points = rigid if moved is None else moved
-    return Registered(fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, why)
+    return Registered(
+        fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, refusal
+    )
 
 
 def _on_surfaces(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) -> F64:

@@ -151,14 +151,14 @@ def _enter_cells(
 
 def base_layers(ground_z: F32) -> I32:
     """(rows, cols) lattice layer of bit 0: floor(ground_z / 0.3), unknown cells filled from the nearest known one."""
-    known = np.isfinite(ground_z)
-    if not known.any():
+    measured = np.isfinite(ground_z)
+    if not measured.any():
         return np.zeros(ground_z.shape, dtype=np.int32)
     low = ground_z.astype(np.float64)
-    if not known.all():
-        low[~known] = np.inf
+    if not measured.all():
+        low[~measured] = np.inf
         lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
-        np.copyto(low, ground_z, where=known)
+        np.copyto(low, ground_z, where=measured)
     return np.floor(low / CELL_SIZE).astype(np.int32)
 
 

@@ -11,13 +11,14 @@ from types import ModuleType
 from mapvote.core.types import MapvoteError
 
 
-def require(module: str, extra: str, where: str) -> ModuleType:
+def require(module: str, extra: str, needed_by: str) -> ModuleType:
     """The module, imported; MapvoteError naming the extra to install if it is not there."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise MapvoteError(
-            f"{where}: needs the package {module.partition('.')[0]}; install it with: pip install 'mapvote[{extra}]'"
+            f"{needed_by}: needs the package {module.partition('.')[0]}; "
+            f"install it with: pip install 'mapvote[{extra}]'"
         ) from error
 
 
@@ -34,10 +35,10 @@ ENDINGS = {
 """The package and the extra that a file of this ending needs."""
 
 
-def require_for(file: Path, where: str) -> None:
+def require_for(file: Path, needed_by: str) -> None:
     """MapvoteError naming the extra if a file of this ending needs a package that is missing: before the work."""
     if file.suffix.lower() in ENDINGS:
-        require(*ENDINGS[file.suffix.lower()], where)
+        require(*ENDINGS[file.suffix.lower()], needed_by)
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:

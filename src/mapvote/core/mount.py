@@ -80,12 +80,12 @@ def mount_of_prior(T: F64, rules: MountRules = MOUNT_RULES) -> Mount | None:
     lean_deg = float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
     # Ahead: the way driven, else the axis of the sensor that is most level.
     ahead = _ahead(T, rules)
-    known = ahead is not None
+    moves = ahead is not None
     if ahead is None:
         ahead = np.eye(3)[int(np.argmin(np.abs(up)))] if abs(up[0]) > 0.7 else np.eye(3)[0]
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
-    turned_deg = float(np.degrees(np.arccos(np.clip(ahead[0], -1.0, 1.0)))) if known else 0.0
+    turned_deg = float(np.degrees(np.arccos(np.clip(ahead[0], -1.0, 1.0)))) if moves else 0.0
     if lean_deg <= rules.usual_deg and turned_deg <= rules.usual_deg:
         return None
     C = np.eye(4)

@@ -176,8 +176,8 @@ class PointMap:
     @property
     def field_names(self) -> list[str]:
         """Names of the fields of its points; a map larger than memory names those of its largest tiles."""
-        asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
-        return sorted({name for index in asked for name in self.tiles[index].fields})
+        largest = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
+        return sorted({name for index in largest for name in self.tiles[index].fields})
 
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""
@@ -186,17 +186,17 @@ class PointMap:
     def by_tile(self, points_map: NDArray[np.floating]) -> Iterator[tuple[Tile, I64, tuple[I64, I64]]]:
         """(tile, indices (m,), cell) of the points (n, 3), map metres, that lie in each tile of the map; the cell is
         (rows (m,), cols (m,)), so that ``tile.ground_z[cell]`` is the ground under them."""
-        for index, mine in cut_tiles(points_map, self.lattice):
+        for index, chosen in cut_tiles(points_map, self.lattice):
             if index in self.tiles:
                 tile = self.tiles[index]
-                rows, cols, _ = tile.window.indices_of(points_map[mine])
-                yield tile, mine, (rows, cols)
+                rows, cols, _ = tile.window.indices_of(points_map[chosen])
+                yield tile, chosen, (rows, cols)
 
     def ground_under(self, points_map: NDArray[np.floating]) -> F64:
         """(n,) height of the ground in the cell of each of the points (n, 3), map metres; NaN where it is unknown."""
         out = np.full(len(points_map), np.nan)
-        for tile, mine, cell in self.by_tile(points_map):
-            out[mine] = tile.ground_z[cell]
+        for tile, chosen, cell in self.by_tile(points_map):
+            out[chosen] = tile.ground_z[cell]
         return out
 
 
@@ -230,7 +230,7 @@ def _numbered(tiles: I32) -> NDArray[np.integer]:
 
 def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:
     """The points as tiles keep them, so that the ground is computed from the points that a map read back holds."""
-    return {tile: lattice.tile(tile).from_map(points_map[mine]) for tile, mine in cut_tiles(points_map, lattice)}
+    return {tile: lattice.tile(tile).from_map(points_map[chosen]) for tile, chosen in cut_tiles(points_map, lattice)}
 
 
 def lattice_of(points: NDArray[np.floating]) -> Lattice:
@@ -271,15 +271,16 @@ def map_from_points(
         check_extent(piece, start)
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
-    known = {} if road is None or len(road) == 0 else _stored(road, lattice)
+    road_tiles = {} if road is None or len(road) == 0 else _stored(road, lattice)
     heights, road_heights = (
-        {tile: (flat_cells(lattice.tile(tile), p), p[:, 2]) for tile, p in some.items()} for some in (stored, known)
+        {tile: (flat_cells(lattice.tile(tile), p), p[:, 2]) for tile, p in of_tiles.items()}
+        for of_tiles in (stored, road_tiles)
     )
     ground = lay_ground(heights, road_heights, {tile: len(p) for tile, p in stored.items()})
     tiles = {tile: Tile(lattice.tile(tile), stored[tile], ground[tile]) for tile in stored}
     if fields:
-        for tile, mine in cut_tiles(points, lattice):
-            tiles[tile] = replace(tiles[tile], fields={name: column[mine] for name, column in fields.items()})
+        for tile, chosen in cut_tiles(points, lattice):
+            tiles[tile] = replace(tiles[tile], fields={name: column[chosen] for name, column in fields.items()})
     return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
 
 

@@ -133,9 +133,9 @@ def merged_values(name: str, values: Values, voxels: I64, chosen: I64) -> Values
     best = np.lexsort((pairs[:, 1], -counts, pairs[:, 0]))
     of_voxel, first = np.unique(pairs[best, 0], return_index=True)
     merged = row.unknown(len(chosen))
-    known = np.isin(voxels[chosen], of_voxel)
-    place = np.searchsorted(of_voxel, voxels[chosen][known])
-    merged[known] = kinds[pairs[best[first[place]], 1]]
+    present = np.isin(voxels[chosen], of_voxel)
+    place = np.searchsorted(of_voxel, voxels[chosen][present])
+    merged[present] = kinds[pairs[best[first[place]], 1]]
     return merged
 
 

@@ -52,8 +52,8 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
         rows, cols, _ = grid.indices_of(tile.points_map)
         z = tile.points[:, 2].astype(np.float64)
         fill_columns(rows, cols, z, ground_z, base, occupied, counts, bottom_z, top_z)
-    known = free if any(t.free is not None for t in tiles) else None
-    yield Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, known)
+    free_words = free if any(t.free is not None for t in tiles) else None
+    yield Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free_words)
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:

@@ -87,12 +87,12 @@ class Memory:
 
     def at(self, cells: I64) -> U32:
         """(4, m) what is remembered of flat ``cells`` (m,), in any order."""
-        found = np.zeros((PLANES, len(cells)), dtype=np.uint32)
+        values = np.zeros((PLANES, len(cells)), dtype=np.uint32)
         if len(self.cells):
             near = np.minimum(np.searchsorted(self.cells, cells), len(self.cells) - 1)
-            known = self.cells[near] == cells
-            found[:, known] = self.values[:, near[known]]
-        return found
+            present = self.cells[near] == cells
+            values[:, present] = self.values[:, near[present]]
+        return values
 
     def but(self, cells: I64, values: U32) -> Memory:
         """The same, but of flat ``cells`` (m,), ascending, these ``values`` (4, m)."""

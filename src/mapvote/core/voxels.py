@@ -119,9 +119,9 @@ def found_among(rows: F32 | F64, others: F32 | F64) -> Bool:
     slots = 1 << (2 * len(words)).bit_length()
     for word in words.T:
         number = grouped(((number << 32) | word) + 1, slots)[0].astype(np.int64)
-    known = np.zeros(len(words), dtype=np.bool_)
-    known[number[: len(others)]] = True
-    return known[number[len(others) :]]
+    present = np.zeros(len(words), dtype=np.bool_)
+    present[number[: len(others)]] = True
+    return present[number[len(others) :]]
 
 
 @kernel
@@ -201,8 +201,8 @@ class VoxelCloud:
 
     def points(self) -> tuple[F64, I32]:
         """(mean point (m, 3) map metres, scans that hit it (m,)) of every voxel, in the lattice's x, y, z order."""
-        found = np.flatnonzero(self._keys)
-        rows: NDArray[np.int32] = self._rows[found[np.argsort(self._keys[found])]]
+        occupied = np.flatnonzero(self._keys)
+        rows: NDArray[np.int32] = self._rows[occupied[np.argsort(self._keys[occupied])]]
         sums = self._sums[: self._n]  # in the order of arrival; sorted when they are few
         means = sums[:, 4:7] + sums[:, 1:4] / sums[:, :1]
         return means.take(rows, axis=0), sums[:, 7].astype(np.int32)[rows]

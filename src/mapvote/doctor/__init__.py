@@ -50,21 +50,21 @@ class Finding:
     """Readings of a prior and its scans among which the drive cannot decide; its map may."""
 
 
-def any_error(found: Iterable[Finding]) -> bool:
+def any_error(findings: Iterable[Finding]) -> bool:
     """Whether one of them is an error."""
-    return any(f.severity == "error" for f in found)
+    return any(f.severity == "error" for f in findings)
 
 
-def in_order(found: Iterable[Finding]) -> list[Finding]:
+def in_order(findings: Iterable[Finding]) -> list[Finding]:
     """Errors first; duplicates once."""
-    return sorted(dict.fromkeys(found), key=lambda finding: get_args(Severity).index(finding.severity))
+    return sorted(dict.fromkeys(findings), key=lambda finding: get_args(Severity).index(finding.severity))
 
 
-def usable(path: str, found: list[Finding]) -> list[Finding]:
+def usable(path: str, findings: list[Finding]) -> list[Finding]:
     """The warnings among what was found at ``path``; MapvoteError with the first error, if there is one."""
-    errors = [f for f in found if f.severity == "error"]
+    errors = [f for f in findings if f.severity == "error"]
     if errors:
         more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""
         stop = "" if errors[0].what.endswith("?") else "."
         raise MapvoteError(f"{path}: {errors[0].what}{stop} {errors[0].mend}{more}")
-    return [f for f in found if f.severity == "warning"]
+    return [f for f in findings if f.severity == "warning"]

@@ -30,7 +30,7 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
         bag = Bag(path)
         times = {topic: stamps_of(bag, topic) for topic in bag.topics(*CLOUDS, *POSES, *GNSS)}
         orders = {topic: in_order_of_stamps(rows[:, 0], rows[:, 1]) for topic, rows in times.items()}
-        files = [Finding("warning", what) for what in bag.mended]
+        files = [Finding("warning", line) for line in bag.mended]
         poses = _poses(bag, orders, drive_options(path, **said))
         return [*files, *_topics(bag, times), *_clocks(bag, times, orders), *poses]
     except MapvoteError as error:
@@ -66,16 +66,16 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
     """Stamps of the headers: what is out of order, doubled or of another clock than the times of receipt."""
     for topic, order in orders.items():
         mend = "the drive is read so; record again with `use_sim_time` alike for all nodes, and one pass a bag"
-        yield from (Finding("warning", f"{topic} {what}", mend) for what in order.told)
+        yield from (Finding("warning", f"{topic} {problem}", mend) for problem in order.told)
     for topic in bag.topics(*CLOUDS):
         stamps, received, _ = times[topic][orders[topic].chosen].T
         if len(stamps) < 3 or not stamps.any():
             continue
         late_s = float(np.median(received - stamps)) * 1e-9
         if abs(late_s) > 0.5:  # more than any transport takes
-            what = f"{topic}: messages were received {late_s:.2f} s after their stamps (median)"
+            problem = f"{topic}: messages were received {late_s:.2f} s after their stamps (median)"
             mend = "the sensor or a simulator (use_sim_time) keeps another clock: do the poses keep the same one?"
-            yield Finding("note", what, mend)
+            yield Finding("note", problem, mend)
 
 
 def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding]:
@@ -88,8 +88,8 @@ def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding
         yield Finding("note", "no topic of poses or GNSS fixes: a prior must come from a file (--prior)")
         return
     if options.prior is None:
-        what = f"no prior is chosen, but there are poses: {', '.join(poses)}"
-        yield Finding("warning", what, f"--prior {poses[0]}")
+        problem = f"no prior is chosen, but there are poses: {', '.join(poses)}"
+        yield Finding("warning", problem, f"--prior {poses[0]}")
     lidar = frame_id(bag, clouds[0])
     scans = orders[clouds[0]].stamps_ns
     edges = static_frames(bag)
@@ -99,20 +99,20 @@ def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding
         if outside > 0.05:
             grave: Severity = "error" if outside > 0.9 else "warning"
             mend = "do both keep one clock? Use times of one computer, or PTP"
-            what = f"{topic} has no pose at the time of {outside:.0%} of the scans"
-            yield Finding(grave, what, mend if outside > 0.9 else "leave these scans out with --scans")
+            problem = f"{topic} has no pose at the time of {outside:.0%} of the scans"
+            yield Finding(grave, problem, mend if outside > 0.9 else "leave these scans out with --scans")
         tracked = frame_id(bag, topic, child=True)
         if tracked and tracked != lidar:
-            what = f"{topic} tracks {tracked}, the scans are of {lidar}"
-            yield _mounted(what, T_from(edges, tracked).get(lidar), options)
+            problem = f"{topic} tracks {tracked}, the scans are of {lidar}"
+            yield _mounted(problem, T_from(edges, tracked).get(lidar), options)
 
 
-def _mounted(what: str, T: F64 | None, options: DriveOptions) -> Finding:
+def _mounted(difference: str, T: F64 | None, options: DriveOptions) -> Finding:
     if T is None:
         mend = "give it: --mount X,Y,Z,ROLL,PITCH,YAW (metres, degrees)"
-        return Finding("warning", f"{what}; nothing in /tf_static says where that sits on it", mend)
+        return Finding("warning", f"{difference}; nothing in /tf_static says where that sits on it", mend)
     if options.mount or options.T_base_lidar or np.allclose(T, np.eye(4), atol=1e-3):
-        return Finding("note", f"{what}: /tf_static says where that sits on it")
+        return Finding("note", f"{difference}: /tf_static says where that sits on it")
     rpy_deg = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
     mend = "--mount " + ",".join(f"{v:.3f}" for v in (*T[:3, 3], *rpy_deg))
-    return Finding("warning", f"{what}: /tf_static says where that sits on it, the prior does not know", mend)
+    return Finding("warning", f"{difference}: /tf_static says where that sits on it, the prior does not know", mend)

@@ -59,7 +59,7 @@ def check_bent(
     around = MapWindow(point_map)
     first_level = len(LEVELS) - 1 if localised else 0
     scores: dict[str, list[float]] = {}
-    told = None
+    times = None
     for i in np.unique(np.linspace(1, len(poses) - 2, BENT_SCANS.scans).astype(np.int64)).tolist():
         twist = _steady_motion(stamps_ns, poses, i)
         if twist is None:
@@ -70,7 +70,7 @@ def check_bent(
             continue
         if scan.others or not drive.sensor.rings:
             return
-        told = scan.times or told
+        times = scan.times or times
         ndt_map = around(poses[i, :3, 3])
         for name, time_s in _readings(scan, drive).items():
             clouds = Sample(replace(scan, time_s=time_s)).clouds(twist)
@@ -78,7 +78,7 @@ def check_bent(
             scores.setdefault(name, []).append(score)
     best = _best(scores)
     if best is not None:
-        how = "none" if told is None else told.how
+        how = "none" if times is None else times.how
         yield _finding(best, how, np.array(scores[_AS_READ]), np.array(scores[best]))
 
 
@@ -116,11 +116,11 @@ def _finding(best: str, how: str, as_read: F64, fits: F64) -> Finding:
     shown = f"{(fits > as_read).sum()} of {len(fits)} scans fit the map better ({np.median(fits):.2f}, as read "
     shown += f"{np.median(as_read):.2f})"
     if best == _NONE:
-        what = f"the points are motion-compensated already: without their times {shown}"
-        return Finding("error", what, "set motion_compensated = true in drive.toml")
-    what = f"the points are not motion-compensated: with times of a sensor that spins {best} {shown}"
+        problem = f"the points are motion-compensated already: without their times {shown}"
+        return Finding("error", problem, "set motion_compensated = true in drive.toml")
+    problem = f"the points are not motion-compensated: with times of a sensor that spins {best} {shown}"
     if how == "field":
-        what = f"the times of points do not belong to them: with times of a sensor that spins {best} {shown}"
+        problem = f"the times of points do not belong to them: with times of a sensor that spins {best} {shown}"
     field = 'time_field = "none" and ' if how == "field" else ""
     spin = "" if best == _CLOCKWISE else ", and clockwise = false in its table [sensor]"
-    return Finding("error", what, f"set {field}motion_compensated = false in drive.toml{spin}")
+    return Finding("error", problem, f"set {field}motion_compensated = false in drive.toml{spin}")

@@ -67,23 +67,23 @@ def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[
     if mount is not None:
         turned = DriveEvidence(mount.turned(drive), progress)
         vars(turned)["looks"] = e.looks
-        found, T = _by_scans(turned)
+        findings, T = _by_scans(turned)
         # Prior and points that agree on a mount are sound. A road below a sensor that leans so shows the mount, too.
-        if not any_error(found) or (
+        if not any_error(findings) or (
             mount.lean_deg > ROAD_BELOW.lean_deg and turned.road.up == "+z" and turned.road.is_there
         ):
-            found = [replace(f, readings=()) for f in found]  # of the turned prior
-            return in_order([*cheap, *found]), e.T if T is turned.T or T is None else T @ mount.C
-    found, T = _by_scans(e)
-    return in_order([*cheap, *found]), T
+            findings = [replace(f, readings=()) for f in findings]  # of the turned prior
+            return in_order([*cheap, *findings]), e.T if T is turned.T or T is None else T @ mount.C
+    findings, T = _by_scans(e)
+    return in_order([*cheap, *findings]), T
 
 
 def _by_scans(e: DriveEvidence) -> tuple[list[Finding], F64 | None]:
     """(what scans show once they are compared, the prior (n, 4, 4) as it would be mended)."""
-    found = [*check_ranges(e), *check_road(e), *e.leaps]
+    findings = [*check_ranges(e), *check_road(e), *e.leaps]
     of_prior, T = agreement(e)
     attitude = [] if any_error(of_prior) else check_attitude(e)
-    return [*found, *of_prior, *attitude], T
+    return [*findings, *of_prior, *attitude], T
 
 
 def diagnose(
@@ -95,49 +95,49 @@ def diagnose(
     """Everything the doctor finds at ``path``: in a map, a ballot or a drive; with ``point_map``, also whether a drive
     or a map lies on it. ``options``: of the drive, as ``open_drive`` takes them."""
     if is_cloud(path):
-        found, cloud = examine_map(path)
+        findings, cloud = examine_map(path)
         if point_map is not None and cloud is not None:
-            found = in_order([*found, *check_cloud_on_map(point_map, cloud)])
-        return Diagnosis(found)
+            findings = in_order([*findings, *check_cloud_on_map(point_map, cloud)])
+        return Diagnosis(findings)
     layout = drive_format(path)
     if path.is_file() and layout is None and (path.suffix == ".ballot" or is_ballot(path.read_bytes())):
         return Diagnosis(list(check_ballot(path.read_bytes())))
     options = options or {}
     drive, unopened = _opened(path, options, point_map)
     of_bag = layout is not None and layout.open is open_rosbag
-    found = unopened + (check_bag(path, **options) if of_bag else [])
+    findings = unopened + (check_bag(path, **options) if of_bag else [])
     T = None
     if drive is not None:
         lidars = check_lidars_of_bag(path, drive, options) if of_bag else []
-        found += lidars
+        findings += lidars
         # Scans put together wrongly fit neither each other nor a prior.
         more, T = ([], None) if any_error(lidars) else examine_drive(drive, progress)
         # That a prior that could not be read is missing goes without saying.
-        found += [f for f in more if not (unopened and f == NO_PRIOR)]
+        findings += [f for f in more if not (unopened and f == NO_PRIOR)]
     if point_map is not None:
-        found, T = _with_map(found, drive, T, point_map, progress)
+        findings, T = _with_map(findings, drive, T, point_map, progress)
     as_read = T is (None if drive is None else drive.T_map_lidar_prior)
-    return Diagnosis(in_order(found), drive, None if as_read and any_error(found) else T)
+    return Diagnosis(in_order(findings), drive, None if as_read and any_error(findings) else T)
 
 
 def _opened(path: Path, options: Mapping[str, Any], point_map: PointMap | None) -> tuple[Drive | None, list[Finding]]:
     """(the drive as `vote` opens it, what stopped it from opening so): neither a broken prior nor points whose times
     cannot be told hide anything else."""
-    found: list[Finding] = []
+    findings: list[Finding] = []
     unread: Drive | None = None
     for without in ({}, {"motion_compensated": True}, {"prior": "none"}, {"prior": "none", "motion_compensated": True}):
         try:
             drive = open_drive_on(point_map, path, **{**options, **without})
         except MapvoteError as error:
-            found = found or [Finding("error", str(error))]
+            findings = findings or [Finding("error", str(error))]
             continue
         refusal = _refusal_of_all(drive)
         if not refusal:
-            return drive, found
+            return drive, findings
         unread = unread or drive
-        found = found or [Finding("error", refusal)]
+        findings = findings or [Finding("error", refusal)]
     # Scans that cannot be read in any way are told one by one.
-    return unread, found if unread is None else [f for f in found if f.what != _refusal_of_all(unread)]
+    return unread, findings if unread is None else [f for f in findings if f.what != _refusal_of_all(unread)]
 
 
 def _refusal_of_all(drive: Drive) -> str:
@@ -154,20 +154,20 @@ def _refusal_of_all(drive: Drive) -> str:
 
 
 def _with_map(
-    found: list[Finding], drive: Drive | None, T: F64 | None, point_map: PointMap, progress: Progress | None
+    findings: list[Finding], drive: Drive | None, T: F64 | None, point_map: PointMap, progress: Progress | None
 ) -> tuple[list[Finding], F64 | None]:
     """(also what is wrong with the map, and with the drive on it; the poses (n, 4, 4) as they lie on the map)."""
     of_points = [f for f in check_cloud(tile_by_tile(point_map), classified_ground(point_map)) if f.severity != "note"]
     of_map = of_points + [f for f in check_map(point_map) if f.severity != "note"]
     named = [replace(f, what=f"the map: {f.what}") for f in of_map]
     if drive is not None and not any_error(of_points):
-        found, T_read = decided_by_map(found, drive, point_map, progress)
+        findings, T_read = decided_by_map(findings, drive, point_map, progress)
         T = T if T_read is None else T_read
-    if drive is None or T is None or any_error(found):
-        return found + named, T
+    if drive is None or T is None or any_error(findings):
+        return findings + named, T
     if any_error(of_points):  # as it is, no scan can fit it
         unit = in_another_unit(MapEvidence(drive, T, point_map, progress))
-        return [*found, *named, *([unit] if unit is not None else [])], T
+        return [*findings, *named, *([unit] if unit is not None else [])], T
     mount = mount_of_prior(T)
     if mount is None:
         more, T = check_on_map(drive, T, point_map, progress)
@@ -177,8 +177,8 @@ def _with_map(
     if not any_error(more):
         more += check_bent(drive, list(T), point_map, localised=False)
     if not of_map and all(f.severity == "note" for f in more):
-        found = [f for f in found if not f.map_tells]
-    return [*found, *named, *more], T
+        findings = [f for f in findings if not f.map_tells]
+    return [*findings, *named, *more], T
 
 
 def check_ballot(data: bytes) -> Iterator[Finding]:
@@ -195,21 +195,21 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
     changed = int(counts[[CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]].sum())
     determined = changed + int(counts[[CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY]].sum())
     if not ballot.tiles:
-        what = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
-        yield Finding("error", what, "see mapvote doctor DRIVE --map MAP")
+        problem = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
+        yield Finding("error", problem, "see mapvote doctor DRIVE --map MAP")
     elif determined and changed > BALLOT_CHECK.most_changed * determined:
-        what = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
-        yield Finding("warning", what, "a lost vehicle, or the wrong map? Streets change by a few per cent")
+        problem = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
+        yield Finding("warning", problem, "a lost vehicle, or the wrong map? Streets change by a few per cent")
     if ballot.end_ns <= ballot.start_ns:
         yield Finding("error", "the drive ends before it begins", "mend the times of the drive, and vote again")
     if ballot.scans_localised < 0.5 * ballot.scans:
-        what = f"only {ballot.scans_localised} of {ballot.scans} scans were localised"
-        yield Finding("warning", what, "is it the map of this street? mapvote doctor DRIVE --map MAP")
+        problem = f"only {ballot.scans_localised} of {ballot.scans} scans were localised"
+        yield Finding("warning", problem, "is it the map of this street? mapvote doctor DRIVE --map MAP")
     if ballot.median_sigma_m > BALLOT_CHECK.sigma_m:
-        what = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
-        yield Finding("warning", what, "cells are 0.3 m: such votes blur")
+        problem = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
+        yield Finding("warning", problem, "cells are 0.3 m: such votes blur")
     misfit_m = ballot.prior_misfit_m
     sigma_m = ballot.prior_sigma_m
     if misfit_m is not None and sigma_m is not None and misfit_m > max(3.0 * sigma_m, 0.5):
-        what = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
-        yield Finding("warning", what, "measure the offset: mapvote doctor DRIVE --map MAP")
+        problem = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
+        yield Finding("warning", problem, "measure the offset: mapvote doctor DRIVE --map MAP")

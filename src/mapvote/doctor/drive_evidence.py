@@ -196,7 +196,7 @@ class DriveEvidence:
         return self.looks["index"]
 
     @cached_property
-    def some(self) -> I64:
+    def sample(self) -> I64:
         """A few of the readable scans, spread evenly."""
         chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), ROAD_PLANE.scans)).astype(np.int64)
         return self.readable[chosen]
@@ -208,8 +208,8 @@ class DriveEvidence:
 
     @cached_property
     def _scans(self) -> list[Scan]:
-        """``some``, as they are read."""
-        return [self.drive.read_scan(int(i)) for i in self.some]
+        """Scans of :attr:`sample`, as they are read."""
+        return [self.drive.read_scan(int(i)) for i in self.sample]
 
     @cached_property
     def road(self) -> Road:
@@ -239,12 +239,12 @@ class DriveEvidence:
         across = np.argsort(self.looks.leaps, kind="stable")[-RUN_RULE.across :] - RUN_RULE.scans // 2
         odd = np.unique(np.clip(across, 0, max(0, n - RUN_RULE.scans)))
         starts = dict.fromkeys([*self._starts.tolist(), *odd.tolist()])
-        found = []
+        runs = []
         for k, start in enumerate(starts):
-            found.append(self._follow(start))
+            runs.append(self._follow(start))
             if self.progress is not None:
                 self.progress("registering scans", k + 1, len(starts))
-        return found
+        return runs
 
     @cached_property
     def runs(self) -> list[Run]:
@@ -296,14 +296,16 @@ class DriveEvidence:
         while len(indices) < scans and i + step < len(self.readable):
             i += step
             clouds = thin_for_levels(_near(self._points(self.readable[i])))
-            found = _registered(ndt_map, clouds, _guesses(indices, poses, i, _UPS[self.road_below.up]), self.road_below)
+            registration = _registered(
+                ndt_map, clouds, _guesses(indices, poses, i, _UPS[self.road_below.up]), self.road_below
+            )
             indices.append(i)
-            poses.append(found.T_map_lidar)
-            fits.append(found.inlier_share)
-            position = found.T_map_lidar[:3, 3]
+            poses.append(registration.T_map_lidar)
+            fits.append(registration.inlier_share)
+            position = registration.T_map_lidar[:3, 3]
             if not ndt_map.is_central(position):
                 ndt_map.recentre(position)
-            ndt_map.enter(transform(found.T_map_lidar, clouds[-1].T))
+            ndt_map.enter(transform(registration.T_map_lidar, clouds[-1].T))
             a_scan_m = float(np.linalg.norm((inverse(poses[-2]) @ poses[-1])[:3, 3])) / (indices[-1] - indices[-2])
             step = 1 if len(indices) < 3 else int(np.clip(RUN_RULE.step_m / max(a_scan_m, 0.01), 1, RUN_RULE.most_step))
         return Run(self.readable[indices], np.array(poses), np.array(fits))
@@ -401,13 +403,13 @@ def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Ro
 
     Only objects on the road distinguish guesses: the sensor's rings on it fit best where nothing has moved.
     """
-    found = ndt_map.refine(clouds, guesses[0])
-    if len(guesses) == 2 and found.inlier_share >= RUN_RULE.good_fit:
-        return found
+    registration = ndt_map.refine(clouds, guesses[0])
+    if len(guesses) == 2 and registration.inlier_share >= RUN_RULE.good_fit:
+        return registration
     stands = [np.abs(road.normal @ cloud + road.depth_m) > RUN_RULE.stands_m for cloud in clouds]
     standing = [np.ascontiguousarray(cloud[:, high]) for cloud, high in zip(clouds, stands, strict=True)]
     tried = [
-        found,
+        registration,
         *(ndt_map.refine(clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, RUN_RULE.refined, 800)),
     ]
     return max(tried, key=lambda one: likelihood_at(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
@@ -429,10 +431,10 @@ def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]
 def check_ranges(e: DriveEvidence) -> Iterator[Finding]:
     """Do ranges scatter more than a sound sensor's?"""
     if len(e.readable) > 2 and e.scatter_m > RANGE_SCATTER.scatter_m:
-        what = f"ranges scatter by {e.scatter_m:.2f} m against those of the rays beside them"
-        what += " (sound sensors: 0.01 to 0.04 m)"
+        problem = f"ranges scatter by {e.scatter_m:.2f} m against those of the rays beside them"
+        problem += " (sound sensors: 0.01 to 0.04 m)"
         mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
-        yield Finding("error" if e.scatter_m > 2.0 * RANGE_SCATTER.scatter_m else "warning", what, mend)
+        yield Finding("error" if e.scatter_m > 2.0 * RANGE_SCATTER.scatter_m else "warning", problem, mend)
 
 
 def check_road(e: DriveEvidence) -> Iterator[Finding]:
@@ -442,41 +444,41 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
     road = e.road
     T = e.T
     if road.up == "-z":
-        what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
+        problem = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
         mend = "negate y and z of every point (or only z, if right and left are right already)"
-        yield Finding("error", what, mend)
+        yield Finding("error", problem, mend)
         return
     if road.up != "+z":
-        what = f"the points' axis {road.up} points up (the road lies {road.depth_m:.1f} m along its opposite), not z"
+        problem = f"the points' axis {road.up} points up (the road lies {road.depth_m:.1f} m along its opposite), not z"
         mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
-        yield Finding("error", what, mend)
+        yield Finding("error", problem, mend)
         return
     if not road.is_there or (road.scatter_m > RANGE_SCATTER.rough_m and e.scatter_m <= RANGE_SCATTER.scatter_m):
-        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
-        what += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
-        yield Finding("warning", what, "are the lower beams missing, the points cut, or z measured from elsewhere?")
+        problem = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
+        problem += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
+        yield Finding("warning", problem, "are the lower beams missing, the points cut, or z measured from elsewhere?")
         return
     yield Finding("note", f"by the scans themselves the sensor stands {road.depth_m:.1f} m over the road")
     if road.depth_m < 0.5:
-        what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
-        yield Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's")
+        problem = f"the road lies only {road.depth_m:.1f} m below the points' origin"
+        yield Finding("warning", problem, "are the points in the vehicle's frame? Give them in the sensor's")
     if road.depth_m > ROAD_PLANE.highest_m:
-        what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
+        problem = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
         mend = (
             f"multiply their points by 0.3048 if they are feet (the road then lies {0.3048 * road.depth_m:.1f} m below)"
         )
-        yield Finding("warning", what, mend)
+        yield Finding("warning", problem, mend)
     if T is None:
         return
-    normal = np.mean([T[i, :3, :3] @ road.normal for i in e.some], axis=0)
+    normal = np.mean([T[i, :3, :3] @ road.normal for i in e.sample], axis=0)
     tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
     if tilt_deg > 4.0:
         pitch = np.degrees(np.arcsin(-road.normal[0]))
         roll = np.degrees(np.arcsin(road.normal[1]))
-        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg"
+        problem = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg"
         mend = f"turn the points by {roll:.1f} deg about x and {pitch:.1f} deg about y, which levels the road in them, "
         mend += "or put the sensor's tilt into the prior's rotations; on a hill all is well"
-        yield Finding("error" if tilt_deg > 8.0 else "warning", what, mend)
+        yield Finding("error" if tilt_deg > 8.0 else "warning", problem, mend)
 
 
 def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
@@ -489,19 +491,21 @@ def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
     mend = f"are the scans in order of time ({times}), of one drive, and whole?"
     if len(broken) > 0.5 * len(runs):
         fit = float(np.median([run.usual_fit for run in runs]))
-        what = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"
+        problem = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"
     elif len(leaps) and leaps.mean() > 0.25:
-        what = "the scans leap: they are out of order, or their times are wrong (the vehicle would brake or start as "
-        what += f"none can in {leaps.mean():.0%} of the steps)"
+        problem = (
+            "the scans leap: they are out of order, or their times are wrong (the vehicle would brake or start as "
+        )
+        problem += f"none can in {leaps.mean():.0%} of the steps)"
     elif np.median(speed) > 70.0:
-        what = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
+        problem = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
         mend = "check the times (seconds), and that the points are metres"
     elif broken:
         first, last = broken[0].indices[[0, -1]]
-        what = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places checked)"
+        problem = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places checked)"
     else:
         return
-    yield Finding("error", what, mend)
+    yield Finding("error", problem, mend)
 
 
 def _agree_with_time(run: Run, stamps_ns: I64) -> Bool:

@@ -46,9 +46,9 @@ def check_lean(drive: Drive, index: int, rules: RoadBelow = RULES) -> Iterator[F
     layers = np.bincount(np.floor((heights + rules.near_m) / rules.bin_m).astype(np.int64), minlength=1)
     densest_m = (int(np.argmax(layers)) + 0.5) * rules.bin_m - rules.near_m
     low, high = rules.depth_m
-    what = f"the prior tilts the sensor by {mount.lean_deg:.0f} deg"
+    problem = f"the prior tilts the sensor by {mount.lean_deg:.0f} deg"
     if low <= -densest_m <= high and layers.max() >= rules.share * max(len(heights), 1):
-        yield Finding("note", f"{what}, and by the points a road lies {-densest_m:.1f} m below it: it is mounted so")
+        yield Finding("note", f"{problem}, and by the points a road lies {-densest_m:.1f} m below it: it is mounted so")
         return
     mend = "is it mounted so? Else mend the prior's rotations: x is forward, z up"
-    yield Finding("warning", f"{what}, but no road lies below it then", mend)
+    yield Finding("warning", f"{problem}, but no road lies below it then", mend)

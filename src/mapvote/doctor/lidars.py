@@ -59,13 +59,17 @@ def check_lidars(
     best = max(fits, key=lambda pair: fits[pair])
     if best and fits[best] > rules.better * fits[()] and fits[best] > rules.least_fit:
         a, b = (topics[k] for k in best)
-        what = f"the frames of {a} and {b} are swapped: with their places exchanged the LiDARs see the same street to "
-        what += f"{fits[best]:.0%}, as stated to {fits[()]:.0%}"
+        problem = (
+            f"the frames of {a} and {b} are swapped: with their places exchanged the LiDARs see the same street to "
+        )
+        problem += f"{fits[best]:.0%}, as stated to {fits[()]:.0%}"
         mend = f"exchange the frame_ids in the drivers, or {_line(topics, _exchanged(T_base_lidars, best))}"
-        yield Finding("error", what, mend)
+        yield Finding("error", problem, mend)
     elif fits[()] < rules.least_fit:
-        what = f"the LiDARs see too little in common to say whether they sit as stated ({fits[()]:.0%} of the points)"
-        yield Finding("note", what)
+        problem = (
+            f"the LiDARs see too little in common to say whether they sit as stated ({fits[()]:.0%} of the points)"
+        )
+        yield Finding("note", problem)
     else:
         yield from _measured(sweeps, topics, T_base_lidars, rules)
 
@@ -121,14 +125,14 @@ def _measured(
     maps = [_map_of(sweep[0], rules) for sweep in sweeps]
     for k, T in enumerate(stated):
         clouds = [thin_for_levels(sweep[k + 1]) for sweep in sweeps]
-        found = [one.refine(cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
-        off = np.median([log(inverse(T) @ T_found) for T_found in found], axis=0)
-        spread = np.median([np.abs(log(inverse(T) @ T_found) - off) for T_found in found], axis=0)
+        registered = [one.refine(cloud, T).T_map_lidar for one, cloud in zip(maps, clouds, strict=True)]
+        off = np.median([log(inverse(T) @ T_found) for T_found in registered], axis=0)
+        spread = np.median([np.abs(log(inverse(T) @ T_found) - off) for T_found in registered], axis=0)
         off_m = float(np.linalg.norm(off[:3]))
         off_deg = float(np.degrees(np.linalg.norm(off[3:])))
         steady = np.linalg.norm(spread[:3]) < 0.3 * off_m or np.degrees(np.linalg.norm(spread[3:])) < 0.3 * off_deg
         if steady and (off_m > rules.off_m or off_deg > rules.off_deg):
-            what = f"by its points {topics[k + 1]} sits {off_m:.2f} m and {off_deg:.1f} deg off its stated place"
+            problem = f"by its points {topics[k + 1]} sits {off_m:.2f} m and {off_deg:.1f} deg off its stated place"
             measured = T_base_lidars.copy()
             measured[k + 1] = T_base_lidars[0] @ T @ exp(off)
-            yield Finding("warning", what, f"{_line(topics, measured)}; or leave it out with --topic")
+            yield Finding("warning", problem, f"{_line(topics, measured)}; or leave it out with --topic")

@@ -118,17 +118,17 @@ def check_localised(
     if len(drive.stamps_ns) < rules.least_scans:
         return
     yield from _share(drive, point_map, rules)
-    found = np.flatnonzero(drive.sure)
-    if len(found) < rules.least_scans:
+    sure_scans = np.flatnonzero(drive.sure)
+    if len(sure_scans) < rules.least_scans:
         return
-    yield from _leaps(drive, found, rules)
+    yield from _leaps(drive, sure_scans, rules)
     if drive.T_prior is not None:
-        found = found[np.isfinite(drive.T_prior[found]).all(axis=(1, 2))]
-        if len(found) < rules.least_scans:
+        sure_scans = sure_scans[np.isfinite(drive.T_prior[sure_scans]).all(axis=(1, 2))]
+        if len(sure_scans) < rules.least_scans:
             return
-        yield from _ways(drive, found, rules)
-        yield from _attitude(drive, found, rules)
-        yield from _positions(drive, found, rules)
+        yield from _ways(drive, sure_scans, rules)
+        yield from _attitude(drive, sure_scans, rules)
+        yield from _positions(drive, sure_scans, rules)
 
 
 def written_if_localised(
@@ -150,63 +150,67 @@ def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRu
     if point_map is not None:
         believed = drive.T_map_lidar[:, :3, 3].copy()
         if drive.T_prior is not None:
-            told = np.isfinite(drive.T_prior).all(axis=(1, 2))
-            believed[told] = drive.T_prior[told, :3, 3]
+            has_prior = np.isfinite(drive.T_prior).all(axis=(1, 2))
+            believed[has_prior] = drive.T_prior[has_prior, :3, 3]
         on_map = np.isfinite(point_map.ground_under(believed)) | drive.sure
     scans = int(on_map.sum())
     sure = int(drive.sure.sum())
     if scans >= rules.least_scans and sure < rules.least_share * scans:
-        what = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
-        yield Finding("error", what, f"is it the map of this street? {_PLACE_MEND}")
+        problem = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
+        yield Finding("error", problem, f"is it the map of this street? {_PLACE_MEND}")
 
 
-def _leaps(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+def _leaps(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     """Steps from one sure scan to the next that no vehicle drives."""
-    step_m = np.linalg.norm(np.diff(drive.T_map_lidar[found, :3, 3], axis=0), axis=1)
-    step_s = np.diff(drive.stamps_ns[found]) * 1e-9
+    step_m = np.linalg.norm(np.diff(drive.T_map_lidar[sure_scans, :3, 3], axis=0), axis=1)
+    step_s = np.diff(drive.stamps_ns[sure_scans]) * 1e-9
     leaps = (step_m > rules.leap_m) & (step_m > rules.leap_mps * step_s)
     if leaps.any():
         worst = int(np.argmax(np.where(leaps, step_m, 0.0)))
         times = "once" if leaps.sum() == 1 else f"{int(leaps.sum())} times, most"
-        what = f"the localised path leaps {times} before scan {found[worst + 1]} "
-        yield Finding("error", f"{what}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _PLACE_MEND)
+        problem = f"the localised path leaps {times} before scan {sure_scans[worst + 1]} "
+        yield Finding("error", f"{problem}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _PLACE_MEND)
 
 
-def _ways(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+def _ways(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     """How far the vehicle came, by the poses found and by the prior, over pieces of the drive."""
     assert drive.T_prior is not None
     driven_m = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(drive.T_map_lidar[found, :3, 3], axis=0), axis=1))]
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(drive.T_map_lidar[sure_scans, :3, 3], axis=0), axis=1))]
     )
     piece = max(rules.way_m, 6.0 * drive.sigma_m)
     marks = np.searchsorted(driven_m, np.arange(0.0, driven_m[-1], piece))
     if len(marks) < 3:
         return
-    a = found[marks[:-1]]
-    b = found[marks[1:]]
+    a = sure_scans[marks[:-1]]
+    b = sure_scans[marks[1:]]
     came_m = np.linalg.norm(drive.T_map_lidar[b, :3, 3] - drive.T_map_lidar[a, :3, 3], axis=1)
     believed_m = np.linalg.norm(drive.T_prior[b, :3, 3] - drive.T_prior[a, :3, 3], axis=1)
     slack_m = rules.way_share * np.maximum(came_m, believed_m) + 4.0 * drive.sigma_m
     if np.median(np.abs(came_m - believed_m) - slack_m) > 0.0:
         apart_m = float(np.median(np.abs(came_m - believed_m)))
-        what = f"over pieces of {piece:.0f} m the way found and the way by the prior differ by {apart_m:.1f} m (median)"
-        yield Finding("error", what, _PLACE_MEND)
+        problem = (
+            f"over pieces of {piece:.0f} m the way found and the way by the prior differ by {apart_m:.1f} m (median)"
+        )
+        yield Finding("error", problem, _PLACE_MEND)
 
 
-def _attitude(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+def _attitude(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     assert drive.T_prior is not None
-    apart = np.einsum("nji,njk->nik", drive.T_prior[found, :3, :3], drive.T_map_lidar[found, :3, :3])
+    apart = np.einsum("nji,njk->nik", drive.T_prior[sure_scans, :3, :3], drive.T_map_lidar[sure_scans, :3, :3])
     apart_deg = np.degrees(scipy.spatial.transform.Rotation.from_matrix(apart).magnitude())
     median_deg = float(np.median(apart_deg))
     if median_deg > rules.turn_deg + 4.0 * drive.sigma_deg:
-        what = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the one found"
-        yield Finding("error", what, f"are the axes of prior and points the same (x forward, z up)? {_PLACE_MEND}")
+        problem = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the one found"
+        yield Finding("error", problem, f"are the axes of prior and points the same (x forward, z up)? {_PLACE_MEND}")
 
 
-def _positions(drive: LocalisedDrive, found: I64, rules: LocalisedRules) -> Iterator[Finding]:
+def _positions(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     assert drive.T_prior is not None
-    off = drive.T_map_lidar[found, :2, 3] - drive.T_prior[found, :2, 3]
+    off = drive.T_map_lidar[sure_scans, :2, 3] - drive.T_prior[sure_scans, :2, 3]
     scatter_m = float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
     if scatter_m > rules.off_m + 4.0 * drive.sigma_m:
-        what = f"the prior lies {scatter_m:.1f} m (median) about its mean difference from the places found, but states "
-        yield Finding("error", f"{what}{drive.sigma_m:.2f} m", _PLACE_MEND)
+        problem = (
+            f"the prior lies {scatter_m:.1f} m (median) about its mean difference from the places found, but states "
+        )
+        yield Finding("error", f"{problem}{drive.sigma_m:.2f} m", _PLACE_MEND)

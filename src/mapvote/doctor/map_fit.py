@@ -155,12 +155,12 @@ class MapEvidence:
         points = {i: np.asarray(scale * self.scans[i].points, dtype=np.float32) for i in guesses}
         return [_place_of(around or self.around, i, points[i], guesses[i], judge) for i in guesses]
 
-    def told(self, what: str, steps: Iterable[Step]) -> Iterator[Step]:
+    def told(self, stage: str, steps: Iterable[Step]) -> Iterator[Step]:
         """The steps, each reported as it begins."""
         every = list(steps)
         for k, step in enumerate(every):
             if self.progress is not None:
-                self.progress(what, k + 1, len(every))
+                self.progress(stage, k + 1, len(every))
             yield step
 
 
@@ -169,7 +169,7 @@ def check_on_map(
 ) -> tuple[list[Finding], F64]:
     """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
     e = MapEvidence(drive, T, point_map, progress)
-    found = list(_outside(T, point_map))
+    findings = list(_outside(T, point_map))
     road = find_road([scan.points for scan in e.scans.values()])
     depth_m = road.depth_m if road.up == "+z" and road.is_there else None
     places: list[Place] = []
@@ -188,15 +188,15 @@ def check_on_map(
             return [unit], T
         better, mirrored = _searched(e)
         if mirrored:
-            what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, unmirrored none"
-            return [*found, Finding("error", what, "negate y of the map's points, or of the scans'")], T
+            problem = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, unmirrored none"
+            return [*findings, Finding("error", problem, "negate y of the map's points, or of the scans'")], T
         places = max(places, better, key=lambda one: len(fitting(one)))
     good = fitting(places)
     if len(good) < 2:
         best = max(places, key=lambda p: p.fit)
-        what = f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the "
+        problem = f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the "
         mend = "is it the map of another street, in another scale or tilt, or all changed?"
-        return [*found, Finding("error", f"{what}same street fits above {POSE_CHECK.min_fit}", mend)], T
+        return [*findings, Finding("error", f"{problem}same street fits above {POSE_CHECK.min_fit}", mend)], T
     # Places far apart show the scale as well, but no better than the prior's positions are known.
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
@@ -207,7 +207,7 @@ def check_on_map(
     )
     mended = fit.applied(T)
     differs = _differs(fit, len(good), drive)
-    return [*found, *_where_not(places, good), differs, *_heights(point_map, mended, drive)], mended
+    return [*findings, *_where_not(places, good), differs, *_heights(point_map, mended, drive)], mended
 
 
 def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, float]:
@@ -227,8 +227,8 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
             starts = [place.T_map_lidar]
             if not place.fits:  # it may be elsewhere: where the prior has it, in a map so much larger
                 starts.append(e.scaled(place.index, scale))
-            found = [ndt_map.refine(clouds, start).T_map_lidar for start in starts]
-            fits.append(max(likelihood_at(ndt_map, clouds, T, len(clouds) - 1) for T in found))
+            poses = [ndt_map.refine(clouds, start).T_map_lidar for start in starts]
+            fits.append(max(likelihood_at(ndt_map, clouds, T, len(clouds) - 1) for T in poses))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
         peaks.append(scales[best] + step * peak_of(fits[best - 1], fits[best], fits[best + 1]))
     scale = float(np.median(peaks))
@@ -255,7 +255,7 @@ def in_another_unit(e: MapEvidence) -> Finding | None:
 
     The map's points are made metres, not the scans feet: voxels have the size that suits points in metres.
     """
-    some = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.unit_scans)][: MAP_FIT_RULE.unit_scans]
+    sample = list(e.scans)[:: max(1, len(e.scans) // MAP_FIT_RULE.unit_scans)][: MAP_FIT_RULE.unit_scans]
     centres = np.zeros(3), _middle(e.point_map), e.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, MAP_FIT_RULE.sensor_m]
     for name, in_metres, mend in e.told("trying other units", _units()):
         for centre in centres:
@@ -263,10 +263,10 @@ def in_another_unit(e: MapEvidence) -> Finding | None:
             if metres is None:
                 continue
             around = MapWindow(metres)
-            if 2 * len(fitting(e.places({i: [e.T[i]] for i in some}, around))) > len(some):
+            if 2 * len(fitting(e.places({i: [e.T[i]] for i in sample}, around))) > len(sample):
                 fits = len(fitting(e.places({i: [e.T[i]] for i in e.scans}, around)))
-                what = f"the map is {name}: made metres, it fits {fits} of {len(e.scans)} scans checked"
-                return Finding("error", what, mend)
+                problem = f"the map is {name}: made metres, it fits {fits} of {len(e.scans)} scans checked"
+                return Finding("error", problem, mend)
     return None
 
 
@@ -289,9 +289,9 @@ def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointM
         return None
     lattice = Lattice()
     tiles = {}
-    for index, mine in cut_tiles(points, lattice):
+    for index, chosen in cut_tiles(points, lattice):
         empty = Tile.empty(lattice.tile(index))
-        tiles[index] = empty.but(points=empty.window.from_map(points[mine]))
+        tiles[index] = empty.but(points=empty.window.from_map(points[chosen]))
     return PointMap(point_map.map_id, lattice, tiles)
 
 
@@ -304,9 +304,9 @@ def _searched(e: MapEvidence) -> tuple[list[Place], int]:
     mirror = np.array([1.0, -1.0, 1.0], dtype=np.float32)
     for i in e.told("searching the map", chosen):
         scan = e.scans[i]
-        found = _find(search, scan)
-        if found is not None:
-            D = found @ inverse(e.T[i])
+        T_map_lidar = _find(search, scan)
+        if T_map_lidar is not None:
+            D = T_map_lidar @ inverse(e.T[i])
             best = max(best, e.places({j: [D @ e.T[j]] for j in e.scans}), key=lambda p: len(fitting(p)))
             if len(fitting(best)) > 0.6 * len(e.scans):
                 return best, 0
@@ -317,10 +317,10 @@ def _searched(e: MapEvidence) -> tuple[list[Place], int]:
 
 def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
     try:
-        found = search.find(scan)
+        match = search.find(scan)
     except MapvoteError:  # too large to search
         return None
-    return None if found is None or found.fit < POSE_CHECK.min_fit else found.T_map_lidar
+    return None if match is None or match.fit < POSE_CHECK.min_fit else match.T_map_lidar
 
 
 def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], judge: Judge) -> Place:
@@ -330,15 +330,15 @@ def _place_of(around: MapWindow, i: int, points: F32, guesses: Sequence[F64], ju
     best = Place(i, guesses[0], 0.0, 0.0)
     for guess in guesses:
         ndt_map = around(guess[:3, 3])
-        known = _known(ndt_map, clouds[0].T.astype(np.float64), guess)
-        if known < 0.1:
-            best = max(best, Place(i, guess, 0.0, known), key=lambda p: p.known)
+        known_share = _known(ndt_map, clouds[0].T.astype(np.float64), guess)
+        if known_share < 0.1:
+            best = max(best, Place(i, guess, 0.0, known_share), key=lambda p: p.known)
             continue
         starts = [guess]
         for attempt in range(2):
             for start in starts:
                 T = ndt_map.refine(clouds, start).T_map_lidar
-                best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known), key=lambda p: p.fit)
+                best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known_share), key=lambda p: p.fit)
             if best.fits or attempt:
                 break
             starts = likeliest(ndt_map, clouds[0], _grid_around(guess), MAP_FIT_RULE.ranked, 500)
@@ -380,11 +380,13 @@ def _outside(T: F64, point_map: PointMap) -> Iterator[Finding]:
     if share == 0:
         a = low.min(axis=0)
         b = low.max(axis=0) + side
-        what = (
+        problem = (
             f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
             f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
         )
-        yield Finding("error", what, "have prior and map the same frame and origin (for oxts: origin in drive.toml)?")
+        yield Finding(
+            "error", problem, "have prior and map the same frame and origin (for oxts: origin in drive.toml)?"
+        )
     elif share < 0.95:
         yield Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote")
 
@@ -402,11 +404,11 @@ def _where_not(places: Sequence[Place], good: Sequence[Place]) -> Iterator[Findi
     if empty:
         scans = ", ".join(str(p.index) for p in empty)
         grave: Severity = "error" if len(empty) >= 0.4 * len(places) else "warning"
-        what = f"the map holds nothing around {len(empty)} of {len(places)} places checked (scans {scans})"
-        yield Finding(grave, what, "part of the map is missing, or the drive leaves it: there it cannot vote")
+        problem = f"the map holds nothing around {len(empty)} of {len(places)} places checked (scans {scans})"
+        yield Finding(grave, problem, "part of the map is missing, or the drive leaves it: there it cannot vote")
     elif len(good) < 0.7 * len(places):
-        what = f"scans fit the map at {len(good)} of {len(places)} places only"
-        yield Finding("warning", what, "elsewhere the street has changed, or the map is bent")
+        problem = f"scans fit the map at {len(good)} of {len(places)} places only"
+        yield Finding("warning", problem, "elsewhere the street has changed, or the map is bent")
 
 
 def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
@@ -444,21 +446,21 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     ]
     surely = [(words, by, error) for words, by, least, s, within, error in rows if by > max(least, 4.0 * s, within)]
     if not surely:
-        what = f"prior and map agree to {off_m:.2f} m and {abs(yaw_deg):.2f} deg ({places} places)"
+        problem = f"prior and map agree to {off_m:.2f} m and {abs(yaw_deg):.2f} deg ({places} places)"
         small = ", ".join(words for words, by, least, *_ in rows if by > least)
         more = f"; the map is {small}: no more than prior_sigma_m and prior_sigma_deg explain" if small else ""
-        return Finding("note", what + more)
+        return Finding("note", problem + more)
     parts = ", ".join(words for words, _, _ in surely)
-    what = f"the map is {parts} against the prior, at the middle of the drive ({places} places)"
+    problem = f"the map is {parts} against the prior, at the middle of the drive ({places} places)"
     along = _as_time(d, drive) if any(words is shift for words, _, _ in surely) else None
     if along is not None:
-        what += f"; that lies along the road: or the prior's rows are {abs(along.late_s):.1f} s {along.word}"
+        problem += f"; that lies along the road: or the prior's rows are {abs(along.late_s):.1f} s {along.word}"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
     if any(words is scale for words, _, _ in surely):
         mend = f"if the map is right, multiply their points by {d.scale:.4f}; else the map's by {1.0 / d.scale:.4f}"
     if along is not None:
         mend += f"; or shift its rows by {along.scans} scans"
-    return Finding("error" if any(by > error for _, by, error in surely) else "warning", what, mend)
+    return Finding("error" if any(by > error for _, by, error in surely) else "warning", problem, mend)
 
 
 class _Along(NamedTuple):
@@ -500,8 +502,8 @@ def _heights(point_map: PointMap, T: F64, drive: Drive) -> Iterator[Finding]:
     if not np.isfinite(height.median_m):
         return
     if not -0.5 < height.median_m < 6.0:
-        what = f"the sensor is {height.median_m:.1f} m above the map's ground"
-        yield Finding("error", what, "the map's ground lies wrong under this drive: build it anew")
+        problem = f"the sensor is {height.median_m:.1f} m above the map's ground"
+        yield Finding("error", problem, "the map's ground lies wrong under this drive: build it anew")
     elif abs(height.worst_off_m) > height.level_m + 3.0 * drive.prior_sigma_m:
         mend = "if the prior's heights are sound, so much is wrong with the map's ground: build it anew from its drives"
         yield Finding("warning", f"by the prior, {height.complaint}", mend)

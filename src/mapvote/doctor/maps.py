@@ -142,20 +142,20 @@ def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
     n = sum(map(len, pieces()))
     if n < MAP_CHECK.few_points:
         return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
-    some = _every(pieces, max(1, n // MAP_CHECK.checked_points))
-    low, high = np.quantile(some, (0.001, 0.999), axis=0)
-    apart_m = spacing(pieces, some)
+    sample = _every(pieces, max(1, n // MAP_CHECK.checked_points))
+    low, high = np.quantile(sample, (0.001, 0.999), axis=0)
+    apart_m = spacing(pieces, sample)
     units = list(_units(high - low, apart_m))
-    found = [*_strays(pieces, n, low, high), *units]
+    findings = [*_strays(pieces, n, low, high), *units]
     if not units:
         classified = np.empty((0, 3)) if ground is None else _every(ground, max(1, n // MAP_CHECK.checked_points))
-        found += which_way_up(some, high - low, classified)
+        findings += which_way_up(sample, high - low, classified)
     twice = float((apart_m < 1e-6).mean())
     if twice >= 0.05:
-        found.append(
+        findings.append(
             Finding("warning", f"{twice:.0%} of the points are there twice", "the map was joined with itself?")
         )
-    return [*found, *_rounded(some)]
+    return [*findings, *_rounded(sample)]
 
 
 def _every(pieces: Pieces, step: int) -> F64:
@@ -180,14 +180,14 @@ def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> Iterator[Finding]:
         strays += int(outside.sum())
         far_m = max(far_m, float(np.abs(points[outside] - 0.5 * (low + high)).max(initial=0.0)))
     if strays:
-        what = f"{strays} of {n} points lie far off all others, up to {far_m:.0f} m"
+        problem = f"{strays} of {n} points lie far off all others, up to {far_m:.0f} m"
         mend = "strays, or another place's points: cut them off"
-        yield Finding("warning" if far_m > MAP_CHECK.stray_m else "note", what, mend)
+        yield Finding("warning" if far_m > MAP_CHECK.stray_m else "note", problem, mend)
 
 
-def spacing(pieces: Pieces, some: F64) -> F64:
-    """(m,) distance of points to their nearest neighbour, of all points around one place, the middle of ``some``."""
-    centre = np.median(some[:: max(1, len(some) // 1000)], axis=0)
+def spacing(pieces: Pieces, sample: F64) -> F64:
+    """(m,) distance of points to their nearest neighbour, of all points around one place, the middle of ``sample``."""
+    centre = np.median(sample[:: max(1, len(sample) // 1000)], axis=0)
     near = np.empty((0, 3))
     away = np.empty(0)
     for points in pieces():
@@ -233,27 +233,27 @@ def _units(wide: F64, apart: F64) -> Iterator[Finding]:
     apart_m = float(np.median(apart))
     mend = "give the points in metres"
     if wide.max() < 5.0:
-        what = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
-        yield Finding("error", what, mend)
+        problem = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
+        yield Finding("error", problem, mend)
     elif wide[2] < 0.05:
         yield Finding("error", "all points lie at one height: the map is flat", "is the column order x, y, z?")
     elif wide[2] > MAP_CHECK.highest_m or (apart_m > 2.0 and wide[2] > 0.2 * MAP_CHECK.highest_m):
-        what = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
-        yield Finding("error", what, mend)
+        problem = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
+        yield Finding("error", problem, mend)
     elif apart_m > 0.5:
-        what = f"points are {apart_m:.2f} m apart (median): too sparse to show what stands there, or not metres"
-        yield Finding("warning", what, "a map needs a point every 0.3 m or so")
+        problem = f"points are {apart_m:.2f} m apart (median): too sparse to show what stands there, or not metres"
+        yield Finding("warning", problem, "a map needs a point every 0.3 m or so")
 
 
-def _rounded(some: F64) -> Iterator[Finding]:
-    some = some[:: max(1, len(some) // 20_000)]
+def _rounded(sample: F64) -> Iterator[Finding]:
+    sample = sample[:: max(1, len(sample) // 20_000)]
     for axis, name in enumerate("xyz"):
         for quantum in (1.0, 0.5, 0.25, 0.125):
-            steps = some[:, axis] / quantum
-            if (np.abs(steps - np.round(steps)) < 1e-3).mean() > 0.95 and np.ptp(some[:, axis]) > 0.05:
-                what = f"{name} is rounded to {quantum:g} m in the map"
+            steps = sample[:, axis] / quantum
+            if (np.abs(steps - np.round(steps)) < 1e-3).mean() > 0.95 and np.ptp(sample[:, axis]) > 0.05:
+                problem = f"{name} is rounded to {quantum:g} m in the map"
                 mend = "float32 of large coordinates? Subtract an offset before writing them"
-                yield Finding("error", what, mend)
+                yield Finding("error", problem, mend)
                 return
 
 
@@ -264,8 +264,8 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
             sieve = MarkedPoints()
             cloud = joined(sieve.without(stream_cloud(path)))
             findings, made = examine_points(str(path), cloud)
-            told = [Finding("note", line) for line in sieve.told()]
-            return in_order([*findings, *_check_box(path, cloud.points), *told]), made
+            notes = [Finding("note", line) for line in sieve.told()]
+            return in_order([*findings, *_check_box(path, cloud.points), *notes]), made
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
@@ -279,67 +279,69 @@ def _check_box(path: Path, points: NDArray[np.floating]) -> Iterator[Finding]:
     if path.suffix.lower() in (".las", ".laz") and len(points):
         beside = beside_its_box(path, points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64))
         if beside:
-            what, _, mend = beside.partition(". ")
-            yield Finding("error", what, mend)
+            problem, _, mend = beside.partition(". ")
+            yield Finding("error", problem, mend)
 
 
-def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
+def examine_points(source: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
     """The same of points as a file has them, of which no map has been made yet. MapvoteError if their coordinates
     cannot be made metres."""
     finite = on_earth(cloud.points)
     n = len(finite)
     bad = int((~finite).sum())
-    found = []
+    findings = []
     if bad:
-        what = f"{bad} of {n} points are not finite"
+        problem = f"{bad} of {n} points are not finite"
         mend = "export the file again; of a LAS the header's scales and offsets may be broken"
         if bad > POINT_RULE.most_bad_share * n:
-            return [Finding("error", what, mend)], None
-        found.append(Finding("note", f"{what}: import leaves them out"))
+            return [Finding("error", problem, mend)], None
+        findings.append(Finding("note", f"{problem}: import leaves them out"))
     fields = {name: column[finite] for name, column in cloud.fields.items()}
-    (cloud,) = in_map_metres(where, iter([replace(cloud, points=cloud.points[finite], fields=fields)]))
-    found += check_cloud(in_memory(cloud.points), in_memory(grounded(cloud.fields, cloud.points)))
-    if any_error(found):
-        return in_order(found), None
+    (cloud,) = in_map_metres(source, iter([replace(cloud, points=cloud.points[finite], fields=fields)]))
+    findings += check_cloud(in_memory(cloud.points), in_memory(grounded(cloud.fields, cloud.points)))
+    if any_error(findings):
+        return in_order(findings), None
     try:
-        point_map = map_of(where, [cloud])
+        point_map = map_of(source, [cloud])
     except MapvoteError as error:
-        return in_order([*found, Finding("error", str(error))]), None
-    return in_order([*found, *check_map(point_map)]), point_map
+        return in_order([*findings, Finding("error", str(error))]), None
+    return in_order([*findings, *check_map(point_map)]), point_map
 
 
 def check_map(point_map: PointMap) -> Iterator[Finding]:
     """Findings on a map whose ground has been measured. Ground and copies of a map larger than memory are checked
     around its middle."""
-    some = _around_the_middle(point_map)
-    points = all_points(some)
-    tiles = [some.tiles[index] for index in sorted(some.tiles)]
+    middle = _around_the_middle(point_map)
+    points = all_points(middle)
+    tiles = [middle.tiles[index] for index in sorted(middle.tiles)]
     height = np.concatenate([t.points_map[:, 2] - t.ground_z.reshape(-1)[t.cells] for t in tiles])
     yield from _ground(points, height)
-    for what in filter(None, (check_heights(point_map, path).complaint for path in point_map.driven)):
+    for problem in filter(None, (check_heights(point_map, path).complaint for path in point_map.driven)):
         mend = "where drives run above each other it keeps one level, and the other cannot vote there"
-        yield Finding("warning", what, f"build the map anew; {mend}")
+        yield Finding("warning", problem, f"build the map anew; {mend}")
     yield from _missing_tiles(point_map)
-    if some is not point_map:
-        what = f"ground and copies were checked in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
-        yield Finding("note", what)
-    lone = sum(int(lone_points(tile).sum()) for tile in some.tiles.values())
-    if lone > MAP_CHECK.most_lone * some.n_points:
-        what = f"{lone} of {some.n_points} points stand above the ground and touch no other"
-        yield Finding("note", what, "vehicles will deny them; mapvote import --clean drops them")
+    if middle is not point_map:
+        problem = (
+            f"ground and copies were checked in {len(middle.tiles)} tiles of {len(point_map.tiles)}, in the middle"
+        )
+        yield Finding("note", problem)
+    lone = sum(int(lone_points(tile).sum()) for tile in middle.tiles.values())
+    if lone > MAP_CHECK.most_lone * middle.n_points:
+        problem = f"{lone} of {middle.n_points} points stand above the ground and touch no other"
+        yield Finding("note", problem, "vehicles will deny them; mapvote import --clean drops them")
     standing = points[(height > 0.5) & (height < 6.0)]
     yield from _lean(standing)
     layer_m = ghost_layer(height)
     if layer_m is not None:
-        what = f"the road lies there twice, {abs(layer_m):.2f} m apart in height: a ghost layer"
-        yield Finding("error", what, "two drives of different height were merged: align them")
+        problem = f"the road lies there twice, {abs(layer_m):.2f} m apart in height: a ghost layer"
+        yield Finding("error", problem, "two drives of different height were merged: align them")
     elif float(np.median(spacing(in_memory(points), points))) < MAP_CHECK.sparse_m:
         shift = ghost_shift(standing)
         if shift is not None:
             x, y = shift
             by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
-            what = f"walls and poles are there twice, shifted by {by}: a ghost layer"
-            yield Finding("error", what, "two drives were merged without alignment: align them")
+            problem = f"walls and poles are there twice, shifted by {by}: a ghost layer"
+            yield Finding("error", problem, "two drives were merged without alignment: align them")
     yield _frame(point_map)
 
 
@@ -358,38 +360,38 @@ def _around_the_middle(point_map: PointMap) -> PointMap:
 
 def _ground(points: F64, height: F64) -> Iterator[Finding]:
     """Findings on the share of points (n, 3) that the ground explains, by their ``height`` (n,) over it."""
-    known = float(np.isfinite(height).mean())
-    if known < 0.5:
-        what = f"the ground is known under {known:.0%} of the points only"
-        yield Finding("warning", what, "is the road missing, cut off below, or is z not up?")
+    known_share = float(np.isfinite(height).mean())
+    if known_share < 0.5:
+        problem = f"the ground is known under {known_share:.0%} of the points only"
+        yield Finding("warning", problem, "is the road missing, cut off below, or is z not up?")
     below = float((height < -1.0).mean())
     if below > 0.01:
-        what = f"{below:.1%} of the points lie more than 1 m below the ground"
-        yield Finding("warning", what, "reflections, cellars, or a second layer below")
+        problem = f"{below:.1%} of the points lie more than 1 m below the ground"
+        yield Finding("warning", problem, "reflections, cellars, or a second layer below")
     above = float((height > MAP_CHECK.aloft_m).mean())
     if above > 0.001:
-        what = f"{above:.1%} of the points lie more than {MAP_CHECK.aloft_m:.0f} m above the ground"
+        problem = f"{above:.1%} of the points lie more than {MAP_CHECK.aloft_m:.0f} m above the ground"
         mend = "outliers, or another place's points: cut them off; sound among towers only"
-        yield Finding("error" if above > 0.01 else "warning", what, mend)
+        yield Finding("error" if above > 0.01 else "warning", problem, mend)
     near = np.abs(height) < 0.15
     if near.sum() < 100:
         yield Finding("warning", "hardly any point lies on the ground", "was the ground cut out of the map?")
         return
     if near.mean() < 0.08:
-        what = f"only {near.mean():.0%} of the points lie on the ground"
-        yield Finding("warning", what, "was the ground cut out of the map? Votes need the road")
+        problem = f"only {near.mean():.0%} of the points lie on the ground"
+        yield Finding("warning", problem, "was the ground cut out of the map? Votes need the road")
     p = points[near][:: max(1, int(near.sum()) // 100_000)]
     p = p - p.mean(axis=0)
     slope, *_ = np.linalg.lstsq(np.column_stack([p[:, :2], np.ones(len(p))]), p[:, 2], rcond=None)
     slope_deg = float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
     if slope_deg > MAP_CHECK.slope_deg:
-        what = f"the ground as a whole is tilted by {slope_deg:.1f} deg"
-        yield Finding("warning", what, "sound on a steep street only; else z is not up: level the map")
+        problem = f"the ground as a whole is tilted by {slope_deg:.1f} deg"
+        yield Finding("warning", problem, "sound on a steep street only; else z is not up: level the map")
     wide = height[np.abs(height) < 0.6]
     rough_m = 1.4826 * float(np.median(np.abs(wide - np.median(wide))))
     if rough_m > 0.12:
-        what = f"the ground is {rough_m:.2f} m thick"
-        yield Finding("warning", what, "scans scatter, or several were merged with bad poses")
+        problem = f"the ground is {rough_m:.2f} m thick"
+        yield Finding("warning", problem, "scans scatter, or several were merged with bad poses")
 
 
 def _missing_tiles(point_map: PointMap) -> Iterator[Finding]:
@@ -399,8 +401,8 @@ def _missing_tiles(point_map: PointMap) -> Iterator[Finding]:
     holes = sorted(((above & below) | (beside & behind)) - tiles)
     if holes:
         window = point_map.lattice.tile(holes[0])
-        what = f"{len(holes)} tiles are missing between others, the first at ({window.x0:.0f}, {window.y0:.0f})"
-        yield Finding("warning", what, "a hole in the map: no vehicle can vote there")
+        problem = f"{len(holes)} tiles are missing between others, the first at ({window.x0:.0f}, {window.y0:.0f})"
+        yield Finding("warning", problem, "a hole in the map: no vehicle can vote there")
 
 
 def _frame(point_map: PointMap) -> Finding:
@@ -412,8 +414,8 @@ def _frame(point_map: PointMap) -> Finding:
         high = np.maximum(high, points.max(axis=0, initial=-np.inf))
     extent = ", ".join(f"{axis} {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
     if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > MAP_CHECK.far_m:
-        what = f"the map does not name its coordinate system ({extent})"
-        return Finding("warning", what, "import it with --from-crs EPSG:n, so that GNSS and maps find it")
+        problem = f"the map does not name its coordinate system ({extent})"
+        return Finding("warning", problem, "import it with --from-crs EPSG:n, so that GNSS and maps find it")
     return Finding("note", f"{extent}; {frame.told()}")
 
 
@@ -439,9 +441,9 @@ def _lean(standing: F64) -> Iterator[Finding]:
     if by_deg > max(LEAN_CHECK.lean_deg, LEAN_CHECK.lean_sigmas * sigma_deg):
         pitch = np.degrees(np.arctan(lean[0]))
         roll = np.degrees(np.arctan(-lean[1]))
-        what = f"walls and poles lean by {by_deg:.1f} deg (+-{sigma_deg:.1f}): the map is tilted"
+        problem = f"walls and poles lean by {by_deg:.1f} deg (+-{sigma_deg:.1f}): the map is tilted"
         mend = f"level it: turn its points back by pitch {pitch:.1f} deg (about y) and roll {roll:.1f} deg (about x)"
-        yield Finding("warning", what, mend)
+        yield Finding("warning", problem, mend)
 
 
 def _sides(standing: F64) -> F64:

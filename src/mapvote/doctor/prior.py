@@ -295,11 +295,11 @@ def _fit_rule(rule: Callable[[F64], Rule], starts: list[F64], T: F64, runs: Sequ
         return np.asarray((_residuals(rule(parameters)(T), runs) * weights).ravel())
 
     best = min(starts, key=lambda start: float(np.abs(off(start)).sum()))
-    found = scipy.optimize.least_squares(off, best, loss="soft_l1", f_scale=0.3, max_nfev=30)
-    spread = 1.4826 * float(np.median(np.abs(found.fun))) + 0.02
+    solution = scipy.optimize.least_squares(off, best, loss="soft_l1", f_scale=0.3, max_nfev=30)
+    spread = 1.4826 * float(np.median(np.abs(solution.fun))) + 0.02
     # Neighbouring numbers of a run err alike: two of every three are taken to say nothing new.
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 3.0 * spread**2
-    return np.asarray(found.x), np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * 3.0 * spread**2
+    return np.asarray(solution.x), np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
 def measure_scale(T: F64, runs: Sequence[Run]) -> Number:
@@ -400,16 +400,16 @@ def fit_similarity(
         if own_turn:
             rotated = rotated * Rotation.from_euler("zy", x[7:])
         rotations = (rotated.inv() * R_to).as_rotvec() / rotation_rad
-        known = (x[6] - np.log(scale[0])) / scale[1]
-        return np.concatenate([(moved(x) / position_m).ravel(), rotations.ravel(), [known]])
+        scale_off = (x[6] - np.log(scale[0])) / scale[1]
+        return np.concatenate([(moved(x) / position_m).ravel(), rotations.ravel(), [scale_off]])
 
     start = np.zeros(9 if own_turn else 7)
     start[3:6] = (R_to * R_from.inv()).mean().as_rotvec()
     start[6] = np.log(scale[0])
-    found = scipy.optimize.least_squares(off, start, loss="soft_l1", f_scale=2.0, max_nfev=100)
-    x = found.x
-    spread = max(1.0, 1.4826 * float(np.median(np.abs(found.fun))))
-    sigma = spread * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
+    solution = scipy.optimize.least_squares(off, start, loss="soft_l1", f_scale=2.0, max_nfev=100)
+    x = solution.x
+    spread = max(1.0, 1.4826 * float(np.median(np.abs(solution.fun))))
+    sigma = spread * np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)))
     return Similarity(
         middle=middle,
         offset_m=there - middle + x[:3],

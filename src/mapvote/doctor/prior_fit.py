@@ -94,11 +94,11 @@ def agreement(e: DriveEvidence) -> tuple[list[Finding], F64 | None]:
     """(how prior and scans differ, the prior (n, 4, 4) as it would be mended)."""
     if e.T is None or not e.can_be_registered or e.leaps:
         return [], e.T
-    found, T = compare(e, e.T)
+    findings, T = compare(e, e.T)
     if e.road.up == "-z":
         # Nothing wrong with a prior shows surely in scans that are mended by a guess.
-        return [f for f in found if f.severity == "error"], T @ np.diag([1.0, -1.0, -1.0, 1.0])
-    return found, T
+        return [f for f in findings if f.severity == "error"], T @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return findings, T
 
 
 def check_attitude(e: DriveEvidence) -> Iterator[Finding]:
@@ -118,8 +118,8 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     if length_m < 1.0 and prior_m < 1.0:
         return [Finding("note", "the vehicle hardly moves: prior and scans cannot be compared")], T
     if length_m < min(1.0, 0.1 * prior_m):
-        what = f"the scans stand still where the prior moves {prior_m:.1f} m"
-        return [Finding("error", what, "is it the trajectory of this drive? Are the points in the map's frame?")], T
+        problem = f"the scans stand still where the prior moves {prior_m:.1f} m"
+        return [Finding("error", problem, "is it the trajectory of this drive? Are the points in the map's frame?")], T
     as_it_is = _fit(AS_IT_IS, T, runs)
     turn, pitch = measure_turn(T, runs)
     time = measure_time(T, runs, drive.stamps_ns)
@@ -134,8 +134,8 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     if not _clearly_better(best, as_it_is, length_m):
         if as_it_is.median > floor_m:
             return [_nothing_fits(as_it_is, runs, length_m, prior_m)], T
-        found = [*check_small(e, T, time), *_places(as_it_is, runs, drive.prior_sigma_m)]
-        return [*found, *_scatter(drive, as_it_is, length_m), *_cannot_tell(as_it_is, fits, length_m, e)], T
+        findings = [*check_small(e, T, time), *_places(as_it_is, runs, drive.prior_sigma_m)]
+        return [*findings, *_scatter(drive, as_it_is, length_m), *_cannot_tell(as_it_is, fits, length_m, e)], T
     if best.median > floor_m:
         pair = _two_at_once(T, fits, runs, e.road_below)
         if pair is None or pair[1].median > floor_m:
@@ -147,16 +147,16 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
         return [first, behind], other.reading.poses(one.reading.poses(T))
     group = _like_the_best(best, fits, length_m, runs)
     named = replace(_named(group, as_it_is, best, length_m), readings=_for_a_map(group, fits, as_it_is, T))
-    found = [named]
+    findings = [named]
     mended = best.reading.poses(T)
     right_handed = bool(np.linalg.det(mended[0, :3, :3]) > 0)
     if len(group) == 1 and right_handed and best.median > 0.1 + 0.02 * length_m:  # another fault may hide behind it
         more, twice_mended = compare(e, mended)
         errors = [f for f in more if f.severity == "error"]
         more = [replace(f, what=f"and once that is mended: {f.what}", readings=()) for f in errors]
-        found = found + more
+        findings = findings + more
         mended = twice_mended if more else mended
-    return found, mended
+    return findings, mended
 
 
 def _two_at_once(T: F64, fits: Sequence[_Fit], runs: Sequence[Run], road: Road) -> tuple[_Fit, _Fit] | None:
@@ -256,23 +256,23 @@ def _forward_deg(runs: Sequence[Run]) -> float:
 
 def _reading_of(number: Number, T: F64, runs: Sequence[Run], road: Road) -> Reading:
     """The reading that a number stands for, with the side that is wrong as far as it shows."""
-    value, what, mend = number.value, *number.words
+    value, problem, mend = number.value, *number.words
     if number.kind == "scale":
         return Reading(*_scale_words(number, road), number.poses)
     if number.kind == "time":
-        return Reading(what, f"shift its times by {-value:+.2f} s, or its rows against the scans", number.poses)
+        return Reading(problem, f"shift its times by {-value:+.2f} s, or its rows against the scans", number.poses)
     if number.kind == "pitch":
         side = "scans" if road.tilt_deg > 0.5 * abs(value) else "prior"
-        return Reading(what, mend, number.poses, side, angle=True)
+        return Reading(problem, mend, number.poses, side, angle=True)
     forward = _forward_deg(runs)
     drift = drift_angle_deg(T)
     if abs(forward) > max(0.5 * abs(value), 2.0 * abs(drift)):
         back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
-        what = f"the scans {back}are turned by {forward:.1f} deg about z (+-{number.sigma:.1f})"
-        what += " from the direction of travel"
-        return Reading(what, X_FORWARD, number.poses, "scans", angle=True)
-    what = f"the prior's headings are off by {value:.1f} deg (+-{number.sigma:.1f}), counter-clockwise"
-    return Reading(what, f"turn its rotations by {-value:.1f} deg about z", number.poses, angle=True)
+        problem = f"the scans {back}are turned by {forward:.1f} deg about z (+-{number.sigma:.1f})"
+        problem += " from the direction of travel"
+        return Reading(problem, X_FORWARD, number.poses, "scans", angle=True)
+    problem = f"the prior's headings are off by {value:.1f} deg (+-{number.sigma:.1f}), counter-clockwise"
+    return Reading(problem, f"turn its rotations by {-value:.1f} deg about z", number.poses, angle=True)
 
 
 def _unit_near(m: Number) -> float:
@@ -289,20 +289,23 @@ def _scale_words(m: Number, road: Road) -> tuple[str, str]:
     other = low <= road.depth_m * m.value <= high
     unit = _unit_near(m)
     if road.is_there and other and not usual:
-        what = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
+        problem = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
         mend = f"multiply their points by {m.value:.4f}, or by the exact factor if you know it"
         if unit:
             mend = f"multiply their points by {unit:.5g} ({'they are' if unit < 1.0 else 'they were taken for'} feet)"
-        return f"{what}: by them the road lies {road.depth_m:.1f} m below", mend
-    what = f"the prior's positions are {size} too large"
+        return f"{problem}: by them the road lies {road.depth_m:.1f} m below", mend
+    problem = f"the prior's positions are {size} too large"
     if road.is_there and usual and not other:
         feet = " (they are feet)" if unit > 1.0 else " (they were taken for feet)"
-        return what, f"divide its positions by {unit:.5g}{feet}" if unit else f"divide its positions by {m.value:.5g}"
+        return (
+            problem,
+            f"divide its positions by {unit:.5g}{feet}" if unit else f"divide its positions by {m.value:.5g}",
+        )
     mend = (
         f"divide its positions by {m.value:.5g}, or multiply the points by that: compare with a length that you know "
     )
     mend += "(Mercator's metres need a projection such as UTM, feet 0.3048), or decide by a map (--map)"
-    return f"{what}, or the scans that much too small", mend
+    return f"{problem}, or the scans that much too small", mend
 
 
 def _named(group: Sequence[_Fit], as_it_is: _Fit, best: _Fit, length_m: float) -> Finding:
@@ -319,14 +322,14 @@ def _nothing_fits(as_it_is: _Fit, runs: Sequence[Run], length_m: float, prior_m:
         bad = [run for run, good in zip(runs, fits, strict=True) if not good]
         first = bad[0].indices[0]
         last = bad[-1].indices[-1]
-        what = f"the prior fits the scans in {fits.sum()} of {len(fits)} places only; it does not between scans "
+        problem = f"the prior fits the scans in {fits.sum()} of {len(fits)} places only; it does not between scans "
         mend = "did it stand still, jump or change its frame there? Leave that part out"
-        return Finding("error", f"{what}{first} and {last}", mend)
-    what = (
+        return Finding("error", f"{problem}{first} and {last}", mend)
+    problem = (
         f"prior and scans do not belong together under any reading: the scans move {length_m:.1f} m where the prior "
         f"moves {prior_m:.1f} m, {as_it_is.median:.1f} m apart"
     )
-    return Finding("error", what, "is it the trajectory of this drive, one row for each scan, in order?")
+    return Finding("error", problem, "is it the trajectory of this drive, one row for each scan, in order?")
 
 
 def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Finding]:
@@ -337,8 +340,8 @@ def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Findi
     sigma_m = e.drive.prior_sigma_m
     if len(chain.indices) < len(e.chain.indices):  # though the runs fit by themselves
         before, scan = e.chain.indices[len(chain.indices) - 1 : len(chain.indices) + 1]
-        what = f"between scans {before} and {scan} the sensor is elsewhere at once: they do not fit each other"
-        yield Finding("warning", what, "are scans missing there, or out of order?")
+        problem = f"between scans {before} and {scan} the sensor is elsewhere at once: they do not fit each other"
+        yield Finding("warning", problem, "are scans missing there, or out of order?")
     whole = fit_to_chain(T, chain, sigma_m)
     if time is not None and whole is not None and _shows(time, T, e.runs):
         later = fit_to_chain(at_times(T, stamps_ns, time.value), chain, sigma_m)
@@ -356,8 +359,8 @@ def check_small(e: DriveEvidence, T: F64, time: Number | None) -> Iterator[Findi
     if all(f.severity == "note" for f in small):  # how large a mistake may be: a short drive shows little
         least = [f"{whole.scale.least:.0%} of scale", f"{whole.turn.least:.0f} deg of heading"]
         least += [f"{time.least:.1f} s"] if time is not None else []
-        what = f"over {whole.length_m:.0f} m mistakes of the prior show from {', '.join(least)} on"
-        yield Finding("note", what, "a longer drive with turns shows smaller ones")
+        problem = f"over {whole.length_m:.0f} m mistakes of the prior show from {', '.join(least)} on"
+        yield Finding("note", problem, "a longer drive with turns shows smaller ones")
 
 
 def fit_to_chain(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> ChainFit | None:
@@ -407,11 +410,11 @@ def _small(number: Number) -> Iterator[Finding]:
     off, sigma = number.off
     if off <= max(PRIOR_CHECK.least_of(number.kind), PRIOR_CHECK.likely * sigma):
         return
-    what, mend = number.words
+    problem, mend = number.words
     if off <= PRIOR_CHECK.sure * sigma:
-        yield Finding("note", f"{what}; that may be chance", f"a longer drive decides; else: {mend}")
+        yield Finding("note", f"{problem}; that may be chance", f"a longer drive decides; else: {mend}")
     else:
-        yield Finding("error" if off > 2.0 * PRIOR_CHECK.least_of(number.kind) else "warning", what, mend)
+        yield Finding("error" if off > 2.0 * PRIOR_CHECK.least_of(number.kind) else "warning", problem, mend)
 
 
 def _places(as_it_is: _Fit, runs: Sequence[Run], prior_sigma_m: float) -> Iterator[Finding]:
@@ -424,22 +427,22 @@ def _places(as_it_is: _Fit, runs: Sequence[Run], prior_sigma_m: float) -> Iterat
         first = runs[worst].indices[0]
         last = runs[worst].indices[-1]
         most_m = float(as_it_is.misfit[worst])
-        what = (
+        problem = (
             f"between scans {first} and {last} the prior is {most_m:.1f} m off the scans' motion, "
             f"elsewhere {usual:.1f} m ({bad.sum()} of {len(runs)} places)"
         )
         grave: Severity = "note" if most_m <= 3.0 * prior_sigma_m else "warning"
         if most_m > max(5.0, 4.0 * prior_sigma_m):
             grave = "error"
-        yield Finding(grave, what, "a jump, or rows that belong to other scans: mend or leave out that part")
+        yield Finding(grave, problem, "a jump, or rows that belong to other scans: mend or leave out that part")
 
 
 def _scatter(drive: Drive, as_it_is: _Fit, length_m: float) -> Iterator[Finding]:
     tilt_m = PRIOR_CHECK.lever_m * np.radians(2.0 * drive.prior_sigma_deg)
     if as_it_is.median >= 1.5 * drive.prior_sigma_m + tilt_m + 0.01 * length_m:
-        what = f"the prior is off the scans' motion by {as_it_is.median:.1f} m over {length_m:.0f} m, but "
+        problem = f"the prior is off the scans' motion by {as_it_is.median:.1f} m over {length_m:.0f} m, but "
         mend = "say how far it may be off: prior_sigma_m, prior_sigma_deg in drive.toml"
-        yield Finding("warning", f"{what}prior_sigma_m says {drive.prior_sigma_m:g}", mend)
+        yield Finding("warning", f"{problem}prior_sigma_m says {drive.prior_sigma_m:g}", mend)
 
 
 def _cannot_tell(as_it_is: _Fit, fits: Sequence[_Fit], length_m: float, e: DriveEvidence) -> Iterator[Finding]:
@@ -447,8 +450,8 @@ def _cannot_tell(as_it_is: _Fit, fits: Sequence[_Fit], length_m: float, e: Drive
     like = [h.reading for h in fits if h.special and not _worse(h, as_it_is, length_m)]
     if not like:
         return
-    what = f"{CANNOT_TELL}: {'; '.join(reading.name for reading in like)}"
+    problem = f"{CANNOT_TELL}: {'; '.join(reading.name for reading in like)}"
     if any(r.left_handed for r in like) and np.median(e.looks["turns"]) > 0.5 and e.drive.sensor.clockwise:
-        what += " (the points go round counter-clockwise, most sensors clockwise)"
+        problem += " (the points go round counter-clockwise, most sensors clockwise)"
     mend = "check with a drive that turns, or against a map (--map)"
-    yield Finding("note", what, mend, map_tells=True, readings=tuple(like))
+    yield Finding("note", problem, mend, map_tells=True, readings=tuple(like))

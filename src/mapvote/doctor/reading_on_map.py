@@ -53,12 +53,12 @@ class ReadOnMap:
 
 
 def decided_by_map(
-    found: Sequence[Finding], drive: Drive, point_map: PointMap, progress: Progress | None = None
+    findings: Sequence[Finding], drive: Drive, point_map: PointMap, progress: Progress | None = None
 ) -> tuple[list[Finding], F64 | None]:
     """(the findings, those that leave readings open decided where the map tells; the prior (n, 4, 4) under the reading
     that it confirms, None if there is none such)."""
     T = drive.T_map_lidar_prior
-    out = list(found)
+    out = list(findings)
     errors = [f for f in out if f.severity == "error"]
     # Of several errors each may hide what the others do to the scans.
     if T is None or len(errors) > 1:
@@ -73,15 +73,15 @@ def decided_by_map(
             continue
         reading = readings[best]
         its = on_map[best]
-        what = (
+        problem = (
             f"{reading.name}: so {its.fit} of {its.scans} scans checked fit the map, {its.off_m:.1f} m from the prior"
         )
         others = [one for i, one in enumerate(on_map) if i != best]
         if others:
             next_best = max(others, key=lambda one: one.total)
-            where = f", {next_best.off_m:.1f} m from it" if next_best.fit else ""
-            what += f"; read otherwise at best {next_best.fit}{where}"
-        out[k] = Finding("error", what, reading.mend)
+            distance = f", {next_best.off_m:.1f} m from it" if next_best.fit else ""
+            problem += f"; read otherwise at best {next_best.fit}{distance}"
+        out[k] = Finding("error", problem, reading.mend)
         return out, reading.poses(T)
     return out, None
 

@@ -162,21 +162,21 @@ class Looking:
     def warnings(self, progress: Callable[[int, int], None] | None = None, *, unchecked: bool = False) -> list[Finding]:
         """The findings of all scans, read or not; MapvoteError with the first error, if there is one and they are not
         ``unchecked``."""
-        found = cheap_checks(self.drive, self.look(range(len(self.drive)), progress))
-        serious = [f for f in found if f.severity != "note"]
-        return [f for f in (serious if unchecked else usable(str(self.drive.path), found)) if f != NO_PRIOR]
+        findings = cheap_checks(self.drive, self.look(range(len(self.drive)), progress))
+        serious = [f for f in findings if f.severity != "note"]
+        return [f for f in (serious if unchecked else usable(str(self.drive.path), findings)) if f != NO_PRIOR]
 
 
 def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looking:
     """A drive that must be usable. Some of its scans are looked at before, the others when they are read: so none is
     read only to be looked at. MapvoteError with the first error that some of the scans show, as of all scans."""
     looking = Looking(drive)
-    some = (
+    sample = (
         np.unique(np.linspace(0, len(drive) - 1, SCAN_CHECK.first_scans).astype(np.int64)).tolist()
         if len(drive)
         else []
     )
-    if any_error(cheap_checks(drive, looking.look(some, progress))):
+    if any_error(cheap_checks(drive, looking.look(sample, progress))):
         looking.warnings(progress)
     return looking
 
@@ -230,12 +230,12 @@ def cheap_checks(drive: Drive, looks: Looks) -> list[Finding]:
     T = drive.T_map_lidar_prior
     if T is not None and len(looks) and _in_map_frame(T, looks):
         return [IN_MAP_FRAME]
-    found = [*_check_times(drive), *_check_scans(drive, looks)]
+    findings = [*_check_times(drive), *_check_scans(drive, looks)]
     if T is None:
-        return [*found, NO_PRIOR] if len(drive) >= 2 else found
+        return [*findings, NO_PRIOR] if len(drive) >= 2 else findings
     if len(looks):
-        found += check_lean(drive, int(looks["index"][len(looks) // 2]))
-    return [*found, *_check_track(drive, T)] if len(T) >= 2 else found
+        findings += check_lean(drive, int(looks["index"][len(looks) // 2]))
+    return [*findings, *_check_track(drive, T)] if len(T) >= 2 else findings
 
 
 def _in_map_frame(T: F64, looks: Looks) -> bool:
@@ -267,25 +267,25 @@ def _check_times(drive: Drive) -> Iterator[Finding]:
         small = median_s < 0.01
         if (large and 0.02 <= median_s / factor <= 2.0) or (small and 0.02 <= median_s * factor <= 2.0):
             wrong = f"are {unit}, not seconds" if large else f"were divided by {factor:g}"
-            what = f"scans are {median_s:g} s apart: the times {wrong}"
-            yield Finding("error", what, f"convert {source_of_times(drive.path)}")
+            problem = f"scans are {median_s:g} s apart: the times {wrong}"
+            yield Finding("error", problem, f"convert {source_of_times(drive.path)}")
             return
     sensor = drive.sensor
     if not 0.8 < median_s * sensor.rate_hz < 1.25:
-        what = f"scans are {median_s:.3f} s apart, but a {sensor.name} turns at {sensor.rate_hz:g} Hz"
+        problem = f"scans are {median_s:.3f} s apart, but a {sensor.name} turns at {sensor.rate_hz:g} Hz"
         times = source_of_times(drive.path)
         mend = f"if scans were left out, all is well; else {times} or rate_hz (--rate, drive.toml) are wrong"
-        yield Finding("warning", what, mend)
+        yield Finding("warning", problem, mend)
     holes = int((step_s > 1.8 * median_s).sum())
     longest = int(np.argmax(step_s))
     if holes:
-        what = f"{holes} holes in the times, the longest {step_s[longest]:.2f} s after scan {longest}"
+        problem = f"{holes} holes in the times, the longest {step_s[longest]:.2f} s after scan {longest}"
         grave: Severity = "warning" if step_s[longest] > 5.0 * median_s else "note"
-        yield Finding(grave, what, "chosen with --scans, or lost while recording?")
+        yield Finding(grave, problem, "chosen with --scans, or lost while recording?")
     uneven = float(np.median(np.abs(step_s - median_s))) / median_s
     if uneven > 0.1:
-        what = f"the times are uneven: half of the steps are more than {uneven:.0%} off {median_s:.3f} s"
-        yield Finding("warning", what, "are they times of arrival? Take the sensor's own stamps")
+        problem = f"the times are uneven: half of the steps are more than {uneven:.0%} off {median_s:.3f} s"
+        yield Finding("warning", problem, "are they times of arrival? Take the sensor's own stamps")
 
 
 def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
@@ -294,8 +294,8 @@ def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
     way_m = float(steps_m.sum())
     usual_m = float(np.median(steps_m))
     if way_m < 0.5:
-        what = f"the prior does not move ({way_m:.2f} m in {len(T)} scans)"
-        yield Finding("warning", what, "if the vehicle did, the file is not its trajectory; else all is well")
+        problem = f"the prior does not move ({way_m:.2f} m in {len(T)} scans)"
+        yield Finding("warning", problem, "if the vehicle did, the file is not its trajectory; else all is well")
     else:
         speed_mps = float(np.median(steps_m / (np.diff(drive.stamps_ns) * 1e-9)))
         if speed_mps > SCAN_CHECK.fastest_mps:
@@ -307,26 +307,26 @@ def _check_track(drive: Drive, T: F64) -> Iterator[Finding]:
         for quantum in (1.0, 0.5, 0.25, 0.1):
             whole = np.abs(values / quantum - np.round(values / quantum)) < 1e-3
             if way_m > 5.0 and whole.mean() > 0.95:
-                what = f"the prior's positions are rounded to {quantum:g} m"
-                yield Finding("warning", what, "float32 of large coordinates? Write double")
+                problem = f"the prior's positions are rounded to {quantum:g} m"
+                yield Finding("warning", problem, "float32 of large coordinates? Write double")
                 break
 
 
 def _jumps_and_stops(steps_m: F64, usual_m: float) -> Iterator[Finding]:
     jumps = int((steps_m > 5 * usual_m + 1.0).sum())
     if 0 < jumps < 0.2 * len(steps_m) and usual_m > 0:
-        what = f"the prior jumps {jumps} times, most at scan {int(np.argmax(steps_m)) + 1} ({steps_m.max():.1f} m)"
+        problem = f"the prior jumps {jumps} times, most at scan {int(np.argmax(steps_m)) + 1} ({steps_m.max():.1f} m)"
         # No error: a map fits all its priors, and a vehicle localises in the map; both reject outliers.
-        yield Finding("warning", what, "GNSS outliers: smooth them, or give prior_sigma_m in drive.toml")
+        yield Finding("warning", problem, "GNSS outliers: smooth them, or give prior_sigma_m in drive.toml")
     stuck = steps_m < 1e-6
     if 3 <= stuck.sum() < len(steps_m) and usual_m > 0.05:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], stuck.astype(np.int8), [0]])))
         longest = int((edges[1::2] - edges[::2]).max()) + 1
-        what = f"the prior stands still for {longest} rows, at full speed before or after"
-        yield Finding("warning", what, "was it held while GNSS or the filter was away? Leave those rows out")
+        problem = f"the prior stands still for {longest} rows, at full speed before or after"
+        yield Finding("warning", problem, "was it held while GNSS or the filter was away? Leave those rows out")
     elif usual_m <= 1e-6 < steps_m.sum() and stuck.sum() > 0.4 * len(stuck):
-        what = f"{stuck.mean():.0%} of the prior's rows repeat the one before"
-        yield Finding("warning", what, "it is slower than the scans, or was held: interpolate it")
+        problem = f"{stuck.mean():.0%} of the prior's rows repeat the one before"
+        yield Finding("warning", problem, "it is slower than the scans, or was held: interpolate it")
 
 
 def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
@@ -341,8 +341,8 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
     yield from _doubled(looks)
     own = float(np.median(looks["near"]))
     if own > 0.05 and looks.median_m >= 1.5:
-        what = f"{own:.0%} of the points are within 2 m of the sensor: the vehicle's own body?"
-        yield Finding("warning", what, "mask it: it would be mapped as a wall that follows the car")
+        problem = f"{own:.0%} of the points are within 2 m of the sensor: the vehicle's own body?"
+        yield Finding("warning", problem, "mask it: it would be mapped as a wall that follows the car")
     if not columns and not units:
         yield from _sectors(drive, looks)
         far_m = float(np.median(looks["range_m"][:, 2]))
@@ -353,8 +353,8 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
         q for q, share in zip(SCAN_CHECK.quanta_m, np.median(looks["rounded"], axis=0), strict=True) if share > 0.95
     ]
     if coarse:
-        what = f"coordinates are rounded to {coarse[0]:g} m"
-        yield Finding("error" if coarse[0] > 0.2 else "warning", what, "write them in millimetres or as float32")
+        problem = f"coordinates are rounded to {coarse[0]:g} m"
+        yield Finding("error" if coarse[0] > 0.2 else "warning", problem, "write them in millimetres or as float32")
     yield from _times_of_points(looks.times)
     if not looks.has_intensity:
         yield Finding("note", "no intensity field", "the method does not need it")
@@ -363,26 +363,28 @@ def _check_scans(drive: Drive, looks: Looks) -> Iterator[Finding]:
 def _times_of_points(times: Counter[TimesTold]) -> Iterator[Finding]:
     """The assumption on the times of points, where the user stated none."""
     state = "if they are not, set motion_compensated = false in drive.toml; if they are, true"
-    for told in times:
-        named = " or ".join(told.fields)
-        if told.how == "none" and told.fields:
-            what = f"no field has the name of a time of points, but {named} lasts about one revolution"
+    for kind in times:
+        named = " or ".join(kind.fields)
+        if kind.how == "none" and kind.fields:
+            problem = f"no field has the name of a time of points, but {named} lasts about one revolution"
             yield Finding(
-                "warning", what, f'set time_field = "{told.fields[0]}" in drive.toml, or "none" if it is no time'
+                "warning", problem, f'set time_field = "{kind.fields[0]}" in drive.toml, or "none" if it is no time'
             )
-        elif told.how == "none":
-            what = f"points carry no times: scans are taken as motion-compensated ({told.told})"
-            yield Finding("warning" if told.doubtful else "note", what, state)
-        elif told.doubtful:
-            what = f"the times of points are taken from {told.told}: it lasts one revolution, its name is not known"
-            yield Finding("warning", what, f'set time_field = "{named}" in drive.toml, or "none" if it is no time')
-        elif told.other_clock:
-            what = f"the times of points ({told.told}) and the stamps of scans are of two clocks"
-            yield Finding("note", what, "the first point is taken to lie at the stamp")
-    without = sum(n for told, n in times.items() if told.how == "none")
+        elif kind.how == "none":
+            problem = f"points carry no times: scans are taken as motion-compensated ({kind.told})"
+            yield Finding("warning" if kind.doubtful else "note", problem, state)
+        elif kind.doubtful:
+            problem = f"the times of points are taken from {kind.told}: it lasts one revolution, its name is not known"
+            yield Finding("warning", problem, f'set time_field = "{named}" in drive.toml, or "none" if it is no time')
+        elif kind.other_clock:
+            problem = f"the times of points ({kind.told}) and the stamps of scans are of two clocks"
+            yield Finding("note", problem, "the first point is taken to lie at the stamp")
+    without = sum(n for kind, n in times.items() if kind.how == "none")
     if 0 < without < times.total():
-        what = f"{without} of {times.total()} scans, or one of several LiDARs, carry no times of points, the others do"
-        yield Finding("warning", what, "record all of them in the same way, or state motion_compensated")
+        problem = (
+            f"{without} of {times.total()} scans, or one of several LiDARs, carry no times of points, the others do"
+        )
+        yield Finding("warning", problem, "record all of them in the same way, or state motion_compensated")
 
 
 def _severity(spoilt: int, scans: int) -> Severity:
@@ -392,20 +394,20 @@ def _severity(spoilt: int, scans: int) -> Severity:
 def _refused(drive: Drive, looks: Looks) -> Iterator[Finding]:
     if not looks.refused:
         return
-    i, why = min(looks.refused.items())
+    i, refusal = min(looks.refused.items())
     others = f" (and {len(looks.refused) - 1} more of {len(drive)} scans)" if len(looks.refused) > 1 else ""
     T = drive.T_map_lidar_prior
     mend = ""
-    if "not finite or beyond" in why and T is not None and np.linalg.norm(T[i, :3, 3]) > 2000.0:
+    if "not finite or beyond" in refusal and T is not None and np.linalg.norm(T[i, :3, 3]) > 2000.0:
         mend = "are the points in the map's frame already? Then take them back: p_lidar = inverse(T_map_lidar) p"
-    yield Finding("error", why + others, mend)
+    yield Finding("error", refusal + others, mend)
 
 
 def _beams(drive: Drive, looks: Looks) -> Iterator[Finding]:
     """The sensor that somebody stated, against the rings of some scans: rays that never were would demolish walls."""
     if drive.sensor_told.startswith("measured"):
         return
-    some = (drive.read_scan(int(looks["index"][k])) for k in sorted({0, len(looks) // 2, len(looks) - 1}))
+    sample = (drive.read_scan(int(looks["index"][k])) for k in sorted({0, len(looks) // 2, len(looks) - 1}))
     mount = None if drive.T_map_lidar_prior is None else mount_of_prior(drive.T_map_lidar_prior)
 
     def contradicted(scan: Scan) -> str:
@@ -414,27 +416,29 @@ def _beams(drive: Drive, looks: Looks) -> Iterator[Finding]:
         upright = own if mount is None else contradiction(drive.sensor, mount.in_steps().scan(scan).by_lidar()[0][1])
         return own if upright else ""
 
-    what = next(filter(None, map(contradicted, some)), "")
-    if what:
-        yield Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")
+    problem = next(filter(None, map(contradicted, sample)), "")
+    if problem:
+        yield Finding("error", problem, "leave out --sensor, and the sensor in drive.toml: it is measured then")
 
 
 def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
     """A coordinate that is something else: an intensity, a constant."""
     period, width = _period(scan)
     if period != width:
-        what = f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
-        yield Finding("error", what, "name all columns in their order: --columns x,y,z,intensity,ring")
+        problem = (
+            f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
+        )
+        yield Finding("error", problem, "name all columns in their order: --columns x,y,z,intensity,ring")
         return
     unit = np.median(looks["unit"], axis=0)
     spread = np.median(looks["high"] - looks["low"], axis=0)
     for axis, name in enumerate("xyz"):
         if spread[axis] == 0.0:
-            what = f"{name} is {looks['low'][0, axis] + 0.0:g} in every point: the scans are flat"
-            yield Finding("error", what, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)")
+            problem = f"{name} is {looks['low'][0, axis] + 0.0:g} in every point: the scans are flat"
+            yield Finding("error", problem, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)")
         elif unit[axis] > 0.98:
-            what = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
-            yield Finding("error", what, "name the columns in their order: --columns x,y,z,intensity")
+            problem = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
+            yield Finding("error", problem, "name the columns in their order: --columns x,y,z,intensity")
         elif np.median(looks["low"][:, axis]) >= 0.0 and np.median(looks["rounded"][:, 0]) < 0.9:
             # A sensor without rings may look ahead only. Points that go round it, but only part of the way, are half of
             # a revolution: that is reported as the sectors that are missing.
@@ -442,8 +446,8 @@ def _columns(drive: Drive, looks: Looks, scan: Scan) -> Iterator[Finding]:
             if goes_round or (name == "x" and not drive.sensor.rings):
                 continue
             halved = "an absolute value, a range, or half of the azimuth is missing (180 deg)"
-            what = f"{name} is never negative: {'no LiDAR sees nothing below itself' if name == 'z' else halved}"
-            yield Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns")
+            problem = f"{name} is never negative: {'no LiDAR sees nothing below itself' if name == 'z' else halved}"
+            yield Finding("error", problem, "is it a range, an intensity, an absolute value? Check --columns")
 
 
 def _period(scan: Scan) -> tuple[int, int]:
@@ -466,12 +470,12 @@ def _period(scan: Scan) -> tuple[int, int]:
 
 def _units(looks: Looks) -> Iterator[Finding]:
     if looks.median_m > 150.0 or np.isinf(looks.median_m):
-        what = f"points are {looks.median_m:.0f} m away in the median: no LiDAR in a street sees so"
+        problem = f"points are {looks.median_m:.0f} m away in the median: no LiDAR in a street sees so"
         mend = "convert the points to metres (they look like centimetres), or are they in the map's frame?"
-        yield Finding("error", what, mend)
+        yield Finding("error", problem, mend)
     elif looks.median_m < 1.5:
-        what = f"points are {looks.median_m:.2f} m away in the median"
-        yield Finding("error", what, "convert the points to metres, or mask the vehicle's own body")
+        problem = f"points are {looks.median_m:.2f} m away in the median"
+        yield Finding("error", problem, "convert the points to metres, or mask the vehicle's own body")
 
 
 def _counts(drive: Drive, looks: Looks) -> Iterator[Finding]:
@@ -481,22 +485,22 @@ def _counts(drive: Drive, looks: Looks) -> Iterator[Finding]:
     cut = np.flatnonzero(count < SCAN_CHECK.cut_share * around)
     if len(cut):
         k = int(cut[np.argmin(count[cut] / around[cut])])
-        what = f"scan {looks['index'][k]} holds {count[k]} points, those around it {around[k]:.0f}: cut off?"
+        problem = f"scan {looks['index'][k]} holds {count[k]} points, those around it {around[k]:.0f}: cut off?"
         more = f" ({len(cut)} such scans)" if len(cut) > 1 else ""
-        yield Finding(_severity(len(cut), len(count)), what + more, "copy it again, or leave it out with --scans")
+        yield Finding(_severity(len(cut), len(count)), problem + more, "copy it again, or leave it out with --scans")
     usual = float(np.median(count))
     if usual < 0.1 * sensor.beams * sensor.azimuths or usual < 1500:
-        what = f"{usual:.0f} points a scan, few for a {sensor.name}"
-        yield Finding("warning", what, "is it another sensor (--sensor), or a down-sampled recording?")
+        problem = f"{usual:.0f} points a scan, few for a {sensor.name}"
+        yield Finding("warning", problem, "is it another sensor (--sensor), or a down-sampled recording?")
 
 
 def _doubled(looks: Looks) -> Iterator[Finding]:
     same = np.flatnonzero((np.diff(looks["digest"]) == 0.0) & (np.diff(looks["count"]) == 0))
     if len(same):
-        what = f"scan {looks['index'][same[0] + 1]} is the same as the one before it"
+        problem = f"scan {looks['index'][same[0] + 1]} is the same as the one before it"
         more = f" ({len(same)} such scans of {len(looks)})" if len(same) > 1 else ""
         mend = "the recording stood still or was written twice: leave the copies out"
-        yield Finding(_severity(len(same), len(looks)), what + more, mend)
+        yield Finding(_severity(len(same), len(looks)), problem + more, mend)
 
 
 def _sectors(drive: Drive, looks: Looks) -> Iterator[Finding]:
@@ -507,16 +511,16 @@ def _sectors(drive: Drive, looks: Looks) -> Iterator[Finding]:
     blind_deg = 360.0 / SCAN_CHECK.sectors * int(empty.sum())
     if blind_deg >= 60.0:
         start_deg = -180.0 + 10.0 * int(np.argmax(empty & ~np.roll(empty, 1)))
-        what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start_deg:.0f} deg counter-clockwise)"
+        problem = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start_deg:.0f} deg counter-clockwise)"
         mend = "part of every revolution is missing? Sound only for a sensor that sees no more, or is hidden there"
         middle = np.radians(-175.0 + 10.0 * np.arange(SCAN_CHECK.sectors))
         facing = np.arctan2(mean @ np.sin(middle), mean @ np.cos(middle))
         looks_ahead = not drive.sensor.rings and abs(facing) < np.radians(30.0)
-        yield Finding("note" if looks_ahead else "warning", what, mend)
+        yield Finding("note" if looks_ahead else "warning", problem, mend)
     lost_deg = ((sectors < SCAN_CHECK.empty_sector * mean) & (mean * SCAN_CHECK.sectors > 0.3)).sum(axis=1) * 10.0
     bad = np.flatnonzero(lost_deg >= 60.0)
     if 0 < len(bad) < 0.5 * len(lost_deg):
         k = int(bad[np.argmax(lost_deg[bad])])
-        what = f"scan {looks['index'][k]} lacks {lost_deg[k]:.0f} deg of azimuth that the others see"
+        problem = f"scan {looks['index'][k]} lacks {lost_deg[k]:.0f} deg of azimuth that the others see"
         mend = "packets were lost, or the file is cut off: leave these scans out"
-        yield Finding(_severity(len(bad), len(lost_deg)), f"{what} ({len(bad)} such scans)", mend)
+        yield Finding(_severity(len(bad), len(lost_deg)), f"{problem} ({len(bad)} such scans)", mend)

@@ -46,33 +46,33 @@ _UPSIDE_DOWN = Finding(
 )
 
 
-def which_way_up(some: F64, wide: F64, ground: F64) -> Iterator[Finding]:
-    """Faults of the axes of points ``some`` (n, 3) of extent ``wide`` (3,). ``ground`` (m, 3): those that their file
+def which_way_up(sample: F64, wide: F64, ground: F64) -> Iterator[Finding]:
+    """Faults of the axes of points ``sample`` (n, 3) of extent ``wide`` (3,). ``ground`` (m, 3): those that their file
     classifies as ground, which outweigh every guess: a city of flat roofs looks alike from below."""
-    above = _share_above(some, ground)
+    above = _share_above(sample, ground)
     if above is not None:
         if above < 1.0 - RULE.mostly:
             yield _UPSIDE_DOWN
         if not 1.0 - RULE.mostly <= above <= RULE.mostly:
             return
-    yield from _by_sheet(some, wide)
+    yield from _by_sheet(sample, wide)
 
 
-def _share_above(some: F64, ground: F64) -> float | None:
+def _share_above(sample: F64, ground: F64) -> float | None:
     """Share of the points standing off the classified ground of their column that lie above it; None if few do."""
     if len(ground) < RULE.least_points:
         return None
-    low = np.minimum(some[:, :2].min(axis=0), ground[:, :2].min(axis=0))
-    width = int(np.ceil((max(some[:, 1].max(), ground[:, 1].max()) - low[1]) / RULE.column_m)) + 1
+    low = np.minimum(sample[:, :2].min(axis=0), ground[:, :2].min(axis=0))
+    width = int(np.ceil((max(sample[:, 1].max(), ground[:, 1].max()) - low[1]) / RULE.column_m)) + 1
     at_ground = _columns(ground[:, :2] - low, width)
-    at_points = _columns(some[:, :2] - low, width)
+    at_points = _columns(sample[:, :2] - low, width)
     # The middle height of the ground of each column that has some.
     order = np.lexsort((ground[:, 2], at_ground))
     keys, starts, counts = np.unique(at_ground[order], return_index=True, return_counts=True)
     heights = ground[order, 2][starts + counts // 2]
     place = np.minimum(np.searchsorted(keys, at_points), len(keys) - 1)
-    known = keys[place] == at_points
-    off = some[known, 2] - heights[place[known]]
+    matched = keys[place] == at_points
+    off = sample[matched, 2] - heights[place[matched]]
     stands = np.abs(off) > RULE.stands_m
     return float((off[stands] > 0).mean()) if stands.sum() >= RULE.least_points else None
 
@@ -82,13 +82,13 @@ def _columns(xy: F64, width: int) -> I64:
     return np.asarray(cells[:, 0] * width + cells[:, 1])
 
 
-def _by_sheet(some: F64, wide: F64) -> Iterator[Finding]:
+def _by_sheet(sample: F64, wide: F64) -> Iterator[Finding]:
     """A street is a sheet of ground with things on it, none below, and not higher than it is wide: rows of house fronts
     behind each other are no ground."""
     share = {sign + axis: 0.0 for axis in "xyz" for sign in "+-"}
     for axis, name in enumerate("xyz"):
         if wide[axis] <= RULE.slender * wide[2]:
-            share["+" + name], share["-" + name] = _sheet_shares(some, axis)
+            share["+" + name], share["-" + name] = _sheet_shares(sample, axis)
     best = max(share, key=lambda name: share[name])
     opposite = ("-" if best[0] == "+" else "+") + best[1]
     # Between two walls, as much lies at one end of an axis as at the other: that is no ground.

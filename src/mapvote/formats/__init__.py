@@ -162,10 +162,10 @@ def import_cloud(
     point_map = map_of(str(path), kept(), folder, look, 1.0 if unchecked else POINT_RULE.most_bad_share, sizes)
     if unchecked:
         point_map = replace(point_map, georeference={**point_map.georeference, UNCHECKED: "import"})
-    told = [f"coordinates: {frame_of(point_map.georeference).told()}", *sieve.told()]
+    lines = [f"coordinates: {frame_of(point_map.georeference).told()}", *sieve.told()]
     if dropped:
-        told.append(f"dropped fields: {', '.join(dropped)}")
-    return point_map, told
+        lines.append(f"dropped fields: {', '.join(dropped)}")
+    return point_map, lines
 
 
 def export_map(
@@ -252,11 +252,11 @@ def _pieces(
     return CloudPieces.gathered(pieces, frame)
 
 
-def box_of(where: Path, point_map: PointMap) -> F64:
+def box_of(source: Path, point_map: PointMap) -> F64:
     """(2, 3) the lowest and the highest coordinates of a map's points; MapvoteError if it has none to write there."""
     boxes = [(t.points_map.min(axis=0), t.points_map.max(axis=0)) for t in point_map.tiles.values() if len(t.points)]
     if not boxes:
-        raise MapvoteError(f"{where}: the map holds no points, so there is nothing to export")
+        raise MapvoteError(f"{source}: the map holds no points, so there is nothing to export")
     low, high = np.array(boxes).transpose(1, 0, 2)
     return np.array([low.min(axis=0), high.max(axis=0)])
 

@@ -33,7 +33,7 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
             point_map = map_of(
                 str(path), in_map_metres(str(path), _noted(without_marked(path, layout.stream(path)), about))
             )
-            return kind, _map(point_map) + [(name, ", ".join(found) or "none") for name, found in about.items()]
+            return kind, _map(point_map) + [(name, ", ".join(names) or "none") for name, names in about.items()]
     for kind, drive_layout in DRIVES.items():
         if drive_layout.recognised(path):
             return f"drive, {kind}", _drive(open_drive(path, rate_hz=rate_hz, topic=topic))
@@ -56,13 +56,13 @@ def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterat
 def _map(point_map: PointMap) -> Rows:
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
-    known = 0.0
+    known_share = 0.0
     learned = 0
     fields: dict[str, str] = {}
     for tile in point_map.tiles.values():
         low = np.minimum(low, tile.points_map.min(axis=0, initial=np.inf))
         high = np.maximum(high, tile.points_map.max(axis=0, initial=-np.inf))
-        known += float(np.isfinite(tile.ground_z).mean()) / len(point_map.tiles)
+        known_share += float(np.isfinite(tile.ground_z).mean()) / len(point_map.tiles)
         learned += tile.free is not None
         fields |= {name: f"{name} ({column.dtype})" for name, column in tile.fields.items()}
     rows = [
@@ -74,7 +74,7 @@ def _map(point_map: PointMap) -> Rows:
         ("y", f"{low[1]:.2f} to {high[1]:.2f} m"),
         ("z", f"{low[2]:.2f} to {high[2]:.2f} m"),
         ("lattice", f"cells of {CELL_SIZE} m from ({point_map.lattice.x0}, {point_map.lattice.y0})"),
-        ("ground", f"known in {known:.0%} of the tiles' cells"),
+        ("ground", f"known in {known_share:.0%} of the tiles' cells"),
         ("fields", ", ".join(fields.values()) or "none"),
         ("known free", f"learned in {learned} tiles" if learned else "never learned"),
     ]
@@ -121,8 +121,8 @@ def _drive(drive: Drive) -> Rows:
 
 def _times(scan: Scan) -> str:
     """How the times of the points are known."""
-    told = "" if scan.times is None else f" ({scan.times.told})"
-    return f"none: taken as motion-compensated{told}" if scan.time_s is None else f"yes: scans are de-skewed{told}"
+    origin = "" if scan.times is None else f" ({scan.times.told})"
+    return f"none: taken as motion-compensated{origin}" if scan.time_s is None else f"yes: scans are de-skewed{origin}"
 
 
 def _foundation(ballot: Ballot) -> str:

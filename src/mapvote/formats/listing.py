@@ -32,7 +32,7 @@ def entry(folder: Path, name: str) -> Path:
         return place
     for part in name.split("/"):
         try:
-            alike = sorted(found for found in os.listdir(folder) if found.lower() == part.lower())
+            alike = sorted(listed for listed in os.listdir(folder) if listed.lower() == part.lower())
         except OSError:
             return place
         if not alike:

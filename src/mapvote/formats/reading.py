@@ -73,12 +73,12 @@ def read_yaml(file: Path) -> Any:
     return parse_yaml(read_text(file), str(file))
 
 
-def parse_yaml(text: str, where: str) -> Any:
-    """The content of a YAML text; MapvoteError, by the name of ``where`` it stands, if it is none."""
+def parse_yaml(text: str, source: str) -> Any:
+    """The content of a YAML text; MapvoteError, which names its ``source``, if it is none."""
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, RecursionError) as error:
-        raise MapvoteError(f"{where}: cannot be read ({first_line(error)})") from error
+        raise MapvoteError(f"{source}: cannot be read ({first_line(error)})") from error
 
 
 def read_text(file: Path) -> str:

@@ -268,9 +268,11 @@ def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish, waits: Wai
             f"with the fixes of {fixes[0].topic}; or type --odometry {fixes[0].topic}"
         )
     useless = [one.topic for one in _of_kinds(published, (GNSS,), (), wish.names)]
-    why = f" {useless[0]} is of no use: the map's place on Earth is unknown (import --crs EPSG:n)." if useless else ""
+    reason = (
+        f" {useless[0]} is of no use: the map's place on Earth is unknown (import --crs EPSG:n)." if useless else ""
+    )
     return (
-        f"no {ODOMETRY} or other pose is sent.{why} The drive begins without it {waits.odometry_s:.0f} s after the "
+        f"no {ODOMETRY} or other pose is sent.{reason} The drive begins without it {waits.odometry_s:.0f} s after the "
         "first cloud, and the whole map is searched; or start the odometry, or type --odometry TOPIC"
     )
 

@@ -85,14 +85,14 @@ class Network:
 
     def published(self) -> list[PublishedTopic]:
         """Every topic of ROS 2 that another participant publishes now, in the order of names."""
-        found: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        offers_of: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for end in self._writers.read(10_000):
             if not end.sample_info.valid_data or end.sample_info.instance_state != _ALIVE:
                 continue  # a writer that has gone: its sample names nothing
             topic = end.topic_name.removeprefix("rt")
             kind = ros_type(end.type_name)
             if end.topic_name.startswith("rt/") and kind and str(end.participant_key) != self._own:
-                found[topic, kind].append(end.qos)
+                offers_of[topic, kind].append(end.qos)
         policy = self._core.Policy
         return [
             PublishedTopic(
@@ -101,7 +101,7 @@ class Network:
                 all(qos[policy.Reliability] != policy.Reliability.BestEffort for qos in offers),
                 all(qos[policy.Durability] == policy.Durability.TransientLocal for qos in offers),
             )
-            for name, offers in sorted(found.items())
+            for name, offers in sorted(offers_of.items())
         ]
 
     def wait(self, seconds: float) -> None:

@@ -16,7 +16,7 @@ class Delivery:
 
     taken: int = 0
     """Ballots that the server took now."""
-    known: int = 0
+    repeated: int = 0
     """Ballots that the server had already."""
     refused: int = 0
     """Ballots that are damaged, or that the server does not take."""
@@ -31,7 +31,7 @@ class Delivery:
     def told(self) -> str:
         """The outcome in one line."""
         away = f", {self.left} not sent: the server is away, run the same command again" if self.left else ""
-        return f"{self.taken} ballots sent, {self.known} were there already, {self.refused} refused{away}"
+        return f"{self.taken} ballots sent, {self.repeated} were there already, {self.refused} refused{away}"
 
 
 def send_all(client: MapClient, files: Sequence[Path], say: Callable[[str], object]) -> Delivery:
@@ -51,7 +51,7 @@ def send_all(client: MapClient, files: Sequence[Path], say: Callable[[str], obje
             delivery.left = len(files) - number
             return delivery
         delivery.taken += outcome != "repeated"
-        delivery.known += outcome == "repeated"
+        delivery.repeated += outcome == "repeated"
         say(f"{file}: {outcome}")
     return delivery
 

@@ -159,23 +159,23 @@ class FirstSeconds:
         elif frame is not None and frame.is_own:
             self._priors = [None if T is None else frame.T_map_prior @ T for T in self._priors]
         drive = self._drive(vehicle)
-        found = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
+        findings = [f for f in cheap_checks(drive, self._looking.look([])) if f != NO_PRIOR]
         report = vehicle.report
         decided = len(report.T_map_lidar)
-        if decided and len(report.lost) > LIVE_RULE.sick_share * decided and not any_error(found):
-            found += self._on_map(drive, point_map, len(report.lost), decided)
-        return in_order(found)
+        if decided and len(report.lost) > LIVE_RULE.sick_share * decided and not any_error(findings):
+            findings += self._on_map(drive, point_map, len(report.lost), decided)
+        return in_order(findings)
 
     def _on_map(self, drive: Drive, point_map: PointMap, lost: int, decided: int) -> list[Finding]:
-        what = f"{lost} of the first {decided} scans have no sure place on map {point_map.map_id}"
-        lost_scans = Finding("warning", what, "they cast no vote; is this the map of this road?")
+        problem = f"{lost} of the first {decided} scans have no sure place on map {point_map.map_id}"
+        lost_scans = Finding("warning", problem, "they cast no vote; is this the map of this road?")
         if drive.T_map_lidar_prior is None:
             return [lost_scans]
         try:
-            found = check_on_map(drive, drive.T_map_lidar_prior, point_map)[0]
+            findings = check_on_map(drive, drive.T_map_lidar_prior, point_map)[0]
         except MapvoteError as error:
             return [lost_scans, Finding("warning", str(error))]
-        return [lost_scans, *found]
+        return [lost_scans, *findings]
 
 
 class LiveDrive:
@@ -348,10 +348,10 @@ class LiveDrive:
         self.checked_now = False
         if first is None or self.vehicle is None:
             return []
-        found = first.findings(self.vehicle, self.vehicle.point_map)
-        if not any(finding.severity == "error" for finding in found):
+        findings = first.findings(self.vehicle, self.vehicle.point_map)
+        if not any(finding.severity == "error" for finding in findings):
             self._release()
-        return found
+        return findings
 
     def _release(self) -> None:
         for closed in self._held:

@@ -53,8 +53,8 @@ class Follower:
             except Exception as error:  # the services answer on from the folder, whatever stops the thread's work
                 if self._ended.is_set():
                     return  # the connection was closed
-                known = isinstance(error, (MapvoteError, OSError))
-                self.trouble = str(error) if known else f"{type(error).__name__}: {error}"
+                expected = isinstance(error, (MapvoteError, OSError))
+                self.trouble = str(error) if expected else f"{type(error).__name__}: {error}"
                 self._repeated(self.trouble, f"{self.trouble}; the folder stays as it is")
             else:
                 if change is not None:

@@ -128,13 +128,13 @@ class MapLoader:
     def selected(self, ids: Iterable[str]) -> list[Cell]:
         """The tiles of these ids, in their order, each as often as it is asked for; unknown ones are said and left
         out."""
-        found = []
+        cells = []
         for name in ids:
             if name in self.cells:
-                found.append(self.cells[name])
+                cells.append(self.cells[name])
             else:
                 log.warning("no tile %s in the newest version", name)
-        return found
+        return cells
 
     def hash(self) -> str:
         """Digest of all tiles: SHA-256 over their names, which are hashes; "" without a map."""

@@ -51,8 +51,8 @@ def typestore() -> Any:
     types = require("rosbags.typesys", "ros2", "messages of ROS 2")
     store = types.get_typestore(types.Stores.LATEST)
     for name, definition in lacking_types().items():
-        (found,) = types.get_types_from_msg(definition, name).values()
-        store.register({name: found})
+        (registered,) = types.get_types_from_msg(definition, name).values()
+        store.register({name: registered})
     return store
 
 

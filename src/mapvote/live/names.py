@@ -68,10 +68,10 @@ def _absolute(name: str, namespace: str) -> str:
 
 def sim_time_of(parameters: Sequence[str]) -> bool:
     """Whether ``use_sim_time:=true`` is among the parameters. MapvoteError for any other parameter."""
-    found = False
+    use_sim_time = False
     for parameter in parameters:
         name, _, value = parameter.partition(":=")
         if name != "use_sim_time" or value not in ("true", "false"):
             raise MapvoteError(f"-p {parameter}: known is use_sim_time:=true or use_sim_time:=false")
-        found = value == "true"
-    return found
+        use_sim_time = value == "true"
+    return use_sim_time

@@ -182,13 +182,13 @@ class Outbox:
     def begin(self, name: str) -> int:
         """Close what a drive that was cut off left open, and begin to write and send. Returns the number of the first
         ballot of drive ``name``: one more than that of its last one, which an earlier process may have begun."""
-        found = {file.stem for suffix in ("journal", "ballot") for file in self._state.glob(f"*.{suffix}")}
+        open_stretches = {file.stem for suffix in ("journal", "ballot") for file in self._state.glob(f"*.{suffix}")}
         last = self._state / ".last"
-        stretches = [*found, last.read_text() if last.exists() else ""]
+        stretches = [*open_stretches, last.read_text() if last.exists() else ""]
         named = [match for match in (re.fullmatch(r"(.+)-(\d{3,})", stretch) for stretch in stretches) if match]
         number = max((int(m[2]) for m in named if m[1] == name), default=0) + 1
         self._begin_ballot(stretch_name(name, number))
-        for drive in sorted(found):
+        for drive in sorted(open_stretches):
             self._recover(drive)
         self._writer.start()
         self._sender.start()

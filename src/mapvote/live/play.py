@@ -104,15 +104,15 @@ def opened(path: Path) -> tuple[list[tuple[str, str]], Callable[[], Iterator[Mes
     bag = Bag(path)
     if not bag.reader.is2:
         raise MapvoteError(f"{path}: a ROS 1 bag, whose messages are no CDR; convert it with rosbags-convert")
-    found = [c for c in bag.reader.connections if c.msgtype in READ]
-    if not found:
+    connections = [c for c in bag.reader.connections if c.msgtype in READ]
+    if not connections:
         raise MapvoteError(f"{path}: no topic of a type that can be played: {', '.join(sorted(READ))}")
 
     def messages() -> Iterator[Message]:
-        for connection, time_ns, data in bag.reader.messages(connections=found):
+        for connection, time_ns, data in bag.reader.messages(connections=connections):
             yield Message(time_ns, connection.topic, connection.msgtype, bytes(data))
 
-    return [(c.topic, c.msgtype) for c in found], messages
+    return [(c.topic, c.msgtype) for c in connections], messages
 
 
 def _messages_of_drive(drive: Drive) -> Iterator[Message]:

@@ -96,9 +96,9 @@ def prepare(
         elif plan.idle_s and now_s >= start_s + plan.idle_s:
             break
         lack = _lack(topics, plan)
-        known = bool(scans) and topics.measure(scans)
+        measured = bool(scans) and topics.measure(scans)
         tracked = topics.chosen.odometry is None or topics.poses > 0 or now_s > first_s + voice.patience.odometry_s
-        if known and tracked and not lack:
+        if measured and tracked and not lack:
             break
         if lack and plan.idle_s and now_s > max(start_s, first_s) + plan.idle_s:
             raise MapvoteError(lack)

@@ -177,24 +177,24 @@ class StatusBoard:
 
     def __call__(self, live: LiveDrive, topics: Subscriptions) -> None:
         """Called by the scan loop, as often as it likes."""
-        now = time.monotonic()
+        now_s = time.monotonic()
         if topics.clouds != self._clouds:
             self._clouds = topics.clouds
-            self._last_cloud_s = now
-        due = [k for k, due_s in enumerate(self._due) if now >= due_s]
+            self._last_cloud_s = now_s
+        due = [k for k, due_s in enumerate(self._due) if now_s >= due_s]
         if not due:
             return
-        self.status = self.look(live, now)
+        self.status = self.look(live, now_s)
         for k in due:
             every_s, listener = self._listeners[k]
-            self._due[k] = now + every_s
+            self._due[k] = now_s + every_s
             listener(self.status, live, topics)
 
-    def look(self, live: LiveDrive, now: float) -> Status:
+    def look(self, live: LiveDrive, now_s: float) -> Status:
         """The status now, seconds of any steady clock."""
         counts = live.counts
-        self._past.append((now, counts.scans, counts.localised, counts.lost))
-        while now - self._past[0][0] > STATUS_TIMES.minute_s:
+        self._past.append((now_s, counts.scans, counts.localised, counts.lost))
+        while now_s - self._past[0][0] > STATUS_TIMES.minute_s:
             self._past.popleft()
         then, scans, localised, lost = self._past[0]
         localised = counts.localised - localised
@@ -213,12 +213,12 @@ class StatusBoard:
         return Status(
             replace(counts),
             replace(self._outbox.report),
-            scans_hz=(counts.scans - scans) / (now - then) if now > then else 0.0,
+            scans_hz=(counts.scans - scans) / (now_s - then) if now_s > then else 0.0,
             localised_share=localised / (localised + lost) if localised + lost else float("nan"),
             sigma_m=float(np.median(sigmas)) if sigmas else float("nan"),
             latency_s=float(np.median(recent)) if recent else float("nan"),
             waiting_scans=live.waiting,
-            silent_s=now - self._last_cloud_s,
+            silent_s=now_s - self._last_cloud_s,
             map_version=version,
             tiles=tiles,
             server_away=away,

@@ -313,8 +313,8 @@ class Subscriptions:
         if not all(self.lidar_frames):
             return None
         T_first = [self.frames.between(first, frame) for frame in self.lidar_frames]
-        found = [T for T in T_first if T is not None]
-        return found if len(found) == len(T_first) else None
+        mounts = [T for T in T_first if T is not None]
+        return mounts if len(mounts) == len(T_first) else None
 
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
@@ -324,9 +324,9 @@ class Subscriptions:
             rate_hz = rate_of_first(np.array([cloud.stamp_ns for cloud in firsts]))
             model = replace(UNKNOWN_SENSOR, rate_hz=rate_hz)
             read = [self._scan_of(cloud, model) for cloud in firsts]
-            found = estimate_sensor(read, rate_hz)
-            self.sensor = found.sensor
-            self.sensor_told = found.told
+            estimate = estimate_sensor(read, rate_hz)
+            self.sensor = estimate.sensor
+            self.sensor_told = estimate.told
         return self.sensor is not None
 
     def waiting(self, clouds: list[Cloud]) -> WaitingScan:

@@ -256,7 +256,7 @@ class NewPoints:
         return of_tile
 
     def _of_tiles(self, points: F64) -> dict[TileIndex, F64]:
-        return {tile: points[mine] for tile, mine in cut_tiles(points, self.lattice)}
+        return {tile: points[chosen] for tile, chosen in cut_tiles(points, self.lattice)}
 
 
 def points_in(

@@ -190,16 +190,18 @@ def change_objects(
     if cells is None:
         return []
     kinds = cells.states.astype(np.int64)
-    found = buildings(cells.rows, cells.cols, kinds)
-    outlines = rings(cells.rows, cells.cols, found.polygons)
-    things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
+    cut = buildings(cells.rows, cells.cols, kinds)
+    outlines = rings(cells.rows, cells.cols, cut.polygons)
+    things = group(cells.rows, cells.cols, kinds, cut.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)
     probability = change_probability(cells.states, cells.votes, cells.against, beside, cells.odds)
-    sizes_m = [size(cells.rows, cells.cols, found.objects)[found.objects] for size in (_lengths_m, widths_m)]
+    sizes_m = [size(cells.rows, cells.cols, cut.objects)[cut.objects] for size in (_lengths_m, widths_m)]
     return [
-        _object(cells, probability, mine, sizes_m, [outlines[p] for p in np.unique(found.polygons[mine])])
-        for mine in members(things)
-        if len(mine) >= min_cells
+        _object(
+            cells, probability, members_of_it, sizes_m, [outlines[p] for p in np.unique(cut.polygons[members_of_it])]
+        )
+        for members_of_it in members(things)
+        if len(members_of_it) >= min_cells
     ]
 
 
@@ -226,33 +228,33 @@ def _lengths_m(rows: I64, cols: I64, pieces: I32) -> F64:
 
 
 def _object(
-    cells: ChangedCells, probability: F64, mine: I64, sizes_m: Sequence[F64], outline: list[list[Ring]]
+    cells: ChangedCells, probability: F64, own: I64, sizes_m: Sequence[F64], outline: list[list[Ring]]
 ) -> ChangeObject:
-    """``mine``: the cells of one thing; ``sizes_m``: of every cell, how long and how wide its piece is."""
-    longest_m, width_m = (float(of_piece[mine].max()) for of_piece in sizes_m)
-    rows = cells.rows[mine]
-    cols = cells.cols[mine]
-    versions = cells.versions[mine]
-    kind = KINDS[int(cells.states[mine[0]])]
+    """``own``: the cells of one thing; ``sizes_m``: of every cell, how long and how wide its piece is."""
+    longest_m, width_m = (float(of_piece[own].max()) for of_piece in sizes_m)
+    rows = cells.rows[own]
+    cols = cells.cols[own]
+    versions = cells.versions[own]
+    kind = KINDS[int(cells.states[own[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
-    by_vote = (versions > 0) & ~cells.fell[mine]
-    voted = mine[by_vote] if by_vote.any() else mine
+    by_vote = (versions > 0) & ~cells.fell[own]
+    voted = own[by_vote] if by_vote.any() else own
     judged = voted[~cells.stands[voted]]
-    seen_first = int(cells.first_ns[mine].min())
-    seen_last = int(cells.last_ns[mine].max())
-    columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
+    seen_first = int(cells.first_ns[own].min())
+    seen_last = int(cells.last_ns[own].max())
+    columns = np.maximum(cells.top_m[own] - cells.bottom_m[own], 0.0) + CELL_SIZE
     return ChangeObject(
         id=f"{kind}.v{made_in[0] if made_in else 0}.{rows[0]}.{cols[0]}",
         kind=kind,
         outline=outline,
-        cells=len(mine),
+        cells=len(own),
         where=(rows, cols),
         box=(float(cols.min()), float(rows.min()), float(cols.max() + 1), float(rows.max() + 1)),
         longest_m=longest_m,
         width_m=width_m,
-        height_m=float(cells.top_m[mine].max()),
+        height_m=float(cells.top_m[own].max()),
         volume_m3=float(columns.sum() * CELL_SIZE**2),
-        points=int(cells.points[mine].sum()),
+        points=int(cells.points[own].sum()),
         votes_min=int(cells.votes[voted].min()),
         votes_median=float(np.median(cells.votes[voted])),
         against_median=float(np.median(cells.against[voted])),
@@ -260,8 +262,8 @@ def _object(
         last_seen_ns=None if seen_last == _UNTIL else seen_last,
         versions=made_in,
         probability=float(probability[judged].mean()) if made_in and len(judged) else None,
-        trimmed=int(cells.stands[mine].sum()),
-        fell=int(cells.fell[mine].sum()),
+        trimmed=int(cells.stands[own].sum()),
+        fell=int(cells.fell[own].sum()),
     )
 
 

@@ -53,12 +53,12 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
     window = Grid(lattice, int(rows[0]), int(cols[0]), TILE_CELLS, TILE_CELLS)
     far = np.array([box[2] + CUTOUT_SIZES.around_m, box[3] + CUTOUT_SIZES.around_m]) - [window.x0, window.y0]
     ground = np.full(window.shape, np.nan, dtype=np.float32)
-    found: dict[str, list[F32]] = {"kept": [], "removed": [], "added": []}
+    points_of: dict[str, list[F32]] = {"kept": [], "removed": [], "added": []}
     for index in window.tiles():
         before, after = (look(index) for look in tiles)
         common = before.window.intersection(window)
-        known = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z)
-        ground[common.slices_in(window)] = known[common.slices_in(before.window)]
+        ground_z = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z)
+        ground[common.slices_in(window)] = ground_z[common.slices_in(before.window)]
         gone = ~found_among(before.points, after.points)
         come = ~found_among(after.points, before.points)
         for kind, points in (
@@ -66,10 +66,10 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
             ("removed", before.points_map[gone]),
             ("added", after.points_map[come]),
         ):
-            found[kind].append(_inside(points, window, far))
-    clouds = {kind: cloud_bytes(*pack(_thinned(np.concatenate(some)), ground)) for kind, some in found.items()}
-    told = {"name": name, "facts": facts, "x": window.x0, "y": window.y0, "box": box, "height": height_m}
-    return told | {kind: base64.b64encode(cloud).decode() for kind, cloud in clouds.items()}
+            points_of[kind].append(_inside(points, window, far))
+    clouds = {kind: cloud_bytes(*pack(_thinned(np.concatenate(parts)), ground)) for kind, parts in points_of.items()}
+    view = {"name": name, "facts": facts, "x": window.x0, "y": window.y0, "box": box, "height": height_m}
+    return view | {kind: base64.b64encode(cloud).decode() for kind, cloud in clouds.items()}
 
 
 def of_feature(feature: ChangeFeature, tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:

@@ -192,7 +192,7 @@ def _cell(value: Any) -> Any:
 def _neighbours(objects: Sequence[ChangeObject], among: Sequence[ChangeObject]) -> list[list[str]]:
     """For each object the ids of other large things whose box is within 15 m, nearest first."""
     large = [other for other in among if other.size == "large"]
-    boxes, others = (shapely.box(*np.array([o.box for o in some]).reshape(-1, 4).T) for some in (objects, large))
+    boxes, others = (shapely.box(*np.array([o.box for o in group]).reshape(-1, 4).T) for group in (objects, large))
     here, there = shapely.STRtree(others).query(boxes, predicate="dwithin", distance=NEIGHBOUR_RULE.near_m / CELL_SIZE)
     distance_m = CELL_SIZE * shapely.distance(boxes[here], others[there])
     near: list[list[tuple[float, str]]] = [[] for _ in objects]

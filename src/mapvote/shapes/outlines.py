@@ -44,7 +44,7 @@ def rings(rows: I64, cols: I64, polygons: I32) -> list[list[Ring]]:
     their lowest, then leftmost corner: valid by RFC 7946 and OGC Simple Features, equal for equal cells.
     """
     squares = shapely.box(cols, rows, cols + 1, rows + 1)
-    return [_outline(shapely.coverage_union_all(squares[mine])) for mine in members(polygons)]
+    return [_outline(shapely.coverage_union_all(squares[own])) for own in members(polygons)]
 
 
 def _outline(polygon: shapely.Polygon) -> list[Ring]:
@@ -91,8 +91,8 @@ def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
     i = np.concatenate([a for a, _ in pairs])
     j = np.concatenate([b for _, b in pairs])
     graph = scipy.sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
-    _, found = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    return _in_order(found)
+    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return _in_order(labels)
 
 
 @record()
@@ -122,17 +122,17 @@ PIECE_RULE = PieceRule()
 
 def buildings(rows: I64, cols: I64, kinds: I64) -> Pieces:
     """Connected cells of one kind, see :func:`pieces`, cut between buildings that stand side by side."""
-    found = pieces(rows, cols, kinds)
+    cut = pieces(rows, cols, kinds)
     part = np.zeros(len(rows), dtype=np.int64)
     done: set[tuple[int, int]] = set()
     for turn in range(1, PIECE_RULE.cuts + 1):
-        fresh = _cut_each(rows, cols, found.objects, done)
+        fresh = _cut_each(rows, cols, cut.objects, done)
         if not fresh.any():
             break
         part[fresh] += 1 << turn
         _, apart = np.unique(np.stack([kinds, part]), axis=1, return_inverse=True)
-        found = pieces(rows, cols, apart.reshape(-1))
-    return found
+        cut = pieces(rows, cols, apart.reshape(-1))
+    return cut
 
 
 def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) -> Bool:
@@ -141,15 +141,15 @@ def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) ->
     fresh = np.zeros(len(rows), dtype=np.bool_)
     sizes = np.bincount(objects)
     for label in np.flatnonzero(sizes >= 2 * PIECE_RULE.wall_cells / PIECE_RULE.least_share):
-        mine = np.flatnonzero(objects == label)
-        name = int(mine[0]), len(mine)
+        own = np.flatnonzero(objects == label)
+        name = int(own[0]), len(own)
         if name in done:
             continue
-        side = _beyond_cut(rows[mine], cols[mine])
+        side = _beyond_cut(rows[own], cols[own])
         if side is None:
             done.add(name)
         else:
-            fresh[mine[side]] = True
+            fresh[own[side]] = True
     return fresh
 
 
@@ -197,11 +197,11 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = PIECE_
     if not len(rows):
         return np.zeros(0, dtype=np.int32)
     each = members(pieces)
-    corners = [_corners(rows[mine], cols[mine]) for mine in each]
+    corners = [_corners(rows[own], cols[own]) for own in each]
     low = np.array([c.min(axis=0) for c in corners])
     high = np.array([c.max(axis=0) for c in corners])
-    size = np.array([len(mine) for mine in each])
-    kind = np.array([kinds[mine[0]] for mine in each])
+    size = np.array([len(own) for own in each])
+    kind = np.array([kinds[own[0]] for own in each])
     owner = np.arange(len(each))
     reach = reach_m / CELL_SIZE
     leaders: dict[int, list[int]] = {int(k): [] for k in np.unique(kind)}
@@ -226,7 +226,7 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = PIECE_
 def widths_m(rows: I64, cols: I64, pieces: I32) -> F64:
     """(k,) metres: the narrowest gate that each piece (n,) labels 0 ... k - 1 would fit through, across a side of its
     convex hull."""
-    return np.array([_width(_corners(rows[mine], cols[mine])) for mine in members(pieces)]) * CELL_SIZE
+    return np.array([_width(_corners(rows[own], cols[own])) for own in members(pieces)]) * CELL_SIZE
 
 
 def _width(corners: F64) -> float:

@@ -57,9 +57,9 @@ class Levels:
 
     def part(self, level: int) -> bytes:
         """One level as :func:`cloud_bytes`, then the intensity of each point, a byte, if there is one."""
-        some = slice(0 if level == 0 else int(self.ends[level - 1]), int(self.ends[level]))
-        bright = b"" if self.bright is None else self.bright[some].tobytes()
-        return cloud_bytes(self.packed[some], self.z0_m, self.z_step_m) + bright
+        rows = slice(0 if level == 0 else int(self.ends[level - 1]), int(self.ends[level]))
+        bright = b"" if self.bright is None else self.bright[rows].tobytes()
+        return cloud_bytes(self.packed[rows], self.z0_m, self.z_step_m) + bright
 
     @property
     def nbytes(self) -> int:
@@ -93,8 +93,8 @@ def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
         return np.zeros((0, 4), dtype=np.uint16), 0.0, LAYER_RULE.least_z_step_m
     low, high = _heights(points)
     step = max(LAYER_RULE.least_z_step_m, (high - low) / _STEPS)
-    known = ground_z[np.isfinite(ground_z)]
-    elsewhere = float(np.median(known)) if len(known) else low
+    measured = ground_z[np.isfinite(ground_z)]
+    elsewhere = float(np.median(measured)) if len(measured) else low
     return _pack(points, ground_z, elsewhere, low, step), low, step
 
 
@@ -161,5 +161,5 @@ def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> 
     ground = (after if len(after.points) else before).ground_z
     gone = ~found_among(before.points, after.points)
     come = ~found_among(after.points, before.points)
-    clouds = [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
+    clouds = [cloud_bytes(*pack(points, ground)) for points in (before.points[gone], after.points[come])]
     return b"".join([np.array(index or after.index, dtype="<i4").tobytes(), *clouds])

@@ -202,8 +202,8 @@ class Mapper:
 def _standing(points: F64, ground: PointMap) -> Bool:
     """(n,) which points (n, 3) stand above the ground of ``ground``; none outside its tiles."""
     out = np.zeros(len(points), dtype=np.bool_)
-    for tile, mine, cell in ground.by_tile(points):
-        out[mine] = column_bits(points[mine, 2], tile.ground_z[cell], tile.base[cell])[1]
+    for tile, chosen, cell in ground.by_tile(points):
+        out[chosen] = column_bits(points[chosen, 2], tile.ground_z[cell], tile.base[cell])[1]
     return out
 
 
@@ -268,9 +268,9 @@ def mirrored(points: F64, point_map: PointMap, road: F64 | None, numbers: Cleani
 def _unbroken(ground_z: F32, numbers: Cleaning = CLEANING) -> Bool:
     """(rows, cols) cells around which the ground is known and has no step."""
     side = 2 * numbers.level_cells + 1
-    known = np.isfinite(ground_z)
-    highest = ndimage.maximum_filter(np.where(known, ground_z, np.inf), side, mode="nearest")
-    lowest = ndimage.minimum_filter(np.where(known, ground_z, -np.inf), side, mode="nearest")
+    measured = np.isfinite(ground_z)
+    highest = ndimage.maximum_filter(np.where(measured, ground_z, np.inf), side, mode="nearest")
+    lowest = ndimage.minimum_filter(np.where(measured, ground_z, -np.inf), side, mode="nearest")
     with np.errstate(invalid="ignore"):
         return np.asarray(highest - lowest <= numbers.below_m)
 

@@ -162,10 +162,10 @@ def dempster(
         return 0.0, 0.0
     o = o / total
     f = f / total
-    known = o + f
-    if known > 1.0 - least_unknown:
-        o = o * (1.0 - least_unknown) / known
-        f = f * (1.0 - least_unknown) / known
+    belief = o + f
+    if belief > 1.0 - least_unknown:
+        o = o * (1.0 - least_unknown) / belief
+        f = f * (1.0 - least_unknown) / belief
     return o, f
 
 
@@ -411,6 +411,8 @@ def _measure(task: tuple[Scene, str, F64]) -> None:
     }
     with whole_folder(_folder(scene, name), sign="cost.json") as folder:
         np.save(folder / "nearest.npy", states)
-        known = np.flatnonzero((evidence.occupied > 0) | (evidence.free > 0)).astype(np.int32)
-        np.savez(folder / "evidence.npz", known=known, occupied=evidence.occupied[known], free=evidence.free[known])
+        believed = np.flatnonzero((evidence.occupied > 0) | (evidence.free > 0)).astype(np.int32)
+        np.savez(
+            folder / "evidence.npz", known=believed, occupied=evidence.occupied[believed], free=evidence.free[believed]
+        )
         (folder / "cost.json").write_text(json.dumps(cost))

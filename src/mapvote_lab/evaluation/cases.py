@@ -39,7 +39,7 @@ Progress = Callable[[str, int, int], None]
 """Called with (what is being done, done, in all)."""
 
 
-def untold(what: str, done: int, total: int) -> None:
+def untold(stage: str, done: int, total: int) -> None:
     """A progress that is not reported."""
 
 
@@ -176,17 +176,18 @@ PUBLISHED = "as_published"
 its cases vote on that. Both readings of an occluded scan stand side by side in its tables."""
 
 
-def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), reading: str | None = None) -> Settings:
+def as_paper(settings: Settings, scenario: str, stated: Collection[str] = (), reading: str | None = None) -> Settings:
     """``settings`` with the paper read as ``reading`` says, and with a map like the paper's on the paper's street.
 
-    ``told``: names ("mapping.drop_strays") of what the user set: that stays. MapvoteError for a reading there is not.
+    ``stated``: names ("mapping.drop_strays") of settings that the user set: they stay. MapvoteError for a reading that
+    does not exist.
     """
-    known = settings
+    adapted = settings
     if reading:
-        known = known.model_copy(update={"paper": read(known.paper, reading)})
-    if scenario == PUBLISHED and "mapping.drop_strays" not in told:
-        known = known.model_copy(update={"mapping": known.mapping.model_copy(update={"drop_strays": False})})
-    return known
+        adapted = adapted.model_copy(update={"paper": read(adapted.paper, reading)})
+    if scenario == PUBLISHED and "mapping.drop_strays" not in stated:
+        adapted = adapted.model_copy(update={"mapping": adapted.mapping.model_copy(update={"drop_strays": False})})
+    return adapted
 
 
 CountedBy = tuple[VotingSettings, PaperSettings]
@@ -217,15 +218,15 @@ def tallies(drive: Words, mapped: Bool, rules: Iterable[CountedBy]) -> dict[Coun
 
     ``mapped`` (rows, cols): where the map holds obstacle points.
     """
-    found = {rule: np.zeros((*mapped.shape, N_STATES), dtype=np.int32) for rule in rules}
+    tally_of = {rule: np.zeros((*mapped.shape, N_STATES), dtype=np.int32) for rule in rules}
     for row0, col0, packed, shape in drive:
         raw = unpack_bytes(packed, 2 * shape[0] * shape[1], "a kept scan")
         words = np.frombuffer(raw, dtype="<u2").reshape(shape)
-        for rule, tally in found.items():
+        for rule, tally in tally_of.items():
             half = round(0.5 * rule[1].window_m / CELL_SIZE)
             margin = max(0, words.shape[0] // 2 - half)
             _cast(words, row0, col0, margin, mapped, *reading_table(*rule), NO_VOTE, tally)
-    return found
+    return tally_of
 
 
 def counting_rule(case: Case) -> CountedBy:

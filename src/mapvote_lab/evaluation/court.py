@@ -201,9 +201,9 @@ def _measured_as_far(T: F64, window: Grid, surveyed: Bool, rule: CourtRule) -> F
     reach = rule.stride_m * np.arange(1, int(rule.reach_m / rule.stride_m) + 1)
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
     places = T[:2, 3] + ahead[:, None, :] * reach[None, :, None]
-    known = window.value_at(surveyed, places.reshape(-1, 2))
+    surveyed_there = window.value_at(surveyed, places.reshape(-1, 2))
     return np.asarray(
-        rule.stride_m * (1 + np.logical_and.accumulate(known.reshape(rule.columns, -1), axis=1).sum(axis=1))
+        rule.stride_m * (1 + np.logical_and.accumulate(surveyed_there.reshape(rule.columns, -1), axis=1).sum(axis=1))
     )
 
 
@@ -336,10 +336,10 @@ def _score(
             if not any(one.kind == kind and _in_box(xy, one.box, rule.margin_m).any() for one in shown):
                 false.append(area_m2)
     added = (counts["structure"][1] - counts["structure"][0], counts["thing"][1] - counts["thing"][0])
-    found = int(counts["car"][1] < 0.5 * counts["car"][0]) + sum(more >= 50 for more in added)
+    n_found = int(counts["car"][1] < 0.5 * counts["car"][0]) + sum(more >= 50 for more in added)
     elsewhere = int((gone & ~boxed[0]).sum()), int((come & ~boxed[1]).sum())
     return CourtScore(
-        method, counts["car"][1], counts["car"][0], added, found, elsewhere, tuple(others), tuple(false)
+        method, counts["car"][1], counts["car"][0], added, n_found, elsewhere, tuple(others), tuple(false)
     )  # fmt: skip
 
 

@@ -313,11 +313,11 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     write_map(street.point_map, out / "map")
     progress("mapping", 2, 2)
     progress("voting", 0, 1)
-    run, asked, things = real_bench.new_things(
+    run, bodies, things = real_bench.new_things(
         street, real_bench.survey_site(street), cases, DEMO_PLAN.seed, DEMO_PLAN.each
     )
     progress("voting", 1, 1)
-    found = real_bench.score(asked, run.states[CASE])
+    scores = real_bench.score(bodies, run.states[CASE])
     pictures = [
         (scan, "One scan of the drive, coloured by height."),
         (out / "pictures" / "street.png", "The map. Red: returns of new bodies in cells that the vote calls changed "
@@ -326,9 +326,12 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
          "missed. Black: called changed where nothing changed."),
     ]  # fmt: skip
     draw_street(run, [np.concatenate(thing.met) for thing in things if thing.met], pictures[1][0])
-    draw_things(run, CASE, asked, pictures[2][0])
+    draw_things(run, CASE, bodies, pictures[2][0])
     facts = [
-        (f"{sum(f.half for f in found)} of {sum(f.things for f in found)}", "new bodies found by half of their cells"),
+        (
+            f"{sum(f.half for f in scores)} of {sum(f.things for f in scores)}",
+            "new bodies found by half of their cells",
+        ),
         (
             f"{100 * run.changed_share(CASE, with_movers=False):.2f} %",
             "of the decided cells called changed",
@@ -342,7 +345,7 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     )
     text = page(f"Three vehicles voted on {folder.name}", lead, facts, _sections(folder, street, length, pictures))
     write_whole(out / "report.html", text)
-    lines = [f"{what}: {figure}" for figure, what in facts]
+    lines = [f"{meaning}: {figure}" for figure, meaning in facts]
     return [*lines, f"{out / 'report.html'}: the story with pictures", f"{out / 'map'}: the map"]
 
 
@@ -370,9 +373,9 @@ def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
     clouds = [points[near]]
     colours = [figures.shades(points[near, 2] - road_z)]
     for returns in cast:
-        found = street.grid.value_at(run.states[CASE] == CellState.CHANGED_OCCUPIED, returns)
+        is_new = street.grid.value_at(run.states[CASE] == CellState.CHANGED_OCCUPIED, returns)
         clouds.append(returns)
-        colours.append(np.where(found[:, None], to_rgb(Colour.NEW), to_rgb(Colour.UNSURE)).astype(np.float32))
+        colours.append(np.where(is_new[:, None], to_rgb(Colour.NEW), to_rgb(Colour.UNSURE)).astype(np.float32))
     behind = float(np.degrees(np.arctan2(-along[1], -along[0]))) + 25.0
     camera = figures.Camera((float(middle[0]), float(middle[1]), road_z), 75.0, behind, 38.0)
     panel = (f"{len(points):,} map points", np.concatenate(clouds), np.concatenate(colours))

@@ -162,13 +162,13 @@ def _from_above(points: F64, height: F64, grid: Grid) -> np.ndarray:
     rows, cols, inside = grid.indices_of(points)
     top = np.full(grid.shape, -np.inf)
     np.maximum.at(top, (rows[inside], cols[inside]), height[inside])
-    known = np.isfinite(top)
+    seen = np.isfinite(top)
     share = np.clip(top / 10.0, 0.0, 1.0)[..., None]
-    share[~known] = 0.0
+    share[~seen] = 0.0
     low = np.array([0.83, 0.86, 0.89])
     high = np.array([0.16, 0.25, 0.34])
     image = low + (high - low) * np.sqrt(share)
-    image[~known] = 1.0
+    image[~seen] = 1.0
     return image
 
 
@@ -307,10 +307,10 @@ def score_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Fig
     return figure
 
 
-def reliability_diagram(found: Mapping[CellState, Reliability]) -> Figure:
+def reliability_diagram(by_state: Mapping[CellState, Reliability]) -> Figure:
     """Predicted probability against the share that did change, a panel for each kind; below, how many cells."""
-    figure, axes = style.new_figure(8.2, 4.9, 2, len(found), height_ratios=(3, 1), sharex=True, sharey="row")
-    for column, (state, one) in zip(axes.T, found.items(), strict=True):
+    figure, axes = style.new_figure(8.2, 4.9, 2, len(by_state), height_ratios=(3, 1), sharex=True, sharey="row")
+    for column, (state, one) in zip(axes.T, by_state.items(), strict=True):
         colour, marker = (style.Colour.NEW, "D") if state == CellState.CHANGED_OCCUPIED else (style.Colour.GONE, "X")
         there = one.cells > 0
         column[0].plot([0, 1], [0, 1], color=style.Colour.FAINT, lw=0.9, ls="--")

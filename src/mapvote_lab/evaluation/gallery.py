@@ -45,11 +45,11 @@ def areas_of(evaluation: Evaluation) -> list[ChangedArea]:
     scene = evaluation.scene
     for i, change in enumerate(load_scenario(scene.scenario, scene.overrides).changes):
         corners = [np.asarray(o["footprint"]) for o in evaluation.truth.objects if o["kind"] == change.kind]
-        mine = [c for c in corners if change.from_m - 2 <= c[:, 0].mean() <= change.to_m + 2]
-        if mine:
-            every = np.concatenate(mine)
+        inside = [c for c in corners if change.from_m - 2 <= c[:, 0].mean() <= change.to_m + 2]
+        if inside:
+            every = np.concatenate(inside)
             box = np.array([every.min(axis=0) - 4.0, every.max(axis=0) + 4.0])
-            out.append(ChangedArea(f"area {i + 1}", change.kind, box, len(mine)))
+            out.append(ChangedArea(f"area {i + 1}", change.kind, box, len(inside)))
     return out
 
 
@@ -104,12 +104,12 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     if evaluation.best == "surfaces":
         decisions = evaluation.outcomes["surfaces"].decisions
         lattice = evaluation.first_map.lattice
-        found = {
+        by_state = {
             state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
             for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
         }
         caption = "Share of the cells that really changed, by the probability they were decided with (strict truth)."
-        yield "reliability", figures.reliability_diagram(found), caption
+        yield "reliability", figures.reliability_diagram(by_state), caption
 
 
 def _paths(evaluation: Evaluation) -> list[tuple[str, F64]]:

@@ -144,13 +144,13 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
         )  # fmt: skip
     after = among([*standing, *things, *moved, *gone], street)
     dry = vote_on(street, cases, edit=after)
-    asked = [_new(street, thing) for thing in [*things, *moved]]
+    bodies = [_new(street, thing) for thing in [*things, *moved]]
     still = met_cells(street, after)
     left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
-    asked += [_gone(street, thing, thing.left, still) for thing in left]
-    yield dry, asked
+    bodies += [_gone(street, thing, thing.left, still) for thing in left]
+    yield dry, bodies
     rain = in_rain(STREET_RULE.rain_share)  # over what was cast: drops hide the things as they hide the street
-    yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), asked
+    yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), bodies
 
 
 def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> Iterator[Changed]:
@@ -161,8 +161,8 @@ def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, eac
     )
     T_map_old = before.T_map_lidar[0] @ inverse(street.T_map_lidar[0])
     still = met_cells(before)
-    asked = [_gone(before, thing, [transform(T_map_old, p) for p in thing.met], still) for thing in things]
-    yield vote_on(before, cases), asked
+    bodies = [_gone(before, thing, [transform(T_map_old, p) for p in thing.met], still) for thing in things]
+    yield vote_on(before, cases), bodies
 
 
 def _new(street: Street, thing: Thing) -> Asked:
@@ -195,11 +195,11 @@ def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
     return out
 
 
-def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
+def score(bodies: Sequence[Asked], states: U8) -> list[FoundThings]:
     """Outcome of the ``states`` (rows, cols) for the objects, by kind in the order in which they were asked."""
     out = []
-    for kind in dict.fromkeys(a.kind for a in asked):
-        these = [a for a in asked if a.kind == kind and a.cells.any()]
+    for kind in dict.fromkeys(a.kind for a in bodies):
+        these = [a for a in bodies if a.kind == kind and a.cells.any()]
         right = [np.count_nonzero((states == a.state) & a.cells) for a in these]
         size = [np.count_nonzero(a.cells) for a in these]
         near = [ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state) for a in these]
@@ -210,12 +210,12 @@ def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
     return out
 
 
-def precision_near(asked: Sequence[Asked], states: U8, grid: Grid, near_cells: int = BENCH_RULE.near_cells) -> float:
+def precision_near(bodies: Sequence[Asked], states: U8, grid: Grid, near_cells: int = BENCH_RULE.near_cells) -> float:
     """Share of the cells decided changed within ``near_cells`` of the things that are, or lie next to, cells so
     changed."""
     near = np.zeros(grid.shape, dtype=np.bool_)
     right = np.zeros(grid.shape, dtype=np.bool_)
-    for a in asked:
+    for a in bodies:
         near |= ndimage.binary_dilation(a.cells, NEIGHBOURS, iterations=near_cells)
         right |= ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state)
     return ratio(np.count_nonzero(right), np.count_nonzero(is_changed(states) & near))
@@ -266,10 +266,10 @@ class Bench:
             "unchanged": {name: run.figures(case) for name, run in self.runs.items()},
             "changed": {
                 name: {
-                    "precision_near": precision_near(asked, run.states[case], run.street.grid),
-                    "found": [asdict(f) for f in score(asked, run.states[case])],
+                    "precision_near": precision_near(bodies, run.states[case], run.street.grid),
+                    "found": [asdict(f) for f in score(bodies, run.states[case])],
                 }
-                for name, (run, asked) in self.changed.items()
+                for name, (run, bodies) in self.changed.items()
             },
             "skipped": self.skipped,
         }
@@ -304,8 +304,8 @@ def bench(
     tell("real street", len(jobs), total)
     for names, cast in casts.items():
         try:
-            for name, found in zip(names, cast(street, site, cases, seed, each), strict=True):
-                result.changed[name] = found
+            for name, run in zip(names, cast(street, site, cases, seed, each), strict=True):
+                result.changed[name] = run
                 tell("real street", len(jobs) + len(result.changed), total)
         except MapvoteError as error:
             result.skipped |= {name: str(error) for name in names if name not in result.changed}

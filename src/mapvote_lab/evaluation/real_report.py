@@ -78,8 +78,8 @@ def _poses(bench: Bench, case: str) -> Sheet:
 def _largest(bench: Bench, case: str) -> Sheet:
     rows = []
     if bench.runs:
-        found = largest_false_changes(next(iter(bench.runs.values())), case, 5)
-        rows = [(f.kind.replace("_", "-"), f"{f.x}, {f.y}", f"{f.m2}", "yes" if f.on_mover else "no") for f in found]
+        changes = largest_false_changes(next(iter(bench.runs.values())), case, 5)
+        rows = [(f.kind.replace("_", "-"), f"{f.x}, {f.y}", f"{f.m2}", "yes" if f.on_mover else "no") for f in changes]
     headings = ("in the first run", "x, y in the map, m", "m²", "where something moved")
     return Sheet(f"{bench.name}: the largest false changes", headings, rows)
 
@@ -88,8 +88,8 @@ def _changed(bench: Bench, case: str) -> Sheet:
     headings = ("thing", "asked", "half found", "touched", "cell recall", "rays a scan")
     rows = []
     said = []
-    for name, (run, asked) in bench.changed.items():
-        said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
+    for name, (run, bodies) in bench.changed.items():
+        said.append(f"{precision_near(bodies, run.states[case], run.street.grid):.2f} ({name})")
         for f in [] if name == ChangedRun.BUILT_IN_RAIN else _found(bench, case, name):
             rows.append((f.kind, str(f.things), str(f.half), str(f.touched), f"{f.cell_recall:.2f}", f"{f.rays:.0f}"))
     title = f"{bench.name}: cast into the scans, {case}; precision within 1.5 m of them {', '.join(said)}"
@@ -111,8 +111,8 @@ def _found(bench: Bench, case: str, name: str) -> list[FoundThings]:
     """Found things by kind; empty for a run that was not made."""
     if name not in bench.changed:
         return []
-    run, asked = bench.changed[name]
-    return score(asked, run.states[case])
+    run, bodies = bench.changed[name]
+    return score(bodies, run.states[case])
 
 
 Spot = tuple[float, float, str]
@@ -133,22 +133,22 @@ def draw_worst(bench: Bench, case: str, folder: Path) -> list[Path]:
             run = bench.runs[name]
             written.append(file_of(f"false {name}"))
             draw_false_changes(run, case, largest_false_changes(run, case), written[-1])
-    for name, (run, asked) in bench.changed.items():
+    for name, (run, bodies) in bench.changed.items():
         written.append(file_of(name))
-        draw_things(run, case, asked, written[-1])
+        draw_things(run, case, bodies, written[-1])
     return written
 
 
-def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], path: Path) -> None:
+def draw_false_changes(run: RealRun, case: str, changes: Sequence[FalseChange], path: Path) -> None:
     """The whole street from above, and a close-up of each false change: map height grey, decided changes in colour."""
     picture = _street(run)
     for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
         picture[run.states[case] == state] = to_rgb(STATE_COLOURS[state])
-    spots = [(f.x, f.y, f"{f.m2:.1f} m²{', mover' if f.on_mover else ''}") for f in found[:10]]
+    spots = [(f.x, f.y, f"{f.m2:.1f} m²{', mover' if f.on_mover else ''}") for f in changes[:10]]
     _draw(run, picture, f"{case}: nothing changed; red = decided new, blue = decided gone", spots, path)
 
 
-def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path, most: int = 20) -> None:
+def draw_things(run: RealRun, case: str, bodies: Sequence[Asked], path: Path, most: int = 20) -> None:
     """The whole street, and close-ups of at most ``most`` things, the least found first: found, missed, false."""
     picture = _street(run)
     states = run.states[case]
@@ -156,7 +156,7 @@ def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path, mos
     share = []
     spots = []
     x, y = run.street.grid.centres()
-    for a in asked:
+    for a in bodies:
         picture[a.cells] = to_rgb(Colour.UNSURE)
         picture[a.cells & (states == a.state)] = to_rgb(
             Colour.NEW if a.state == CellState.CHANGED_OCCUPIED else Colour.GONE

@@ -213,8 +213,8 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
         T_true = street.T_map_lidar[scans]
         vehicle = SharedPass(drive, street.point_map, street.settings, cases)
         for i, scan in enumerate(drive):
-            known = i == 0 or not first_pose_only
-            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), street.grid, movers)
+            with_prior = i == 0 or not first_pose_only
+            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if with_prior else None), street.grid, movers)
         _note_movers(vehicle.finish(), street.grid, movers)
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
         reports.append(vehicle.report)

@@ -71,9 +71,9 @@ def sources_digest(parts: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-def key_of(*what: object) -> str:
+def key_of(*parts: object) -> str:
     """12 hex digits naming everything that a cached result depends on."""
-    return hashlib.sha256(json.dumps([str(w) for w in what]).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps([str(w) for w in parts]).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ class Scene:
         """Simulate the drives, unless the cache holds them."""
         if not self.folder.exists():
             made = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
-            told = partial(progress, "simulating")
-            simulate(self.scenario, made, self.seed, progress=told, overrides=self.overrides)
+            report = partial(progress, "simulating")
+            simulate(self.scenario, made, self.seed, progress=report, overrides=self.overrides)
             os.replace(made, self.folder) if not self.folder.exists() else shutil.rmtree(made)
 
     def prepare(self, progress: Progress = untold) -> None:
@@ -286,8 +286,8 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
     observations = vehicle.finish()
     report = vehicle.report
     poses = np.full((len(drive), 4, 4), np.nan)
-    found = np.setdiff1d(np.arange(len(drive)), report.lost)
-    poses[found] = np.array(report.T_map_lidar)[found]
+    localised = np.setdiff1d(np.arange(len(drive)), report.lost)
+    poses[localised] = np.array(report.T_map_lidar)[localised]
     with whole_folder(pass_folder(scene, cases, name, keep), sign="pass.json") as folder:
         if keeper:
             keeper.watch(observations)

@@ -181,8 +181,8 @@ def score_objects(
             area = len(cells[0]) * CELL_SIZE**2
             if area >= rule.least_object_m2 and not near[cells].any():
                 false.append(area)
-    found = tuple(share >= rule.found_share for share in recalls)
-    return ObjectScores(found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
+    are_found = tuple(share >= rule.found_share for share in recalls)
+    return ObjectScores(are_found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
 
 
 class MapScores(msgspec.Struct, frozen=True, kw_only=True):

@@ -109,7 +109,7 @@ class ReportSection:
 
 def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequence[ReportSection]) -> str:
     """The page. ``facts`` are (figure, what it is); every text is escaped, every picture inlined as it lies on disk."""
-    cards = "".join(f"<div><b>{escape(figure)}</b><span>{escape(what)}</span></div>" for figure, what in facts)
+    cards = "".join(f"<div><b>{escape(figure)}</b><span>{escape(meaning)}</span></div>" for figure, meaning in facts)
     body = "\n".join(_section(section) for section in sections)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'

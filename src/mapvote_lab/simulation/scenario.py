@@ -142,7 +142,7 @@ def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = No
         table = tomllib.loads(text)
         for key, value in (overrides or {}).items():
             table[key] = {**table.get(key, {}), **value} if isinstance(value, Mapping) else value
-        found = Scenario.model_validate(table)
+        scenario_read = Scenario.model_validate(table)
     except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"scenario {scenario}: not TOML ({error})") from error
     except ValidationError as error:
@@ -151,12 +151,14 @@ def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = No
             f"scenario {scenario}: {'.'.join(str(part) for part in first['loc'])}: {wanted_of(first)} "
             f"(known keys: {', '.join(Scenario.model_fields)})"
         ) from error
-    if found.sensor not in NAMED:
-        raise MapvoteError(f"scenario {scenario}: sensor '{found.sensor}' unknown; choose one of {', '.join(NAMED)}")
-    for lane in (*found.surveys, *found.vehicle_lanes):
+    if scenario_read.sensor not in NAMED:
+        raise MapvoteError(
+            f"scenario {scenario}: sensor '{scenario_read.sensor}' unknown; choose one of {', '.join(NAMED)}"
+        )
+    for lane in (*scenario_read.surveys, *scenario_read.vehicle_lanes):
         if lane not in LANES:
             raise MapvoteError(f"scenario {scenario}: lane '{lane}' unknown; choose one of {', '.join(LANES)}")
-    return found
+    return scenario_read
 
 
 LANES: dict[str, tuple[int, float]] = {

@@ -221,8 +221,8 @@ def _plots(scenario: Scenario, side: Side, rng: np.random.Generator) -> Iterator
             if not low <= change.from_m < high:
                 continue
             if change.from_m < start or change.to_m - change.from_m < 6.0 * change.count or change.to_m > high:
-                where = f"{change.count} building(s) from {change.from_m} to {change.to_m} m"
-                raise MapvoteError(f"scenario {scenario.name}: {where} do not fit: 6 m each, in a free stretch")
+                stretch = f"{change.count} building(s) from {change.from_m} to {change.to_m} m"
+                raise MapvoteError(f"scenario {scenario.name}: {stretch} do not fit: 6 m each, in a free stretch")
             yield from _fill(start, change.from_m, rng, scenario.house_m)
             each = (change.to_m - change.from_m) / change.count
             for k in range(change.count):

@@ -86,11 +86,11 @@ class Bag:
         for connection, time_ns, data in self.raw(topic, **window):
             yield time_ns, self.decode(connection, data)
 
-    def points(self, where: str, connection: Any, data: bytes) -> NDArray[np.void]:
+    def points(self, source: str, connection: Any, data: bytes) -> NDArray[np.void]:
         """The points (n,) of a serialised cloud of one of CLOUDS, with their fields."""
         if connection.msgtype in LIVOX:
-            return livox_table(where, data, ros2=self.reader.is2)
-        return point_cloud_table(where, self.decode(connection, data))
+            return livox_table(source, data, ros2=self.reader.is2)
+        return point_cloud_table(source, self.decode(connection, data))
 
     def frame_id(self, data: bytes) -> str:
         """The frame in the header of a serialised message, without reading the rest."""

@@ -147,8 +147,10 @@ def _storage_files(files: list[Path], mended: list[str]) -> BagFiles:
         whole = _whole_records(file)
         paths.append(whole)
         lost = file.stat().st_size - whole.end
-        what = f"{file}: cut off, the recording was not stopped properly; its last {lost:,} bytes are no whole record"
-        mended.append(f"{what} and left out. `{mend_of(file)}` writes a whole file")
+        problem = (
+            f"{file}: cut off, the recording was not stopped properly; its last {lost:,} bytes are no whole record"
+        )
+        mended.append(f"{problem} and left out. `{mend_of(file)}` writes a whole file")
     return BagFiles(paths, mended)
 
 

@@ -96,9 +96,9 @@ def _poses_of_frames(bag: Bag, options: DriveOptions, topic: str, lidar: str, mo
 def prior_of_bag(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: Poses) -> Prior:
     """The prior of every scan from a topic or a file."""
     topic = poses.topic
-    known = bag.topics(*POSES, *GNSS, TF)
-    if topic is not None and topic.startswith("/") and topic not in known and not Path(topic).is_file():
-        raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(known) or 'none'}")
+    pose_topics = bag.topics(*POSES, *GNSS, TF)
+    if topic is not None and topic.startswith("/") and topic not in pose_topics and not Path(topic).is_file():
+        raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(pose_topics) or 'none'}")
     frame = map_frame(options)
     if topic in bag.topics(*GNSS) and options.prior is None and frame is None:
         log.warning("%s: %s is not used: the place of the map on Earth is unknown (import --crs)", bag.path, topic)
@@ -110,7 +110,9 @@ def prior_of_bag(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: Poses) 
     files = [bag.path] * len(stamps_ns)
     chosen = msgspec.structs.replace(options, prior=topic)
     try:
-        return prior_of(bag.path, chosen, files, stamps_ns, own, topic if topic in known else None, poses.T_base_lidar)
+        return prior_of(
+            bag.path, chosen, files, stamps_ns, own, topic if topic in pose_topics else None, poses.T_base_lidar
+        )
     except MapvoteError as error:
         if options.prior is not None:
             raise
@@ -218,10 +220,10 @@ def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
     sound = [row for row, kept in zip(rows, keep.tolist(), strict=True) if kept]
     order = _order_of_poses(bag, topic, [row[0] for row in sound], [row[1] for row in sound])
     place = place[order.chosen]
-    T, known = poses_from_gnss(place, np.zeros((len(place), 3)), frame)
+    T, own_frame = poses_from_gnss(place, np.zeros((len(place), 3)), frame)
     covariances = np.array([row[6] for row in sound])[order.chosen]
-    fixes = _with_imu(bag, fixes_of(order.stamps_ns, place, covariances, known))
-    track = Trajectory(order.stamps_ns, yaw_from_track(T), of_vehicle=True, frame=known)
+    fixes = _with_imu(bag, fixes_of(order.stamps_ns, place, covariances, own_frame))
+    track = Trajectory(order.stamps_ns, yaw_from_track(T), of_vehicle=True, frame=own_frame)
     return replace(track, fixes=fixes)
 
 

@@ -36,22 +36,24 @@ _READ: Mapping[str, Callable[[bytes, int], bytes]] = {"zstd": _of_zstd, "zlib": 
 """What undoes a format, at most a byte more than the size: a message cannot fill the memory."""
 
 
-def decompressed(where: str, message: Any) -> bytes:
+def decompressed(source: str, message: Any) -> bytes:
     """The bytes of the points of a CompressedPointCloud2. MapvoteError if they are damaged, or in a format that is not
     read."""
     form = str(message.format).strip().lower()
     if form not in _READ:
-        raise MapvoteError(f"{where}: its points are compressed by {form or 'nobody knows what'}: {republished(form)}")
+        raise MapvoteError(f"{source}: its points are compressed by {form or 'nobody knows what'}: {republished(form)}")
     size = int(message.height) * max(int(message.row_step), int(message.width) * int(message.point_step))
     try:
         data = _READ[form](bytes(message.compressed_data), size)
     except (zlib.error, zstd.ZstdError, EOFError) as error:
         raise MapvoteError(
-            f"{where}: its points do not decompress by {form} ({error}): the message is damaged"
+            f"{source}: its points do not decompress by {form} ({error}): the message is damaged"
         ) from error
     if len(data) != size:
-        found = f"more than {size}" if len(data) > size else f"{len(data)}"
-        raise MapvoteError(f"{where}: {found} bytes after {form}, but its header says {size}: the message is cut off")
+        size_found = f"more than {size}" if len(data) > size else f"{len(data)}"
+        raise MapvoteError(
+            f"{source}: {size_found} bytes after {form}, but its header says {size}: the message is cut off"
+        )
     return data
 
 

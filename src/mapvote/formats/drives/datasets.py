@@ -118,11 +118,11 @@ def _kitti_360_poses(file: Path, files: list[Path], stamps_ns: I64) -> Trajector
     T_imu_camera, T_lidar_camera = rigid_motions(np.stack([calib["image_00"], velo]), str(folder))
     numbers = numbers_of(files)
     first = np.searchsorted(numbers, rows[:, 0])
-    known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
-    if not known.any():
+    has_pose = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
+    if not has_pose.any():
         raise MapvoteError(f"{file}: no pose for any of the scans {files[0].name} to {files[-1].name}; --prior none")
-    T = T_world_imu[known] @ (T_imu_camera @ geometry.inverse(T_lidar_camera))
-    return sorted_trajectory(stamps_ns[first[known]], T, of_vehicle=False, frame=MapFrame())
+    T = T_world_imu[has_pose] @ (T_imu_camera @ geometry.inverse(T_lidar_camera))
+    return sorted_trajectory(stamps_ns[first[has_pose]], T, of_vehicle=False, frame=MapFrame())
 
 
 def is_nuscenes(path: Path) -> bool:

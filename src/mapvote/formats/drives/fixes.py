@@ -101,12 +101,12 @@ class Fixes:
         """These, and headings in the order of their times; NaN is no heading."""
         times = np.array(times_ns, dtype=np.int64)
         order = np.unique(times, return_index=True)[1]
-        known = order[np.isfinite(np.array(yaw_rad, dtype=np.float64)[order])]
+        measured = order[np.isfinite(np.array(yaw_rad, dtype=np.float64)[order])]
         return replace(
             self,
-            turn_times_ns=times[known],
-            yaw_rad=np.array(yaw_rad, dtype=np.float64)[known],
-            yaw_sigma_rad=np.array(sigma_rad, dtype=np.float64)[known],
+            turn_times_ns=times[measured],
+            yaw_rad=np.array(yaw_rad, dtype=np.float64)[measured],
+            yaw_sigma_rad=np.array(sigma_rad, dtype=np.float64)[measured],
         )
 
     def yaw_at(self, times_ns: I64, rules: FixRules = FIX_RULES) -> F64:
@@ -200,10 +200,10 @@ def priors_at(
     of each scan. A scan without a prior has the pose of its neighbour, with the standard deviation inf. None if no
     scan has one."""
     priors = [prior_at(fixes, int(stamp_ns), T_antenna_lidar, rules) for stamp_ns in stamps_ns]
-    known = np.flatnonzero([prior is not None for prior in priors])
-    if not len(known):
+    with_prior = np.flatnonzero([prior is not None for prior in priors])
+    if not len(with_prior):
         return None
-    nearest = known[np.clip(np.searchsorted(known, np.arange(len(priors)), side="right") - 1, 0, None)]
+    nearest = with_prior[np.clip(np.searchsorted(with_prior, np.arange(len(priors)), side="right") - 1, 0, None)]
     poses = np.stack([np.eye(4) if prior is None else prior.T_map_lidar for prior in priors])
     sigmas = [(np.inf, np.inf) if prior is None else (prior.sigma_m, prior.sigma_rad) for prior in priors]
     return poses[nearest], np.array(sigmas)

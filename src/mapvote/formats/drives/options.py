@@ -136,20 +136,20 @@ def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
     for unit, per_ns in (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3)):
         start_ns = options.start_ns * per_ns
         if has_date(start_ns) and start_ns <= 4_102_444_800 * 10**9:  # the year 2100
-            what = f"{file}: start_ns = {options.start_ns} looks like {unit} since 1970"
-            raise MapvoteError(f"{what}: write nanoseconds, {start_ns}")
+            problem = f"{file}: start_ns = {options.start_ns} looks like {unit} since 1970"
+            raise MapvoteError(f"{problem}: write nanoseconds, {start_ns}")
     options = structs.replace(options, **{name: value for name, value in said.items() if value is not None})
     if options.time_unit not in (None, *UNITS_NS):
         raise MapvoteError(f"{file}: time_unit is {options.time_unit!r}; it must be {', '.join(UNITS_NS)}")
     return options
 
 
-def read_mount(numbers: list[float] | str, where: str) -> F64:
+def read_mount(numbers: list[float] | str, source: str) -> F64:
     """T_base_lidar (4, 4) from 12 numbers (rows of 3 x 4) or 6 (metres; roll, pitch, yaw in degrees)."""
     try:
         values = [float(v) for v in numbers.replace(",", " ").split()] if isinstance(numbers, str) else numbers
     except ValueError as error:
-        raise MapvoteError(f"{where}: T_base_lidar is not a list of numbers: {numbers!r}") from error
+        raise MapvoteError(f"{source}: T_base_lidar is not a list of numbers: {numbers!r}") from error
     T_base_lidar = np.eye(4)
     if len(values) == 12:
         T_base_lidar[:3] = np.reshape(values, (3, 4))
@@ -157,29 +157,29 @@ def read_mount(numbers: list[float] | str, where: str) -> F64:
         T_base_lidar = geometry.from_xyz_rpy(*values[:3], *np.deg2rad(values[3:]))
     if len(values) not in (6, 12) or not geometry.is_rigid(T_base_lidar):
         raise MapvoteError(
-            f"{where}: T_base_lidar must be 12 numbers (a rigid 3 x 4 matrix, row by row) or 6 "
+            f"{source}: T_base_lidar must be 12 numbers (a rigid 3 x 4 matrix, row by row) or 6 "
             f"(x, y, z in metres, roll, pitch, yaw in degrees); got {len(values)}: {values}"
         )
     return T_base_lidar
 
 
-def read_sensor(sensor: str | dict[str, Any], where: str) -> Sensor:
+def read_sensor(sensor: str | dict[str, Any], source: str) -> Sensor:
     """A sensor by name, or by a table of its fields. MapvoteError lists what is known."""
     if isinstance(sensor, str):
         if sensor not in NAMED:
             raise MapvoteError(
-                f"{where}: no sensor named {sensor!r}{did_you_mean(sensor, NAMED)}; known: {', '.join(NAMED)}; "
+                f"{source}: no sensor named {sensor!r}{did_you_mean(sensor, NAMED)}; known: {', '.join(NAMED)}; "
                 f"others as a table [sensor] in drive.toml (name, elevations_deg, azimuth_step_deg)"
             )
         return NAMED[sensor]
-    known = [f.name for f in fields(Sensor)]
+    keys = [f.name for f in fields(Sensor)]
     for key in sensor:
-        if key not in known:
-            raise MapvoteError(f"{where}: [sensor]: unknown key {key!r}{did_you_mean(key, known)}")
+        if key not in keys:
+            raise MapvoteError(f"{source}: [sensor]: unknown key {key!r}{did_you_mean(key, keys)}")
     try:
         return msgspec.convert(sensor, Sensor)
     except msgspec.ValidationError as error:
-        raise MapvoteError(f"{where}: [sensor]: {error}") from error
+        raise MapvoteError(f"{source}: [sensor]: {error}") from error
 
 
 def map_frame(options: DriveOptions) -> MapFrame | None:
@@ -198,7 +198,7 @@ def step_of(stamps_ns: I64) -> float | None:
     return float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else None
 
 
-def parse_scans(scans: str | None, n: int, where: str) -> I64:
+def parse_scans(scans: str | None, n: int, source: str) -> I64:
     """Indices (m,) of the scans that comma-separated ``START:STOP:STEP`` slices choose from n; each once, ascending."""
     if scans is None:
         return np.arange(n, dtype=np.int64)
@@ -214,20 +214,20 @@ def parse_scans(scans: str | None, n: int, where: str) -> I64:
                 chosen[slice(*parts)] = True
         except (ValueError, IndexError):
             raise MapvoteError(
-                f"{where}: --scans {piece!r} chooses nothing from {n} scans; write whole numbers as START:STOP:STEP, "
+                f"{source}: --scans {piece!r} chooses nothing from {n} scans; write whole numbers as START:STOP:STEP, "
                 f"for example 0:12,24:36"
             ) from None
     if not chosen.any():
-        raise MapvoteError(f"{where}: --scans {scans!r} chooses none of its {n} scans")
+        raise MapvoteError(f"{source}: --scans {scans!r} chooses none of its {n} scans")
     return np.flatnonzero(chosen)
 
 
-def _name(said: str | None, path: Path, what: str) -> str:
+def _name(said: str | None, path: Path, owner: str) -> str:
     """A legal name of a vehicle or a drive: what is said, else made from the file's name."""
     name = said or re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64] or "drive"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
         raise MapvoteError(
-            f"{path}: {what} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
+            f"{path}: {owner} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
         )
     return name
 
@@ -251,21 +251,21 @@ def make_drive(
 
     MapvoteError if stamps do not increase or a prior is not a rigid motion.
     """
-    where = str(path)
+    source = str(path)
     late = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if len(late):
         i = int(late[0]) + 1
         raise MapvoteError(
-            f"{where}: times are not sorted: scan {i} ({stamps_ns[i] / 1e9:.6f} s) does not come after scan {i - 1} "
+            f"{source}: times are not sorted: scan {i} ({stamps_ns[i] / 1e9:.6f} s) does not come after scan {i - 1} "
             f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; "
             f"sort the scans by time or correct {source_of_times(path)}"
         )
-    chosen = parse_scans(options.scans, len(stamps_ns), where)
+    chosen = parse_scans(options.scans, len(stamps_ns), source)
     rate_hz = options.rate_hz
-    sensor, told = _sensor_of(where, options, stamps_ns, chosen, read_scan)
+    sensor, sensor_told = _sensor_of(source, options, stamps_ns, chosen, read_scan)
     if rate_hz is not None:
         if not 0.1 <= rate_hz <= 100:
-            raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
+            raise MapvoteError(f"{source}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
         sensor = replace(sensor, rate_hz=rate_hz)
     T_map_lidar = None if T_map_lidar_prior is None else T_map_lidar_prior[chosen]
     sigmas = None if prior_sigmas is None else prior_sigmas[chosen]
@@ -285,9 +285,9 @@ def make_drive(
         prior_sigma_m=sigma_m,
         prior_sigma_deg=sigma_deg,
         prior_sigmas=sigmas,
-        T_base_lidar=mount_of(options, T_base_lidar, where),
+        T_base_lidar=mount_of(options, T_base_lidar, source),
         georeference={} if frame.is_local else frame.georeference(),
-        sensor_told=told,
+        sensor_told=sensor_told,
     )
 
 
@@ -301,7 +301,7 @@ def _usual_sigmas(options: DriveOptions, sigmas: F64 | None) -> tuple[float, flo
 
 
 def _sensor_of(
-    where: str,
+    source: str,
     options: DriveOptions,
     stamps_ns: I64,
     chosen: I64,
@@ -311,27 +311,27 @@ def _sensor_of(
     said = options.sensor
     rate_hz = options.rate_hz
     if isinstance(said, str):
-        return read_sensor(said, where), "named"
+        return read_sensor(said, source), "named"
     if isinstance(said, dict) and {"name", "elevations_deg", "azimuth_step_deg"} <= set(said):
-        return read_sensor(said, where), "drive.toml"
-    some = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
+        return read_sensor(said, source), "drive.toml"
+    sample = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
     if options.as_live and rate_hz is None and len(chosen) > 1:
-        some = chosen[: RING_RULE.scans]
-        rate_hz = rate_of_first(stamps_ns[some])
+        sample = chosen[: RING_RULE.scans]
+        rate_hz = rate_of_first(stamps_ns[sample])
     elif rate_hz is None and len(stamps_ns) > 1:
         rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
-    read = (read_scan(int(i), replace(UNKNOWN_SENSOR, rate_hz=rate_hz or 10.0)) for i in np.unique(some))
+    read = (read_scan(int(i), replace(UNKNOWN_SENSOR, rate_hz=rate_hz or 10.0)) for i in np.unique(sample))
     scans = [scan.by_lidar()[0][1] for scan in read]  # the first LiDAR's own
-    found = estimate_sensor(scans, rate_hz or 10.0)
+    estimate = estimate_sensor(scans, rate_hz or 10.0)
     if isinstance(said, dict):
-        known = msgspec.to_builtins(found.sensor)
-        return read_sensor(known | said, where), f"drive.toml, the rest {found.told}"
-    return found.sensor, found.told
+        estimated = msgspec.to_builtins(estimate.sensor)
+        return read_sensor(estimated | said, source), f"drive.toml, the rest {estimate.told}"
+    return estimate.sensor, estimate.told
 
 
-def mount_of(options: DriveOptions, own: F64 | None, where: str) -> F64:
+def mount_of(options: DriveOptions, own: F64 | None, source: str) -> F64:
     """T_base_lidar (4, 4): what the options say, else the format's own, else the identity."""
     said = options.mount or options.T_base_lidar
     if said is not None:
-        return read_mount(said, where)
+        return read_mount(said, source)
     return np.eye(4) if own is None else own

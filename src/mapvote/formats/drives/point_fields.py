@@ -77,12 +77,12 @@ class BadPoints:
             log.warning(message, self.where, self.points, self.what, len(self.seen))
 
 
-def tell_without_points(where: str, scans: int, names: Sequence[str]) -> None:
+def tell_without_points(source: str, scans: int, names: Sequence[str]) -> None:
     """A message on scans without a point, by their ``names``, that are left out. MapvoteError if all ``scans`` are."""
     if len(names) == scans:
-        raise MapvoteError(f"{where}: none of its {scans} scans holds a point; record it again")
+        raise MapvoteError(f"{source}: none of its {scans} scans holds a point; record it again")
     listed = ", ".join(names[:3]) + (", .." if len(names) > 3 else "")
-    log.warning("%s: %d of %d scans hold no point and are left out: %s", where, len(names), scans, listed)
+    log.warning("%s: %d of %d scans hold no point and are left out: %s", source, len(names), scans, listed)
 
 
 @dataclass(slots=True)
@@ -103,7 +103,7 @@ class PointReader:
         self.bad_points = BadPoints(self.where)
         self.bad_times = BadPoints(self.where, "hold no time of their scan")
 
-    def scan(self, where: str, index: int, stamp_ns: int, table: NDArray[np.void], sensor: Sensor) -> Scan:
+    def scan(self, source: str, index: int, stamp_ns: int, table: NDArray[np.void], sensor: Sensor) -> Scan:
         """A Scan of the usable points of a structured array (n,), in their order.
 
         Dropped without a message, as the format defines: rays without return (not finite or exactly at the sensor), and
@@ -111,7 +111,7 @@ class PointReader:
         none of this scan. MapvoteError if the counted ones are more than 5 %, if nothing is left, or if a field that
         should hold times does not.
         """
-        points = xyz_view(where, table).astype(np.float32, copy=False)
+        points = xyz_view(source, table).astype(np.float32, copy=False)
         names = table.dtype.names or ()
         spelled = {plain(name): name for name in reversed(names)}
         beams = ("ring", "channel", "laserid", "lasernumber", "line")  # names of a beam's number
@@ -123,15 +123,15 @@ class PointReader:
         n, measured, bad = _sort_out(points, self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied)
         if bad > POINT_RULE.most_bad_share * max(measured, 1):
             raise MapvoteError(
-                f"{where}: {bad} of {measured} points are not finite or beyond {POINT_RULE.far_m:.0f} m, more than "
+                f"{source}: {bad} of {measured} points are not finite or beyond {POINT_RULE.far_m:.0f} m, more than "
                 f"{POINT_RULE.most_bad_share:.0%}: {_likely_cause(points)}"
             )
         self.bad_points.count(index, bad)
         if n == 0:
-            raise MapvoteError(f"{where}: {_why_none_is_usable(points, near_m)}")
+            raise MapvoteError(f"{source}: {_why_none_is_usable(points, near_m)}")
         keep: slice | I32 = slice(None) if n == len(points) else usable[:n]
         # Their times; where a point has none it is dropped.
-        time_s, told = self._times(where, index, stamp_ns, table, keep, copied[:n], sensor)
+        time_s, times_told = self._times(source, index, stamp_ns, table, keep, copied[:n], sensor)
         xyz = copied[:n]
         if time_s is not None and not np.isfinite(time_s).all():
             good = np.isfinite(time_s)
@@ -142,14 +142,14 @@ class PointReader:
             stamp_ns=stamp_ns,
             points=xyz,
             time_s=time_s,
-            fields=_attributes(where, table, keep),
+            fields=_attributes(source, table, keep),
             ring=None if ring is None else _ring(table[ring][keep]),
-            times=told,
+            times=times_told,
         )
 
     def _times(
         self,
-        where: str,
+        source: str,
         index: int,
         stamp_ns: int,
         table: NDArray[np.void],
@@ -164,42 +164,44 @@ class PointReader:
         axes = {name for axis, name in known_fields(names).items() if axis in "xyz"}
         columns = {name: table[name][keep] for name in names if name not in axes and table.dtype[name].shape == ()}
         try:
-            found = find_times(columns, points, stamp_ns, self._rate_hz(sensor), self.rules)
+            field_times = find_times(columns, points, stamp_ns, self._rate_hz(sensor), self.rules)
         except MapvoteError as error:
-            raise MapvoteError(f"{where}: {error}") from error
-        if found.times is not None:
-            return self._from_field(where, index, found.times, found.surprising)
-        self._refuse_known(where, found)
+            raise MapvoteError(f"{source}: {error}") from error
+        if field_times.times is not None:
+            return self._from_field(source, index, field_times.times, field_times.surprising)
+        self._refuse_known(source, field_times)
         if self.rules.motion_compensated is False:
-            rate_hz = self._turning_rate_hz(where, sensor)
+            rate_hz = self._turning_rate_hz(source, sensor)
             if sensor.azimuth_axes != UPRIGHT:
                 points = np.ascontiguousarray(points @ np.array(sensor.azimuth_axes).T, dtype=np.float32)
             time_s = spinning_time_s(points, rate_hz, clockwise=sensor.clockwise)
             return time_s, TimesTold("azimuth", f"from the azimuths, at {rate_hz:g} Hz")
-        doubtful = bool(found.candidates) or any(refusal.varies for refusal in found.refused.values())
-        return None, TimesTold("none", no_times(found, names), doubtful, found.candidates)
+        doubtful = bool(field_times.candidates) or any(refusal.varies for refusal in field_times.refused.values())
+        return None, TimesTold("none", no_times(field_times, names), doubtful, field_times.candidates)
 
-    def _from_field(self, where: str, index: int, times: FieldTimes, surprising: bool) -> tuple[F32, TimesTold]:
+    def _from_field(self, source: str, index: int, times: FieldTimes, surprising: bool) -> tuple[F32, TimesTold]:
         lost = int(np.isnan(times.after_stamp).sum())
         if lost > POINT_RULE.most_bad_share * len(times.after_stamp):
             raise MapvoteError(
-                f"{where}: {lost} of {len(times.after_stamp)} points hold no time of this scan in the field "
+                f"{source}: {lost} of {len(times.after_stamp)} points hold no time of this scan in the field "
                 f"{times.name}, more than {POINT_RULE.most_bad_share:.0%}; record it again, leave the scan out "
                 f'with --scans, or drop the field (time_field = "none" in drive.toml)'
             )
-        self.clocks.check(where, index, times)
+        self.clocks.check(source, index, times)
         self.bad_times.count(index, lost)
         doubtful = surprising and self.rules.time_field is None
-        told = TimesTold("field", times.told, doubtful, (times.name,), other_clock=times.origin == TimeOrigin.ANOTHER)
-        return times.after_stamp.astype(np.float32), told
+        times_told = TimesTold(
+            "field", times.told, doubtful, (times.name,), other_clock=times.origin == TimeOrigin.ANOTHER
+        )
+        return times.after_stamp.astype(np.float32), times_told
 
-    def _refuse_known(self, where: str, found: FoundTimes) -> None:
+    def _refuse_known(self, source: str, field_times: FoundTimes) -> None:
         """MapvoteError if a field with the name of a time holds something else."""
-        name = known_time_field(found)
+        name = known_time_field(field_times)
         if name is not None and self.rules.time_field is None:
             raise MapvoteError(
-                f"{where}: the field {name} {found.refused[name].why}. In drive.toml name the field with the times "
-                f'(time_field = "NAME"), or "none" if there is none'
+                f"{source}: the field {name} {field_times.refused[name].why}. In drive.toml name the field with the "
+                f'times (time_field = "NAME"), or "none" if there is none'
             )
 
     def _rate_hz(self, sensor: Sensor) -> float:
@@ -208,38 +210,38 @@ class PointReader:
             return sensor.rate_hz
         return float(np.clip(1.0 / self.step_s, 0.1, 100.0))
 
-    def _turning_rate_hz(self, where: str, sensor: Sensor) -> float:
+    def _turning_rate_hz(self, source: str, sensor: Sensor) -> float:
         """The same, for times from azimuths. MapvoteError if scans may have been left out, or the sensor does not
         spin."""
         rate_hz = self._rate_hz(sensor)
         if not sensor.rings:
             raise MapvoteError(
-                f"{where}: motion_compensated = false, but no field tells the times of the points, and azimuths do "
+                f"{source}: motion_compensated = false, but no field tells the times of the points, and azimuths do "
                 f"not: the points lie on no rings. Record the times, or describe the sensor in drive.toml"
             )
         if not self.rules.rate_stated and not POINT_RULE.least_rate_hz <= rate_hz <= POINT_RULE.greatest_rate_hz:
             raise MapvoteError(
-                f"{where}: motion_compensated = false, and scans come every {1.0 / rate_hz:.3g} s: state how often the "
-                f"sensor turns (rate_hz in drive.toml), for scans may have been left out"
+                f"{source}: motion_compensated = false, and scans come every {1.0 / rate_hz:.3g} s: state how often "
+                f"the sensor turns (rate_hz in drive.toml), for scans may have been left out"
             )
         return rate_hz
 
 
-def _attributes(where: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:
+def _attributes(source: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:
     """The attributes of the kept points that the table (n,) has. MapvoteError if one holds what it cannot be."""
     names = table.dtype.names or ()
-    known = known_fields(names)
+    map_fields = known_fields(names)
     spelled = {plain(name): name for name in reversed(names)}
     attributes = {}
     for name, row in point_fields().items():
         column = next((spelled[other] for other in (plain(name), *row.spellings) if other in spelled), None)
-        column = known.get(name, column)
+        column = map_fields.get(name, column)
         if column is None:
             continue
         try:
             attributes[name] = row.in_scan(table[column][keep])
         except MapvoteError as error:
-            raise MapvoteError(f"{where}: field {column}: {error}") from error
+            raise MapvoteError(f"{source}: field {column}: {error}") from error
     return attributes
 
 
@@ -327,13 +329,13 @@ def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F
             out[start + i] = azimuth(y[i], x[i]) / turn_per_s
 
 
-def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
+def point_cloud_table(source: str, message: Any) -> NDArray[np.void]:
     """The points of a PointCloud2 or CompressedPointCloud2 as a structured array (n,), little-endian.
 
     ``message``: rosbags', rclpy's or any object with its fields. MapvoteError if its sizes contradict each other, or
     its points are compressed in a format that is not read.
     """
-    sent = decompressed(where, message) if hasattr(message, "compressed_data") else message.data
+    sent = decompressed(source, message) if hasattr(message, "compressed_data") else message.data
     raw = sent if isinstance(sent, np.ndarray) else bytes(sent)  # an array is not copied
     data = np.frombuffer(raw, dtype=np.uint8)
     row = message.width * message.point_step
@@ -341,26 +343,26 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
         data = np.ascontiguousarray(data.reshape(message.height, message.row_step)[:, :row]).ravel()
     if len(data) != message.height * row or message.point_step <= 0:
         raise MapvoteError(
-            f"{where}: {len(data)} bytes, but its header says {message.height * row}: the message is cut off"
+            f"{source}: {len(data)} bytes, but its header says {message.height * row}: the message is cut off"
         )
     order = ">" if message.is_bigendian else "<"
     try:
-        known = [f for f in message.fields if f.datatype in _POINT_FIELD]
+        numeric = [f for f in message.fields if f.datatype in _POINT_FIELD]
         record = np.dtype(
             {
-                "names": [f.name for f in known],
-                "formats": [(order + _POINT_FIELD[f.datatype], (f.count,) if f.count > 1 else ()) for f in known],
-                "offsets": [f.offset for f in known],
+                "names": [f.name for f in numeric],
+                "formats": [(order + _POINT_FIELD[f.datatype], (f.count,) if f.count > 1 else ()) for f in numeric],
+                "offsets": [f.offset for f in numeric],
                 "itemsize": message.point_step,
             }
         )
     except (ValueError, TypeError) as error:
-        raise MapvoteError(f"{where}: its fields do not fit its point_step ({error}); is the driver sound?") from error
+        raise MapvoteError(f"{source}: its fields do not fit its point_step ({error}); is the driver sound?") from error
     table = data.view(record)
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
-def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
+def livox_table(source: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
     """The points (n,) of a serialised CustomMsg of Livox's drivers: offset_time in ns since the stamp, x, y, z,
     reflectivity, tag, line.
 
@@ -375,11 +377,13 @@ def livox_table(where: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
             at = 4 + -(-(at - 4) // 8) * 8
         count = struct.unpack_from("<I", data, at + 16)[0]
     except struct.error as error:
-        raise MapvoteError(f"{where}: a CustomMsg of {len(data)} bytes has no header; copy the bag again") from error
+        raise MapvoteError(f"{source}: a CustomMsg of {len(data)} bytes has no header; copy the bag again") from error
     size = 20 if ros2 else 19
     start = at + 20
     if len(data) - start < count * size - (size - 19 if count else 0):
-        raise MapvoteError(f"{where}: {len(data)} bytes for {count} points: the message is cut off; copy the bag again")
+        raise MapvoteError(
+            f"{source}: {len(data)} bytes for {count} points: the message is cut off; copy the bag again"
+        )
     record = np.dtype(
         {
             "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
@@ -406,6 +410,6 @@ def scan_from_point_cloud2(message: Any, sensor: Sensor, reader: PointReader | N
     usable point.
     """
     stamp_ns = stamp_of(message)
-    where = f"PointCloud2 in {message.header.frame_id or 'no frame'} at {stamp_ns}"
-    table = point_cloud_table(where, message)
-    return (reader or PointReader(where)).scan(where, stamp_ns, stamp_ns, table, sensor)
+    source = f"PointCloud2 in {message.header.frame_id or 'no frame'} at {stamp_ns}"
+    table = point_cloud_table(source, message)
+    return (reader or PointReader(source)).scan(source, stamp_ns, stamp_ns, table, sensor)

@@ -116,7 +116,7 @@ class ClockDifference:
     index: int = 0
     """The first scan that told it."""
 
-    def check(self, where: str, index: int, times: FieldTimes) -> None:
+    def check(self, source: str, index: int, times: FieldTimes) -> None:
         """MapvoteError if scan ``index`` tells another difference than the first scan that told one."""
         if times.origin == TimeOrigin.SINCE_STAMP:
             return
@@ -129,7 +129,7 @@ class ClockDifference:
             change_ns = (change_ns + times.wraps_ns // 2) % times.wraps_ns - times.wraps_ns // 2
         if abs(change_ns) > JUDGEMENT.apart_s * 1e9:
             raise MapvoteError(
-                f"{where}: the times of its points are {off_ns / 1e9:.3f} s off its stamp, those of scan {self.index} "
+                f"{source}: the times of its points are {off_ns / 1e9:.3f} s off its stamp, those of scan {self.index} "
                 f"{self.off_ns / 1e9:.3f} s: stamps and points belong to different scans, or one of two clocks "
                 f'jumped. Correct the stamps, or drop the field (time_field = "none" in drive.toml)'
             )
@@ -177,9 +177,9 @@ class _Values:
     """One of them."""
     steps: F64
     """(n,) all of them less that one."""
-    known: Bool
+    is_number: Bool
     """(n,) whether it is a number, and not the one that stands for unknown."""
-    some: I64
+    sample: I64
     """Indices of those that are looked at."""
 
 
@@ -188,13 +188,13 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
     if raw.ndim != 1 or raw.dtype.kind not in "iuf":
         return Refusal("holds no numbers", varies=False)
     # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
-    known = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
-    if not known.any():
+    is_number = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
+    if not is_number.any():
         return Refusal("holds no number", varies=False)
-    reference = raw[known][int(known.sum()) // 2]
+    reference = raw[is_number][int(is_number.sum()) // 2]
     steps = _minus(raw, reference)
-    some = np.flatnonzero(known)[:: max(1, int(known.sum()) // JUDGEMENT.sample)]
-    distinct, counts = np.unique(steps[some], return_counts=True)
+    sample = np.flatnonzero(is_number)[:: max(1, int(is_number.sum()) // JUDGEMENT.sample)]
+    distinct, counts = np.unique(steps[sample], return_counts=True)
     values = len(distinct)
     if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
         return Refusal(
@@ -205,12 +205,12 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
         return Refusal(f"holds {values} different value{'s' if values > 1 else ''} in a scan", varies=False)
     # A value that many points share stands for "unknown".
     most = np.argsort(counts)[-2:]
-    if counts[most[1]] > max(JUDGEMENT.shared * len(some), JUDGEMENT.shared_ratio * counts[most[0]]):
-        known &= steps != distinct[most[1]]
-        some = some[known[some]]
-        if len(some) < JUDGEMENT.least_values:
+    if counts[most[1]] > max(JUDGEMENT.shared * len(sample), JUDGEMENT.shared_ratio * counts[most[0]]):
+        is_number &= steps != distinct[most[1]]
+        sample = sample[is_number[sample]]
+        if len(sample) < JUDGEMENT.least_values:
             return Refusal("has one value in nearly all points", varies=False)
-    return _Values(reference, steps, known, some)
+    return _Values(reference, steps, is_number, sample)
 
 
 def read_times(
@@ -230,15 +230,15 @@ def read_times(
         return values
     reference = values.reference
     steps = values.steps
-    some = values.some
+    sample = values.sample
     # The median and twice the interquartile range: what they say holds whatever a quarter of the points say.
-    median = float(np.partition(steps[some], len(some) // 2)[len(some) // 2])
-    low, high = np.quantile(steps[some], (0.25, 0.75))
+    median = float(np.partition(steps[sample], len(sample) // 2)[len(sample) // 2])
+    low, high = np.quantile(steps[sample], (0.25, 0.75))
     spread = 2.0 * float(high - low)
     if spread == 0.0:
         return Refusal("has one value in half of the points")
     # The unit, from the turn of the sensor or from the length of the scan.
-    near = some[np.abs(steps[some] - median) <= JUDGEMENT.reach * spread]
+    near = sample[np.abs(steps[sample] - median) <= JUDGEMENT.reach * spread]
     turn = _turn(steps[near], np.arctan2(points[near, 1], points[near, 0]))
     chosen = unit or _unit_of(spread, turn, rate_hz)
     if chosen is None:
@@ -246,7 +246,7 @@ def read_times(
     to_s = UNITS_NS[chosen] * 1e-9
     # Outliers, by what a scan lasts at most.
     reach = JUDGEMENT.reach * max(1.0 / rate_hz / to_s if turn is None else turn, spread)
-    good = values.known & (np.abs(steps - median) <= reach)
+    good = values.is_number & (np.abs(steps - median) <= reach)
     length_s = float(np.ptp(steps[good])) * to_s
     turns = (length_s if turn is None else turn * to_s) * rate_hz
     one_turn = abs(turns - 1.0) <= JUDGEMENT.off_rate and (turn is not None or chosen == "ms")
@@ -391,9 +391,9 @@ def find_times(
         return FoundTimes(_stated(columns, points, stamp_ns, rate_hz, rules))
     joined = _joined(columns)
     whole = {**joined, **columns}
-    known, alike = _named_like_times(columns)
+    named, alike = _named_like_times(columns)
     refused = {}
-    for name in (*joined, *known, *alike):
+    for name in (*joined, *named, *alike):
         read = read_times(name, whole[name], points, stamp_ns, rate_hz, rules.time_unit)
         if isinstance(read, FieldTimes):
             return FoundTimes(read, surprising=name in alike)
@@ -430,10 +430,10 @@ def _stated(
 def _named_like_times(columns: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """(fields whose names are known, in the order of ``TIME_FIELDS``; others whose names look like a time)."""
     spelled = {plain(name): name for name in reversed(list(columns))}
-    known = [spelled[name] for name in TIME_FIELDS if name in spelled]
+    named = [spelled[name] for name in TIME_FIELDS if name in spelled]
     like_time = r"time|stamp|(^|_)(t|dt|sec|nsec|usec|nanosec)(_|$)"
-    alike = [name for name in columns if name not in known and re.search(like_time, _lower(name))]
-    return known, alike
+    alike = [name for name in columns if name not in named and re.search(like_time, _lower(name))]
+    return named, alike
 
 
 def _lower(name: str) -> str:
@@ -470,15 +470,17 @@ def _goes_forward(after_stamp: F64) -> bool:
     return len(steps) > 0 and bool((steps >= 0.0).mean() > 0.99)
 
 
-def no_times(found: FoundTimes, fields: tuple[str, ...]) -> str:
+def no_times(field_times: FoundTimes, fields: tuple[str, ...]) -> str:
     """Why no field tells when points were measured, with the fields that are there."""
     listed = f"the fields are {', '.join(fields)}"
-    if found.refused:
-        why = "; ".join(f"{name} {refusal.why}" for name, refusal in found.refused.items())
-        return f"{why} ({listed})"
+    if field_times.refused:
+        reasons = "; ".join(f"{name} {refusal.why}" for name, refusal in field_times.refused.items())
+        return f"{reasons} ({listed})"
     return listed
 
 
-def known_time_field(found: FoundTimes) -> str | None:
+def known_time_field(field_times: FoundTimes) -> str | None:
     """The first field whose name is known and whose values differ from point to point, but are no times."""
-    return next((name for name, why in found.refused.items() if plain(name) in TIME_FIELDS and why.varies), None)
+    return next(
+        (name for name, refusal in field_times.refused.items() if plain(name) in TIME_FIELDS and refusal.varies), None
+    )

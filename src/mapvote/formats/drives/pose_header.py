@@ -61,7 +61,7 @@ def split_row(line: str) -> list[str]:
 def find_header(lines: Sequence[str]) -> Header | None:
     """The last line before the first row of numbers that names at least three columns; comments may do so. None if no
     line does."""
-    found = None
+    best = None
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
@@ -69,12 +69,12 @@ def find_header(lines: Sequence[str]) -> Header | None:
         if words and is_number(words[0]):
             break
         header = _header_of(number, line)
-        if header is None and found is not None and _are_units(words, found):
-            return _with_units(found, number, words)
-        found = header or found
+        if header is None and best is not None and _are_units(words, best):
+            return _with_units(best, number, words)
+        best = header or best
         if header is None and not line.lstrip().startswith(("#", "%", "//")):
             break
-    return found
+    return best
 
 
 _UNITLESS = ("", "-", "1", "none", "unitless")
@@ -83,8 +83,8 @@ _UNITLESS = ("", "-", "1", "none", "unitless")
 def _are_units(words: Sequence[str], header: Header) -> bool:
     """Whether a row below the header gives the units of its columns."""
     stripped = [word.strip("[]()").lower() for word in words]
-    known = all(word in _UNITS_OF_POSES or word in _UNITLESS for word in stripped)
-    return known and len(words) == len(header.names) and any(word in _UNITS_OF_POSES for word in stripped)
+    all_units = all(word in _UNITS_OF_POSES or word in _UNITLESS for word in stripped)
+    return all_units and len(words) == len(header.names) and any(word in _UNITS_OF_POSES for word in stripped)
 
 
 def _with_units(header: Header, line: int, words: Sequence[str]) -> Header:

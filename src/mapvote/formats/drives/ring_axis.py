@@ -39,8 +39,8 @@ def ring_axis(points: NDArray[np.floating], rules: RingAxisRules = RING_AXIS) ->
     """(3,) the unit vector about which the elevations of points (n, 3) lie in fewest bins; z or near it."""
     reach_m = np.linalg.norm(points, axis=1)
     far = points[reach_m > rules.far_m] / reach_m[reach_m > rules.far_m, None]
-    some = far[:: max(1, len(far) // rules.points)].astype(np.float64)
-    if len(some) < 100:
+    sample = far[:: max(1, len(far) // rules.points)].astype(np.float64)
+    if len(sample) < 100:
         return np.array([0.0, 0.0, 1.0])
     best = np.zeros(2)
     for bin_deg, steps in zip(rules.bin_deg, rules.steps, strict=True):
@@ -49,7 +49,7 @@ def ring_axis(points: NDArray[np.floating], rules: RingAxisRules = RING_AXIS) ->
         offsets = np.arange(-steps, steps + 1) * step
         tried = [best + np.array([x, y]) for x in offsets for y in offsets]
         tried = [one for one in tried if np.linalg.norm(one) < reach]
-        best = max(tried, key=lambda one: _sharpness(some, one, bin_deg))
+        best = max(tried, key=lambda one: _sharpness(sample, one, bin_deg))
     return _axis(best)
 
 

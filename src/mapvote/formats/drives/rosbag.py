@@ -34,8 +34,8 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     frame of the first topic's LiDAR, by /tf_static. MapvoteError lists the topics if there is none or a choice to make.
     """
     bag = Bag(path)
-    for what in bag.mended:
-        log.warning("%s", what)
+    for line in bag.mended:
+        log.warning("%s", line)
     topics = _choose_topics(bag, options.topic)
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other, options.mounts) for other in topics[1:])]
     own = _mount_in(options.mounts, topics[0], str(path))
@@ -46,9 +46,9 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     readers = [PointReader(f"{path} {topic}", options.time_rules, step_of(stamps_ns)) for topic in topics]
 
     def read_cloud(i: int, message: _Message, sensor: Sensor) -> Scan:
-        where = f"{path} {topics[message.topic]}, scan {i}"
-        table = _points_of(bag, topics[message.topic], message, where)
-        return readers[message.topic].scan(where, i, message.stamp_ns, table, sensor)
+        source = f"{path} {topics[message.topic]}, scan {i}"
+        table = _points_of(bag, topics[message.topic], message, source)
+        return readers[message.topic].scan(source, i, message.stamp_ns, table, sensor)
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
         if message.packets:
@@ -121,17 +121,17 @@ class _Message:
 
 def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution."""
-    found = [
+    messages = [
         message for k, topic in enumerate(topics) for message in _revolutions(bag, topic, _messages_of(bag, topic, k))
     ]
-    if not found:
+    if not messages:
         raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; {mend_of(bag.path)}")
     if len(topics) == 1:
-        return [[message] for message in found]
-    first_ns = np.array([message.stamp_ns for message in found if message.topic == 0])
+        return [[message] for message in messages]
+    first_ns = np.array([message.stamp_ns for message in messages if message.topic == 0])
     reach_ns = SWEEP_RULE.revolutions * float(np.median(np.diff(first_ns))) if len(first_ns) > 1 else 0.0
     sweeps: list[list[_Message]] = []
-    for message in sorted(found, key=lambda m: (m.stamp_ns, m.topic)):
+    for message in sorted(messages, key=lambda m: (m.stamp_ns, m.topic)):
         last = sweeps[-1] if sweeps else []
         if last and message.stamp_ns - last[0].stamp_ns <= reach_ns and message.topic not in {m.topic for m in last}:
             last.append(message)
@@ -140,13 +140,13 @@ def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
     return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
 
 
-def _points_of(bag: Bag, topic: str, message: _Message, where: str) -> NDArray[np.void]:
+def _points_of(bag: Bag, topic: str, message: _Message, source: str) -> NDArray[np.void]:
     """The points (n,) of one cloud of a topic. MapvoteError if it is not there any more, or damaged."""
     start_ns = message.received_ns
     for connection, _, data in bag.raw(topic, start=start_ns, stop=start_ns + 1):
         if bag.stamp_ns(data) == message.header_ns:
-            return bag.points(where, connection, data)
-    raise MapvoteError(f"{where}: gone; the bag changed while it was read")
+            return bag.points(source, connection, data)
+    raise MapvoteError(f"{source}: gone; the bag changed while it was read")
 
 
 def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Message]:
@@ -178,8 +178,8 @@ def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
     """The messages of the ``k``-th topic by their stamps; what is left out is counted and reported."""
     headers, received, sizes = stamps_of(bag, topic).T
     order = in_order_of_stamps(headers, received)
-    for what in order.told:
-        log.warning("%s: %s %s", bag.path, topic, what)
+    for line in order.told:
+        log.warning("%s: %s %s", bag.path, topic, line)
     rows = zip(order.stamps_ns.tolist(), order.chosen.tolist(), strict=True)
     every = [(_Message(stamp_ns, k, int(received[i]), int(headers[i])), int(sizes[i])) for stamp_ns, i in rows]
     empty = {message.stamp_ns for message, size in every if _is_empty(bag, topic, message, size)}
@@ -199,8 +199,8 @@ SMALL_CLOUD_BYTES = 1_024
 """Smaller messages may be clouds without points; larger ones are not looked at before they are read."""
 
 
-def _mount_in(mounts: Mapping[str, list[float]], topic: str, where: str) -> F64 | None:
-    return read_mount(mounts[topic], f"{where}: mounts: {topic}") if topic in mounts else None
+def _mount_in(mounts: Mapping[str, list[float]], topic: str, source: str) -> F64 | None:
+    return read_mount(mounts[topic], f"{source}: mounts: {topic}") if topic in mounts else None
 
 
 def T_first_lidar(bag: Bag, first: str, other: str, mounts: Mapping[str, list[float]]) -> F64:

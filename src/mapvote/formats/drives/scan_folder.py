@@ -78,8 +78,8 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     if table.is_file():
         times_ns = of_scans(read_times_ns(table), files, table)
         if len(times_ns) and has_date(int(times_ns[0])) and has_date(options.start_ns):
-            what = f"{table}: its times count from 1970 already, and drive.toml adds start_ns = {options.start_ns}"
-            raise MapvoteError(f"{what}: leave it out")
+            problem = f"{table}: its times count from 1970 already, and drive.toml adds start_ns = {options.start_ns}"
+            raise MapvoteError(f"{problem}: leave it out")
         return options.start_ns + times_ns
     stamps_ns = None if options.rate_hz is not None else stamps_of_names_ns(files)
     if stamps_ns is not None:
@@ -115,8 +115,8 @@ def _tell_unread(files: Sequence[Path]) -> None:
         others = [] if suffix == taken else files_like(room, f"*{suffix}")
         others = [file for file in others if file not in files]
         if others:
-            what = "%s: %d files *%s lie beside the *%s that are read; they are left out"
-            log.warning(what, room, len(others), suffix, taken)
+            problem = "%s: %d files *%s lie beside the *%s that are read; they are left out"
+            log.warning(problem, room, len(others), suffix, taken)
 
 
 def _with_points(path: Path, folder: ScanFolder) -> I64:
@@ -260,16 +260,16 @@ def cloud_scans(path: Path) -> tuple[Path, str] | None:
 
 def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
     """The drive of which :func:`cloud_scans` knows where it lies."""
-    found = cloud_scans(path)
-    assert found is not None
-    files = scan_files(*found)
+    folder_and_suffix = cloud_scans(path)
+    assert folder_and_suffix is not None
+    files = scan_files(*folder_and_suffix)
     readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
         ".ply": lambda file: np.concatenate(list(stream_ply_tables(file))),
         ".las": _read_las,
         ".laz": _read_las,
         ".npy": lambda file: _read_npy(file, options.columns),
     }
-    read = readers.get(found[1]) or layout_of(files, options).read
+    read = readers.get(folder_and_suffix[1]) or layout_of(files, options).read
     return open_scan_folder(path, options, ScanFolder(files, read_stamps(path, files, options), read))
 
 

@@ -161,11 +161,11 @@ def _tilted(sensor: Sensor, scan: Scan, rule: RingRule) -> Sensor:
     do."""
     R = level_by_axis(ring_axis(scan.points))
     level = replace(scan, points=np.ascontiguousarray(scan.points @ R.T, dtype=np.float32))
-    found = estimate_sensor([level], sensor.rate_hz, rule)
-    if not found.sensor.rings or found.on_rings < rule.sure:
+    estimate = estimate_sensor([level], sensor.rate_hz, rule)
+    if not estimate.sensor.rings or estimate.on_rings < rule.sure:
         return sensor
     forward, left, up = R.tolist()
-    return replace(found.sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
+    return replace(estimate.sensor, azimuth_axes=(tuple(forward), tuple(left), tuple(up)))
 
 
 def _angles(scan: Scan) -> tuple[F64, F64, F64]:
@@ -268,10 +268,10 @@ def _ringless(
     rows = int(np.clip(round((high - low) / step), 4, 256))
     grid = tuple(round(float(e), 3) for e in np.linspace(high, low, rows))
     sensor = Sensor("no-rings", grid, round(step, 3), rate_hz=rate_hz, rings=False, blind_sectors_deg=blind)
-    told = (
+    origin = (
         f"measured: no rings (only {share:.0%} of the points fit any); {low:.1f} to {high:.1f} deg, {wide:.0f} deg wide"
     )
-    return Estimate(sensor, share, told)
+    return Estimate(sensor, share, origin)
 
 
 def _blind_sectors(azimuth: F64, rule: RingRule) -> tuple[tuple[float, float], ...]:

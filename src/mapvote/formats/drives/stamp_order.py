@@ -50,12 +50,12 @@ class StampOrder:
 
 def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STAMP_RULES) -> StampOrder:
     """The order of messages by the stamps of their headers (n,), given in the order of their receipt (n,)."""
-    told: list[str] = []
+    lines: list[str] = []
     chosen = np.arange(len(stamps_ns))
     stamps = stamps_ns
     # Headers that nobody stamped: receipt is the only time there is.
     if len(stamps) and (stamps == 0).all():
-        told.append("has no stamps in its headers; the times of receipt are used")
+        lines.append("has no stamps in its headers; the times of receipt are used")
         stamps = received_ns
     # Stamps of a clock that was not set yet.
     if len(stamps):
@@ -63,13 +63,13 @@ def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STA
         if far.any():
             zero = int((stamps[far] == 0).sum())
             cause = f"{zero} of them 0: use_sim_time before the first /clock" if zero else "a clock that was set later"
-            told.append(f"has {int(far.sum())} stamps of another day ({cause}); these messages are left out")
+            lines.append(f"has {int(far.sum())} stamps of another day ({cause}); these messages are left out")
             chosen = chosen[~far]
     # A bag played in a loop, or two recordings joined: one pass is a drive.
     passes = _passes(stamps[chosen], rules)
     if len(passes) > 1:
         longest = max(passes, key=len)
-        told.append(
+        lines.append(
             f"has stamps that were set back {len(passes) - 1} times over the same time (a bag played in a loop, "
             f"recordings joined): the longest part is read, {len(chosen) - len(longest)} messages are left out"
         )
@@ -77,13 +77,13 @@ def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STA
     # The rest is sorted; the first of equal stamps is kept.
     back = int((np.diff(stamps[chosen]) < 0).sum())
     if back:
-        told.append(f"has stamps out of order in {back} places (use_sim_time, a driver of several threads): sorted")
+        lines.append(f"has stamps out of order in {back} places (use_sim_time, a driver of several threads): sorted")
     chosen = chosen[np.argsort(stamps[chosen], kind="stable")]
     equal = np.diff(stamps[chosen], prepend=stamps[chosen][:1] - 1) == 0
     if equal.any():
-        told.append(f"has {int(equal.sum())} stamps that an earlier message has too; these messages are left out")
+        lines.append(f"has {int(equal.sum())} stamps that an earlier message has too; these messages are left out")
     chosen = chosen[~equal]
-    return StampOrder(chosen, stamps[chosen], told)
+    return StampOrder(chosen, stamps[chosen], lines)
 
 
 def _passes(stamps_ns: I64, rules: StampRules) -> list[I64]:

@@ -90,16 +90,16 @@ def read_poses(file: Path) -> F64:
     rows = read_numbers(file, columns)
     wrong = np.flatnonzero((np.abs(rows[:, 12:] - np.eye(4)[3, : columns - 12]) > 1e-6).any(axis=1))
     if len(wrong):
-        what = f"{file}: pose {wrong[0]} does not end in 0 0 0 1"
-        raise MapvoteError(f"{what}: is each matrix written column by column? Write it row by row")
+        problem = f"{file}: pose {wrong[0]} does not end in 0 0 0 1"
+        raise MapvoteError(f"{problem}: is each matrix written column by column? Write it row by row")
     return rigid_motions(rows[:, :12], str(file))
 
 
-def rigid_motions(rows: F64, where: str) -> F64:
+def rigid_motions(rows: F64, source: str) -> F64:
     """(n, 4, 4) of rows of 12 numbers, 3 x 4 matrices row by row. MapvoteError names the first that is not rigid."""
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3] = rows.reshape(-1, 3, 4)
-    check_rigid(T, where)
+    check_rigid(T, source)
     return T
 
 
@@ -109,7 +109,7 @@ def motions_of_rpy(rows: F64) -> F64:
     return geometry.poses_at(rows[:, :3], rotations.as_matrix())
 
 
-def check_rigid(T: F64, where: str) -> None:
+def check_rigid(T: F64, source: str) -> None:
     """MapvoteError naming the first of the poses (n, 4, 4) that is not a right-handed rigid motion, and its defect."""
     for i, T_i in enumerate(T):
         if geometry.is_rigid(T_i):
@@ -122,7 +122,7 @@ def check_rigid(T: F64, where: str) -> None:
         else:
             scale = float(np.cbrt(abs(np.linalg.det(R))))
             defect = f"has a rotation that is not orthonormal (scale {scale:.3f}); each row is a 3 x 4 T_map_lidar"
-        raise MapvoteError(f"{where}: pose {i} {defect}")
+        raise MapvoteError(f"{source}: pose {i} {defect}")
 
 
 def read_calib(file: Path) -> dict[str, F64]:
@@ -194,7 +194,7 @@ class Trajectory:
     fixes: Fixes | None = None
     """The fixes that the poses were made of, where they came from a satellite receiver."""
 
-    def at(self, stamps_ns: I64, where: str, rule: TrajectoryRule = TRAJECTORY_RULE) -> F64:
+    def at(self, stamps_ns: I64, source: str, rule: TrajectoryRule = TRAJECTORY_RULE) -> F64:
         """(m, 4, 4) at constant twist between two poses. MapvoteError if it does not cover the stamps without holes."""
         t = self.times_ns
         after = np.clip(np.searchsorted(t, stamps_ns), 1, max(len(t) - 1, 1))
@@ -203,7 +203,7 @@ class Trajectory:
         if beyond or gap.max() > rule.hole_ns:
             span = f"{t[0] / 1e9:.3f} to {t[-1] / 1e9:.3f} s" if len(t) else "none"
             raise MapvoteError(
-                f"{where}: {len(t)} poses ({span}) do not cover the scans ({stamps_ns[0] / 1e9:.3f} to "
+                f"{source}: {len(t)} poses ({span}) do not cover the scans ({stamps_ns[0] / 1e9:.3f} to "
                 f"{stamps_ns[-1] / 1e9:.3f} s) without holes of {rule.hole_ns / 1e9:g} s; choose scans that they "
                 f"cover, or --prior none"
             )
@@ -224,10 +224,10 @@ def check_equal_times(file: Path, times_ns: I64, T_map: F64) -> None:
     apart_m = np.linalg.norm(T_map[:, :3, 3] - T_map[first[which], :3, 3], axis=1)
     row = int(np.argmax(np.nan_to_num(apart_m)))
     if apart_m[row] > TRAJECTORY_RULE.one_time_m:
-        what = (
+        problem = (
             f"{file}: row {row + 1} lies {apart_m[row]:.1f} m off row {int(first[which[row]]) + 1}, which has its time"
         )
-        raise MapvoteError(f"{what}: two tracks in one file, or a clock that stood? Leave one of them out")
+        raise MapvoteError(f"{problem}: two tracks in one file, or a clock that stood? Leave one of them out")
 
 
 def has_times(file: Path) -> bool:
@@ -424,14 +424,14 @@ def needed(file: Path, columns: Mapping[str, F64], *names: str) -> F64:
     missing = [name for name in names if name not in columns]
     if missing:
         raise MapvoteError(f"{file}: no column {', '.join(missing)}; the columns are {', '.join(columns)}")
-    found = np.column_stack([columns[name] for name in names])
-    bad = np.argwhere(~np.isfinite(found))
+    table = np.column_stack([columns[name] for name in names])
+    bad = np.argwhere(~np.isfinite(table))
     if len(bad):
         raise MapvoteError(f"{file}: row {bad[0, 0] + 1} has no number in column {names[bad[0, 1]]}; leave it out")
-    return found
+    return table
 
 
-def date_ns(text: str, where: str) -> int:
+def date_ns(text: str, source: str) -> int:
     """Nanoseconds since 1970 of a date and time such as KITTI's "2011-09-26 13:02:25.964389445", in UTC where it names
     no other zone. MapvoteError if it is none."""
     date = r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?"
@@ -442,7 +442,7 @@ def date_ns(text: str, where: str) -> int:
         zone = (parts[3] or "Z").replace("Z", "+00:00")
         moment = datetime.fromisoformat(parts[1] + (zone if ":" in zone else f"{zone[:3]}:{zone[3:]}"))
     except ValueError as error:
-        raise MapvoteError(f"{where}: not a date and time: {text!r}; write seconds, or 2025-10-01 13:00:00") from error
+        raise MapvoteError(f"{source}: not a date and time: {text!r}; write seconds, or 2025-10-01 13:00:00") from error
     return round(moment.timestamp()) * 10**9 + int((parts[2] or "0").ljust(9, "0")[:9])
 
 

@@ -35,9 +35,9 @@ TYPES = ("Local", "MGRS", "LocalCartesianUTM", "LocalCartesian", "TransverseMerc
 log = logging.getLogger("mapvote.formats")
 
 
-def pyproj(where: str = "world coordinates") -> ModuleType:
+def pyproj(needed_by: str = "world coordinates") -> ModuleType:
     """The module; MapvoteError naming the extra if it is not installed."""
-    return require("pyproj", "geo", where)
+    return require("pyproj", "geo", needed_by)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,24 +203,24 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
         raise MapvoteError("a prior from GNSS needs a place for every row; leave out the others, or --prior none")
     farthest = float(np.abs(lonlat[:, 1]).max())
     if farthest > 90.0:
-        what = f"a prior from GNSS has a latitude of {farthest:.10g} degrees"
+        problem = f"a prior from GNSS has a latitude of {farthest:.10g} degrees"
         swapped = (np.abs(lonlat[:, 0]) <= 90.0).all() and farthest <= 180.0
         mend = "are latitude and longitude swapped?" if swapped else "write decimal degrees, between -90 and 90"
-        raise MapvoteError(f"{what}: {mend}")
+        raise MapvoteError(f"{problem}: {mend}")
     if (np.abs(lonlat[:, :2]) <= [np.pi, np.pi / 2.0]).all():
         lon, lat = lonlat[0, :2].tolist()
-        what = f"a prior from GNSS lies in the sea at latitude {lat:.6f}, longitude {lon:.6f}"
-        raise MapvoteError(f"{what}: are they radians, or no fixes at all? Write degrees, or --prior none")
+        problem = f"a prior from GNSS lies in the sea at latitude {lat:.6f}, longitude {lon:.6f}"
+        raise MapvoteError(f"{problem}: are they radians, or no fixes at all? Write degrees, or --prior none")
     if frame is None or frame.is_local:
         lon, lat, height = (float(v) for v in lonlat[0])
-        what = "no place on Earth is known for the map: a plane at the first fix (origin = [%.7f, %.7f, %.2f])"
-        log.warning(what, lat, lon, height)
+        problem = "no place on Earth is known for the map: a plane at the first fix (origin = [%.7f, %.7f, %.2f])"
+        log.warning(problem, lat, lon, height)
         frame = enu_frame(lat, lon, height)
     R_enu_base = scipy.spatial.transform.Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
     return poses_at(frame.from_lonlat(lonlat), frame.axes_at(lonlat) @ R_enu_base), frame
 
 
-def sound_fixes(where: str, lonlat: F64, status: F64 | None = None) -> tuple[Bool, F64]:
+def sound_fixes(source: str, lonlat: F64, status: F64 | None = None) -> tuple[Bool, F64]:
     """(which of the fixes (n, 3), longitude, latitude in degrees, height in metres, are ones (n,), these (m, 3)).
 
     Left out and counted: no fix by its ``status`` (n,), not a number, and (0, 0), which receivers send before their
@@ -232,15 +232,17 @@ def sound_fixes(where: str, lonlat: F64, status: F64 | None = None) -> tuple[Boo
     no_fix = np.zeros(len(lonlat), dtype=np.bool_) if status is None else status < 0
     keep = finite & ~at_zero & ~no_fix
     if not keep.all():
-        what = "%s: %d of %d fixes are left out: %d by their status, %d at latitude 0, longitude 0, %d without a place"
-        log.warning(what, where, (~keep).sum(), len(keep), no_fix.sum(), (at_zero & ~no_fix).sum(), (~finite).sum())
+        problem = (
+            "%s: %d of %d fixes are left out: %d by their status, %d at latitude 0, longitude 0, %d without a place"
+        )
+        log.warning(problem, source, (~keep).sum(), len(keep), no_fix.sum(), (at_zero & ~no_fix).sum(), (~finite).sum())
     if not keep.any():
-        raise MapvoteError(f"{where}: none of its {len(keep)} fixes is one; choose another prior, or --prior none")
+        raise MapvoteError(f"{source}: none of its {len(keep)} fixes is one; choose another prior, or --prior none")
     place = np.array(lonlat[keep], dtype=np.float64)
     high = np.isfinite(place[:, 2])
     if not high.all():
         how = "interpolated" if high.any() else "taken as 0 m: only the map can tell them"
-        log.warning("%s: %d of %d fixes have no altitude; theirs are %s", where, (~high).sum(), len(high), how)
+        log.warning("%s: %d of %d fixes have no altitude; theirs are %s", source, (~high).sum(), len(high), how)
         at = np.arange(len(place))
         place[:, 2] = np.interp(at, at[high], place[high, 2]) if high.any() else 0.0
     return keep, place
@@ -293,20 +295,20 @@ def frame_of(georeference: Mapping[str, str]) -> MapFrame:
     return MapFrame(crs, (offset[0], offset[1], offset[2]), georeference.get("heights", ""), projector)
 
 
-def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
+def frame_of_projector(text: str, source: str = PROJECTOR) -> MapFrame:
     """The frame that a map_projector_info.yaml describes; MapvoteError says what is missing or unknown."""
-    about = parse_yaml(text, where)
+    about = parse_yaml(text, source)
     try:
         kind = str(about["projector_type"])
     except (TypeError, KeyError) as error:
-        raise MapvoteError(f"{where}: no projector_type in it; one of {', '.join(TYPES)}") from error
+        raise MapvoteError(f"{source}: no projector_type in it; one of {', '.join(TYPES)}") from error
     heights = {"WGS84": "above the WGS 84 ellipsoid", "EGM2008": "EGM2008 height"}.get(about.get("vertical_datum"), "")
     if kind.lower() == LOCAL:
         return MapFrame(LOCAL, heights=heights, projector=text)
     if kind == "MGRS":
-        return replace(_mgrs_frame(str(about.get("mgrs_grid", "")), where), heights=heights, projector=text)
+        return replace(_mgrs_frame(str(about.get("mgrs_grid", "")), source), heights=heights, projector=text)
     if kind not in TYPES:
-        raise MapvoteError(f"{where}: unknown projector_type {kind!r}; one of {', '.join(TYPES)}")
+        raise MapvoteError(f"{source}: unknown projector_type {kind!r}; one of {', '.join(TYPES)}")
     try:
         origin = about["map_origin"]
         latitude = float(origin["latitude"])
@@ -314,9 +316,9 @@ def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
         altitude = float(origin.get("altitude") or 0.0)
         scale = float(about.get("scale_factor", 0.9996))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise MapvoteError(f"{where}: {kind} needs map_origin with latitude and longitude in degrees") from error
+        raise MapvoteError(f"{source}: {kind} needs map_origin with latitude and longitude in degrees") from error
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise MapvoteError(f"{where}: map_origin {latitude}, {longitude} is no latitude and longitude in degrees")
+        raise MapvoteError(f"{source}: map_origin {latitude}, {longitude} is no latitude and longitude in degrees")
     if kind == "LocalCartesian":
         return replace(enu_frame(latitude, longitude, altitude), projector=text)
     if kind == "TransverseMercator":
@@ -327,14 +329,14 @@ def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:
     return MapFrame(utm, (float(corner[0]), float(corner[1]), altitude), heights, text)
 
 
-def _mgrs_frame(grid: str, where: str = PROJECTOR) -> MapFrame:
+def _mgrs_frame(grid: str, source: str = PROJECTOR) -> MapFrame:
     """Metres from the lower-left corner of a 100 km square such as 54SUE."""
     try:
-        zone, hemisphere, easting, northing = require("mgrs", "geo", where).MGRS().MGRSToUTM(grid)
+        zone, hemisphere, easting, northing = require("mgrs", "geo", source).MGRS().MGRSToUTM(grid)
     except MapvoteError:
         raise
     except Exception as error:  # the library raises its own, of several kinds
-        raise MapvoteError(f"{where}: {grid!r} is no MGRS grid such as 54SUE") from error
+        raise MapvoteError(f"{source}: {grid!r} is no MGRS grid such as 54SUE") from error
     side_m = 100_000.0
     x0, y0 = (float(np.floor(v / side_m) * side_m) for v in (easting, northing))
     return MapFrame(f"EPSG:{(32600 if hemisphere == 'N' else 32700) + int(zone)}", (x0, y0, 0.0))

@@ -44,7 +44,7 @@ EARTH_SIZE = EarthSize()
 
 
 def settle(
-    where: str, stated: MapFrame, wanted: MapFrame | None, first: NDArray[np.floating], *, sure: bool = False
+    source: str, stated: MapFrame, wanted: MapFrame | None, first: NDArray[np.floating], *, sure: bool = False
 ) -> tuple[MapFrame, Convert]:
     """(frame of the map, how the file's points get there).
 
@@ -57,13 +57,13 @@ def settle(
     if stated.refusal:
         raise MapvoteError(stated.refusal)
     if wanted is not None and not stated.is_local:
-        wanted = _in_metres(where, wanted)
+        wanted = _in_metres(source, wanted)
     if stated.is_local:
         if wanted is None or wanted.is_local:
             if not sure:
-                _check_no_degrees(where, first)
+                _check_no_degrees(source, first)
             return stated, lambda points: points
-        log.warning("%s: names no coordinate system: the requested one is assumed", where)
+        log.warning("%s: names no coordinate system: the requested one is assumed", source)
         stated = replace(wanted, heights=stated.heights or wanted.heights)
         if not any(wanted.offset_m):
             wanted = None
@@ -75,14 +75,14 @@ def settle(
     heights = stated.heights or own
     if horizontal.is_geographic or horizontal.is_geocentric:
         if wanted is None or wanted.is_local:
-            raise MapvoteError(_degrees(where, horizontal, first))
-        return _from_degrees(where, horizontal, replace(wanted, heights=wanted.heights or heights))
-    to_m, z_to_m = _units_of_file(where, crs)
+            raise MapvoteError(_degrees(source, horizontal, first))
+        return _from_degrees(source, horizontal, replace(wanted, heights=wanted.heights or heights))
+    to_m, z_to_m = _units_of_file(source, crs)
     metric = replace(stated, crs=_short(stated.crs), heights=heights)
     if (to_m, z_to_m) != (1.0, 1.0):
         in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
         metric = replace(metric, crs=_short(in_metres.to_wkt()))
-        log.warning("%s: x, y in units of %.10g m, z of %.10g m: converted to metres", where, to_m, z_to_m)
+        log.warning("%s: x, y in units of %.10g m, z of %.10g m: converted to metres", source, to_m, z_to_m)
     scale = np.array([to_m, to_m, z_to_m])
     frame, move = _moved(metric, wanted)
     if (scale == 1.0).all():
@@ -91,7 +91,7 @@ def settle(
 
 
 def settle_out(
-    where: str, stated: MapFrame, wanted: MapFrame | None, points: NDArray[np.floating]
+    source: str, stated: MapFrame, wanted: MapFrame | None, points: NDArray[np.floating]
 ) -> tuple[MapFrame, Convert]:
     """(frame of the file, how a map's points get there): as :func:`settle`, the other way.
 
@@ -100,16 +100,16 @@ def settle_out(
     MapvoteError if a map whose place is unknown is wanted in degrees, or for a geocentric system.
     """
     if wanted is None or wanted.is_local or wanted.crs.startswith(ENU):
-        return settle(where, stated, wanted, points, sure=True)
+        return settle(source, stated, wanted, points, sure=True)
     crs = read_crs(wanted.crs)
     if crs.is_geocentric or (stated.is_local and crs.is_geographic):
         cause = "geocentric metres have no heights" if crs.is_geocentric else "the map's place on Earth is unknown"
-        raise MapvoteError(f"{where}: {cause}; give --crs a projection in metres or feet, such as EPSG:32654")
+        raise MapvoteError(f"{source}: {cause}; give --crs a projection in metres or feet, such as EPSG:32654")
     to_m, z_to_m = _units(crs)
     if crs.is_geographic:
         z_to_m = z_to_m if _up(crs) else 1.0
     if stated.is_local:
-        log.warning("%s: the map names no coordinate system: the requested one is assumed", where)
+        log.warning("%s: the map names no coordinate system: the requested one is assumed", source)
         scale = np.array([to_m, to_m, z_to_m])
         return wanted, lambda points: points.astype(np.float64) / scale
     frame, move = _moved(stated, wanted)
@@ -118,20 +118,20 @@ def settle_out(
     return frame, lambda points: move(points) / np.array([1.0, 1.0, z_to_m])
 
 
-def _in_metres(where: str, wanted: MapFrame) -> MapFrame:
+def _in_metres(source: str, wanted: MapFrame) -> MapFrame:
     """A requested frame of a map, its projection in metres; MapvoteError for degrees."""
     if wanted.is_local or wanted.crs.startswith(ENU):
         return wanted
     crs = read_crs(wanted.crs)
     if crs.is_geographic or crs.is_geocentric:
         raise MapvoteError(
-            f"{where}: a map needs metres, but {crs.name} is none of a projection; give --crs EPSG:326zz"
+            f"{source}: a map needs metres, but {crs.name} is none of a projection; give --crs EPSG:326zz"
         )
     if _units(crs) == (1.0, 1.0):
         return wanted
     horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
     in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
-    log.warning("%s: a map is in metres: %s is taken so", where, horizontal.name)
+    log.warning("%s: a map is in metres: %s is taken so", source, horizontal.name)
     return replace(wanted, crs=_short(in_metres.to_wkt()))
 
 
@@ -146,34 +146,34 @@ def _moved(stated: MapFrame, wanted: MapFrame | None) -> tuple[MapFrame, Convert
     return wanted, lambda points: wanted.from_lonlat(stated.to_lonlat(points))
 
 
-def _from_degrees(where: str, crs: Any, wanted: MapFrame) -> tuple[MapFrame, Convert]:
+def _from_degrees(source: str, crs: Any, wanted: MapFrame) -> tuple[MapFrame, Convert]:
     """From the degrees (or geocentric metres) of a file; x is the longitude."""
-    module = pyproj(where)
+    module = pyproj(source)
     to_wgs84 = module.Transformer.from_crs(crs, "EPSG:4979" if crs.is_geocentric else "EPSG:4326", always_xy=True)
 
     def convert(points: NDArray[np.floating]) -> F64:
         columns = points.astype(np.float64).T
         if not crs.is_geocentric and not (np.abs(columns[1]) <= 90.0).all():
-            raise MapvoteError(f"{where}: latitudes beyond 90 degrees; are x and y exchanged?")
+            raise MapvoteError(f"{source}: latitudes beyond 90 degrees; are x and y exchanged?")
         moved = to_wgs84.transform(*columns) if crs.is_geocentric else (*to_wgs84.transform(*columns[:2]), columns[2])
         return wanted.from_lonlat(np.column_stack(moved))
 
     return wanted, convert
 
 
-def _degrees(where: str, crs: Any, first: NDArray[np.floating]) -> str:
+def _degrees(source: str, crs: Any, first: NDArray[np.floating]) -> str:
     longitude, latitude = (float(v) for v in first[0, :2]) if len(first) else (0.0, 0.0)
     zone = "EPSG:n"
     if crs.is_geographic and abs(longitude) <= 180.0 and abs(latitude) <= 90.0:
         zone = utm_of(longitude, latitude)
     unit = "degrees" if crs.is_geographic else "metres from the Earth's centre"
     return (
-        f"{where}: coordinates are {unit} ({crs.name}), and a map needs metres; project them: "
-        f"mapvote import '{where}' MAP --crs {zone}"
+        f"{source}: coordinates are {unit} ({crs.name}), and a map needs metres; project them: "
+        f"mapvote import '{source}' MAP --crs {zone}"
     )
 
 
-def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
+def _check_no_degrees(source: str, points: NDArray[np.floating]) -> None:
     """Refuse what can only be longitudes and latitudes: many points in a plate of degrees, far higher than wide."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
@@ -186,16 +186,16 @@ def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
         and float(np.abs(points[:, 2]).min()) > EARTH_SIZE.highest_m
     ):
         raise MapvoteError(
-            f"{where}: the points lie {radius_m / 1000.0:.0f} km from (0, 0, 0): they look like metres from the "
-            f"Earth's centre; if so: mapvote import '{where}' MAP --from-crs EPSG:4978 --crs EPSG:n; "
+            f"{source}: the points lie {radius_m / 1000.0:.0f} km from (0, 0, 0): they look like metres from the "
+            f"Earth's centre; if so: mapvote import '{source}' MAP --from-crs EPSG:4978 --crs EPSG:n; "
             "if not: --from-crs local"
         )
     wide = float((high - low)[:2].max())
     on_earth = np.abs([low[0], high[0]]).max() <= 180.0 and np.abs([low[1], high[1]]).max() <= 90.0
     if on_earth and 0.0 < wide < 0.5 and float(high[2] - low[2]) > 4.0 * wide:
         raise MapvoteError(
-            f"{where}: {wide:.4f} wide and {high[2] - low[2]:.1f} high: x and y look like degrees; if so: "
-            f"mapvote import '{where}' MAP --from-crs EPSG:4326 --crs {utm_of(float(low[0]), float(low[1]))}; "
+            f"{source}: {wide:.4f} wide and {high[2] - low[2]:.1f} high: x and y look like degrees; if so: "
+            f"mapvote import '{source}' MAP --from-crs EPSG:4326 --crs {utm_of(float(low[0]), float(low[1]))}; "
             f"if these are metres: --from-crs local"
         )
 
@@ -213,14 +213,14 @@ def _up(crs: Any) -> list[Any]:
     return [a for a in crs.axis_info if a.direction.lower() in ("up", "down")]
 
 
-def _units_of_file(where: str, crs: Any) -> tuple[float, float]:
+def _units_of_file(source: str, crs: Any) -> tuple[float, float]:
     """:func:`_units`, with a message where the unit of heights is assumed. MapvoteError if z counts downwards."""
     up = _up(crs)
     if up and up[0].direction.lower() == "down":
-        raise MapvoteError(f"{where}: z counts downwards ({crs.name}); negate z first")
+        raise MapvoteError(f"{source}: z counts downwards ({crs.name}); negate z first")
     to_m, z_to_m = _units(crs)
     if not up and to_m != 1.0:
-        log.warning("%s: names no unit for heights: taken to be that of x and y", where)
+        log.warning("%s: names no unit for heights: taken to be that of x and y", source)
     return to_m, z_to_m
 
 
@@ -268,8 +268,8 @@ def _with_unit(node: Any, unit: Any) -> Any:
 
 def _short(crs: str) -> str:
     """ "EPSG:n" for a CRS that is exactly that one, else its WKT."""
-    known = read_crs(crs)
-    code = known.to_epsg(min_confidence=100)
-    if code is not None and known.equals(read_crs(f"EPSG:{code}"), ignore_axis_order=True):
+    own = read_crs(crs)
+    code = own.to_epsg(min_confidence=100)
+    if code is not None and own.equals(read_crs(f"EPSG:{code}"), ignore_axis_order=True):
         return f"EPSG:{code}"
-    return str(known.to_wkt())
+    return str(own.to_wkt())

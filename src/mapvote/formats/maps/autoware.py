@@ -88,8 +88,8 @@ def _warn_of_unlisted(path: Path, listed: set[str]) -> None:
     lower = {name.lower() for name in listed}
     unlisted = sorted(name for name in there if name.lower() not in lower and not (kept and FOLLOWED.fullmatch(name)))
     if unlisted:
-        what = "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out"
-        log.warning(what, path, METADATA, len(unlisted), unlisted[0])
+        problem = "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out"
+        log.warning(problem, path, METADATA, len(unlisted), unlisted[0])
 
 
 def is_autoware_default(path: Path) -> bool:
@@ -129,16 +129,16 @@ def write_autoware(path: Path, cloud: Cloud | CloudPieces) -> None:
         (folder / PROJECTOR).write_text(projector)
 
 
-def _squares(where: str, cloud: Cloud | CloudPieces) -> Iterator[tuple[tuple[int, int], Cloud]]:
+def _squares(source: str, cloud: Cloud | CloudPieces) -> Iterator[tuple[tuple[int, int], Cloud]]:
     """A cloud cut along whole multiples of 20 m: (corner, float32 points and their intensity), by x, y.
 
-    ``where`` is the place that they go to. MapvoteError if there are no points.
+    ``source``: the folder that they go to. MapvoteError if there are no points.
     """
     clouds = CloudPieces.of(cloud)
     if not clouds.n:
-        raise MapvoteError(f"{where}: no points to write")
-    warn_of_float32(where, clouds)
-    spill = Spill(folder_beside(Path(where)))
+        raise MapvoteError(f"{source}: no points to write")
+    warn_of_float32(source, clouds)
+    spill = Spill(folder_beside(Path(source)))
     blocks: dict[tuple[int, int], list[int]] = {}
     for piece in clouds:
         stored = piece.points.astype(np.float32)
@@ -215,9 +215,9 @@ def check_followed(folder: Path, map_id: str = "") -> None:
         )
 
 
-def names_of(where: str, cloud: Cloud | CloudPieces) -> list[str]:
-    """The files that a cloud's tiles would be; ``where`` is for messages."""
-    return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in _squares(where, cloud)]
+def names_of(source: str, cloud: Cloud | CloudPieces) -> list[str]:
+    """The files that a cloud's tiles would be; ``source``: the name of the cloud in messages."""
+    return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in _squares(source, cloud)]
 
 
 def lay_version(
@@ -226,11 +226,11 @@ def lay_version(
     version: int,
     *,
     keep: int = 3,
-    known: Collection[str] = (),
+    present: Collection[str] = (),
     map_id: str = "",
 ) -> Change:
     """Show ``cloud`` (map metres, in a frame that Autoware supports) in ``folder``; only tiles that it lacks are
-    written, and of those none that is ``known`` where the folder goes.
+    written, and of those none that is ``present`` where the folder goes.
 
     Tiles of the ``keep`` versions before stay. At every moment the metadata there names only whole tiles. MapvoteError
     if the folder holds a map of somebody else, or another map than ``map_id``.
@@ -245,7 +245,7 @@ def lay_version(
     for (x, y), tile in _squares(str(folder), cloud):
         name = f"{x}_{y}_{_hash8(tile)}.pcd"
         corners[name] = x, y
-        if name not in known and not (tiles / name).is_file():
+        if name not in present and not (tiles / name).is_file():
             with whole_file(tiles / name) as partial:
                 save_pcd(partial, tile)
             written += 1

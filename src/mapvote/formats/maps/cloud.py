@@ -102,8 +102,8 @@ class CloudPieces:
             gps_times = gps_times or piece.gps_times
             latest_s = max(latest_s, float(np.nanmax(piece.fields.get("gps_time", np.zeros(1)), initial=0.0)))
         corners = np.array([low, high]) if n else np.zeros((2, 3))
-        told = gps_times or ("adjusted standard" if latest_s > 604_800.0 else "week")
-        return cls(pieces, frame, n, corners, kinds, brightness, told)
+        times = gps_times or ("adjusted standard" if latest_s > 604_800.0 else "week")
+        return cls(pieces, frame, n, corners, kinds, brightness, times)
 
     def __iter__(self) -> Iterator[Cloud]:
         """The pieces, each with all fields."""
@@ -129,18 +129,18 @@ def joined(pieces: Iterable[Cloud]) -> Cloud:
     )
 
 
-def cloud_of_table(where: str, table: NDArray[np.void]) -> Cloud:
+def cloud_of_table(source: str, table: NDArray[np.void]) -> Cloud:
     """The points of a structured array with x, y, z, and of its fields what a map keeps: numbers under LAS's names,
     PCL's packed rgb taken apart. MapvoteError as :func:`xyz`."""
     names = table.dtype.names or ()
-    known = {ours: name for ours, name in known_fields(names).items() if ours not in ("x", "y", "z")}
-    out = {ours: np.ascontiguousarray(table[name]) for ours, name in known.items()}
+    map_fields = {ours: name for ours, name in known_fields(names).items() if ours not in ("x", "y", "z")}
+    out = {ours: np.ascontiguousarray(table[name]) for ours, name in map_fields.items()}
     for packed in ("rgb", "rgba"):
         if packed in names and "red" not in out and table.dtype[packed].itemsize == 4:
             word = np.ascontiguousarray(table[packed]).view(np.uint32)
             out |= {c: ((word >> s) & 255).astype(np.uint8) for c, s in (("red", 16), ("green", 8), ("blue", 0))}
     kept = {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
-    return Cloud(xyz(where, table), other_fields(names), fields=kept)
+    return Cloud(xyz(source, table), other_fields(names), fields=kept)
 
 
 def table_of(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArray[np.void]:
@@ -151,35 +151,35 @@ def table_of(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArra
     return table
 
 
-def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
+def xyz(source: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     """(n, 3) of a structured array's x, y, z in their own precision; MapvoteError if one is missing."""
-    return np.ascontiguousarray(xyz_view(where, table))
+    return np.ascontiguousarray(xyz_view(source, table))
 
 
-def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
+def xyz_view(source: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     """The result of :func:`xyz`, as a view of ``table`` where its coordinates are adjacent float32, as in nearly every
     LiDAR's clouds."""
     names = table.dtype.names or ()
-    found = known_fields(names)
-    missing = [axis for axis in "xyz" if axis not in found]
+    columns = known_fields(names)
+    missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
-        raise MapvoteError(f"{where}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
-    x, y, z = (table.dtype.fields[found[axis]] for axis in "xyz")  # type: ignore[index]
+        raise MapvoteError(f"{source}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
+    x, y, z = (table.dtype.fields[columns[axis]] for axis in "xyz")  # type: ignore[index]
     single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
     if single and table.flags.c_contiguous and len(table):
         return np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
     short = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)  # float32 holds them exactly
-    exact = any(table.dtype[found[axis]] not in short for axis in "xyz")
+    exact = any(table.dtype[columns[axis]] not in short for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
     for column, axis in enumerate("xyz"):
-        out[:, column] = table[found[axis]]
+        out[:, column] = table[columns[axis]]
     return out
 
 
-def warn_of_float32(where: str, cloud: CloudPieces) -> None:
+def warn_of_float32(source: str, cloud: CloudPieces) -> None:
     """Warn when float32 would move points by more than half a millimetre (coordinates beyond 8 km)."""
     peak_m = float(np.abs(cloud.corners).max())
     loss_m = 0.5 * float(np.spacing(np.float32(peak_m)))
     if loss_m > 0.0005:
-        what = "%s: coordinates of %.0f m as float32 are rounded by up to %.1f mm; subtract an offset, or use LAS"
-        log.warning(what, where, peak_m, 1000 * loss_m)
+        problem = "%s: coordinates of %.0f m as float32 are rounded by up to %.1f mm; subtract an offset, or use LAS"
+        log.warning(problem, source, peak_m, 1000 * loss_m)

@@ -57,17 +57,17 @@ def known_fields(names: Sequence[str]) -> dict[str, str]:
     by_spelling: dict[str, str] = {}
     for name in names:
         by_spelling.setdefault(plain(name), name)
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     brought = {name: (plain(name), *row.spellings) for name, row in point_fields().items()}
     for ours, spellings in {**brought, **_SPELLINGS}.items():
         there = [by_spelling[spelling] for spelling in spellings if spelling in by_spelling]
         if ours in names:
-            found[ours] = ours
+            columns[ours] = ours
         elif there:
-            found[ours] = there[0]
-    if not any(colour in found for colour in COLOURS) and {"r", "g", "b"} <= by_spelling.keys():
-        found |= {colour: by_spelling[colour[0]] for colour in COLOURS}
-    return found
+            columns[ours] = there[0]
+    if not any(colour in columns for colour in COLOURS) and {"r", "g", "b"} <= by_spelling.keys():
+        columns |= {colour: by_spelling[colour[0]] for colour in COLOURS}
+    return columns
 
 
 def other_fields(names: Sequence[str]) -> tuple[str, ...]:

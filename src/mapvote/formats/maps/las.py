@@ -54,7 +54,7 @@ _USER_DEFINED = 32767
 _MODEL_GEOGRAPHIC = 2
 
 
-def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
+def frame_of_keys(source: str, keys: Mapping[int, int]) -> MapFrame:
     """The frame that the keys name; local if they name none, with a warning if they describe one of their own.
 
     MapvoteError if a code is none that pyproj knows.
@@ -64,7 +64,7 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
         code = keys.get(GeoKey.GEODETIC) or 0
     if code == _USER_DEFINED or (keys.get(GeoKey.PROJECTED) == _USER_DEFINED):
         raise MapvoteError(
-            f"{where}: describes a coordinate system of its own in GeoTIFF keys, without a code; name the one it "
+            f"{source}: describes a coordinate system of its own in GeoTIFF keys, without a code; name the one it "
             f"means with --from-crs EPSG:n, or --from-crs local for metres from somewhere"
         )
     if not code:
@@ -77,7 +77,7 @@ def frame_of_keys(where: str, keys: Mapping[int, int]) -> MapFrame:
         except MapvoteError:
             log.warning("heights: EPSG:%d is no vertical coordinate system; ignored", vertical)
     plane, up = (METRES.get(keys.get(key, 0)) for key in (GeoKey.UNIT, GeoKey.VERTICAL_UNIT))
-    return MapFrame(with_units(_known(where, text), plane, up))
+    return MapFrame(with_units(_known(source, text), plane, up))
 
 
 _DECODER = msgspec.json.Decoder(Head)
@@ -129,9 +129,9 @@ def stream_las_tiles(path: Path) -> Iterator[Cloud]:
 
 def _only(piece: Cloud, brought: Sequence[str]) -> Cloud:
     """The piece with LAS's own fields, and of those that the file defines itself the ones that are ``brought``."""
-    known = known_fields(list(piece.fields))
+    map_fields = known_fields(list(piece.fields))
     fields = {name: column for name, column in piece.fields.items() if name in FIELDS}
-    own = {name: piece.fields[known[name]] for name in brought if name in known}
+    own = {name: piece.fields[map_fields[name]] for name in brought if name in map_fields}
     return replace(piece, fields=fields | own)
 
 
@@ -188,19 +188,19 @@ def beside_its_box(path: Path, low: F64, high: F64) -> str:
     )
 
 
-def _frame(where: str, head: Head) -> MapFrame:
+def _frame(source: str, head: Head) -> MapFrame:
     """The frame that the file names; one that only says what is wrong where nobody can make it out."""
     try:
-        return MapFrame(_known(where, head.wkt)) if head.wkt else frame_of_keys(where, head.geo_keys)
+        return MapFrame(_known(source, head.wkt)) if head.wkt else frame_of_keys(source, head.geo_keys)
     except MapvoteError as error:
         return MapFrame(refusal=str(error))
 
 
-def _known(where: str, crs: str) -> str:
+def _known(source: str, crs: str) -> str:
     try:
         read_crs(crs)
     except MapvoteError as error:
-        raise MapvoteError(f"{where}: {error}; say what it is with --from-crs") from error
+        raise MapvoteError(f"{source}: {error}; say what it is with --from-crs") from error
     return crs
 
 

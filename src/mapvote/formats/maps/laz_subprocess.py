@@ -68,8 +68,8 @@ class Head(msgspec.Struct):
     @property
     def fields(self) -> dict[str, str]:
         """The columns that follow x, y, z in every piece, with their types."""
-        known = {name: kind for name, kind in FIELDS.items() if name in self.dimensions or name == "las_flags"}
-        return known | self.extra
+        own = {name: kind for name, kind in FIELDS.items() if name in self.dimensions or name == "las_flags"}
+        return own | self.extra
 
 
 Piece = tuple[NDArray[np.float64], dict[str, NDArray[Any]]]

@@ -142,8 +142,8 @@ def _whole(path: Path, index: TileIndex) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        what = f"{error.filename}: {error.strerror}, but the manifest lists it; copy the map again"
-        raise MapvoteError(what) from error
+        problem = f"{error.filename}: {error.strerror}, but the manifest lists it; copy the map again"
+        raise MapvoteError(problem) from error
     except MapvoteError as error:
         raise MapvoteError(f"{path}: tile {tile_key(index)}: {error}; copy the map again") from error
 

@@ -131,8 +131,8 @@ def stream_pcd(path: Path, sizes: ReadSizes = READ_SIZES) -> Iterator[Cloud]:
                 cloud = cloud.where(measured)
             yield cloud
     if empty_rays:
-        what = "%s: an image of %d by %d rays; %d of them without return are left out"
-        log.warning(what, path, header.width, header.height, empty_rays)
+        problem = "%s: an image of %d by %d rays; %d of them without return are left out"
+        log.warning(problem, path, header.width, header.height, empty_rays)
 
 
 def _measured(points: NDArray[np.floating]) -> Bool:
@@ -204,7 +204,7 @@ def _elements(dtype: np.dtype[np.void]) -> int:
     return sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
 
 
-def _parsed(where: str, lines: list[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+def _parsed(source: str, lines: list[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
     """Lines of numbers as a table. Where a whole number is written "1.0" or "nan" it is read as PCL does: 1, 0.
     MapvoteError names the first line that has too few or too many numbers, or something else."""
     try:
@@ -213,7 +213,7 @@ def _parsed(where: str, lines: list[bytes], dtype: np.dtype[np.void]) -> NDArray
         pass
     width = _elements(dtype)
     rows = np.empty((len(lines), _elements(dtype)))
-    path, _, start = where.rpartition(":")
+    path, _, start = source.rpartition(":")
     for number, line in enumerate(lines):
         words = line.split()
         try:

@@ -93,12 +93,12 @@ def _layout(fields: Sequence[PcdField]) -> np.dtype[np.void]:
     return np.dtype(table)
 
 
-def read_header(where: str, stream: BinaryIO) -> PcdHeader:
+def read_header(source: str, stream: BinaryIO) -> PcdHeader:
     """The header of an opened PCD file; ``stream`` is left where the points begin.
 
     MapvoteError with line, cause and mend if it is none.
     """
-    lines = _Lines(where)
+    lines = _Lines(source)
     for words in lines.read(stream):
         if words[0].upper() == "DATA":
             break

@@ -67,8 +67,8 @@ class Spill:
             for column in columns.values():
                 self._end += self._file.write(np.ascontiguousarray(column).reshape(-1).view(np.uint8).data)
         except OSError as error:
-            where = self._folder or tempfile.gettempdir()
-            raise MapvoteError(f"{where}: no room for temporary files ({error.strerror or error})") from error
+            folder = self._folder or tempfile.gettempdir()
+            raise MapvoteError(f"{folder}: no room for temporary files ({error.strerror or error})") from error
         return len(self._blocks) - 1
 
     def read(self, number: int) -> Columns:
@@ -102,7 +102,7 @@ UNCHECKED = "unchecked"
 
 
 def in_map_metres(
-    where: str, pieces: Iterator[Cloud], wanted: MapFrame | None = None, *, sure: bool = False
+    source: str, pieces: Iterator[Cloud], wanted: MapFrame | None = None, *, sure: bool = False
 ) -> Iterator[Cloud]:
     """Pieces of one file in map metres, in the frame ``wanted`` where one is; see ``geo.units.settle``."""
     first: list[Cloud] = []
@@ -112,7 +112,7 @@ def in_map_metres(
             break
     if not first:
         return
-    frame, convert = settle(where, first[0].frame, wanted, joined(first).points[: READ_SIZES.piece], sure=sure)
+    frame, convert = settle(source, first[0].frame, wanted, joined(first).points[: READ_SIZES.piece], sure=sure)
     for piece in chain(first, pieces):
         yield replace(piece, points=convert(piece.points), frame=frame)
 
@@ -124,7 +124,7 @@ def grounded(columns: Mapping[str, NDArray[Any]], points: NDArray[np.floating]) 
 
 
 def map_of(
-    where: str,
+    source: str,
     pieces: Iterable[Cloud],
     folder: Path | None = None,
     look: Look | None = None,
@@ -138,7 +138,7 @@ def map_of(
     points before tiles are cut and the ground is computed. MapvoteError if the cloud is empty or more than ``most_bad``
     of it is not finite.
     """
-    taken = _Taken(where, Spill(folder, sizes), most_bad)
+    taken = _Taken(source, Spill(folder, sizes), most_bad)
     for piece in pieces:
         taken.take(piece)
     lattice = taken.lattice()
@@ -241,13 +241,13 @@ class _Parts:
 
     def cut(self, block: Columns) -> None:
         """Take in a block of points in map metres and their fields."""
-        for index, mine in cut_tiles(block[_XYZ], self._lattice):
-            part = {name: column[mine] for name, column in block.items()}
+        for index, chosen in cut_tiles(block[_XYZ], self._lattice):
+            part = {name: column[chosen] for name, column in block.items()}
             part[_XYZ] = self._lattice.tile(index).from_map(part[_XYZ])
             if (part.get("classification", np.empty(0)) == LasClass.GROUND).any():
                 self._grounded.add(index)
             self._blocks.setdefault(index, []).append(self._spill.add(part))
-            self.points[index] = self.points.get(index, 0) + len(mine)
+            self.points[index] = self.points.get(index, 0) + len(chosen)
 
     def read(self, index: TileIndex) -> Columns:
         """The points of a tile, from its corner, and their fields."""
