@@ -57,7 +57,62 @@ Reply = _struct(
 )
 
 
+_SEQUENCES = {
+    f"{name}_array_value": types.sequence[of]
+    for name, of in (
+        ("byte", types.byte),
+        ("bool", bool),
+        ("integer", types.int64),
+        ("double", types.float64),
+        ("string", str),
+    )
+}
+ParameterValue = _struct(
+    "rcl_interfaces.msg",
+    "ParameterValue",
+    type=types.uint8,
+    bool_value=bool,
+    integer_value=types.int64,
+    double_value=types.float64,
+    string_value=str,
+    **_SEQUENCES,
+)
+AskParameters = _struct("rcl_interfaces.srv", "GetParameters_Request", **_NUMBERS, names=types.sequence[str])
+ToldParameters = _struct(
+    "rcl_interfaces.srv", "GetParameters_Response", **_NUMBERS, values=types.sequence[ParameterValue]
+)
 _GUID = 0xABCD_0123_4567
+_QOS = Qos(Policy.Reliability.Reliable(1_000_000_000), Policy.History.KeepLast(10))
+
+
+class HeightFitter:
+    """Asks as Autoware's map_height_fitter does when it starts: a parameter of the map loader, and the whole map."""
+
+    def __init__(self, domain: int) -> None:
+        self._participant = DomainParticipant(domain)
+        name = "/map/pointcloud_map_loader/get_parameters"
+        self._writer = DataWriter(self._participant, Topic(self._participant, f"rq{name}Request", AskParameters), _QOS)
+        self._reader = DataReader(self._participant, Topic(self._participant, f"rr{name}Reply", ToldParameters), _QOS)
+        latched = Qos(
+            Policy.Reliability.Reliable(1_000_000_000), Policy.Durability.TransientLocal, Policy.History.KeepLast(1)
+        )
+        self._maps = DataReader(
+            self._participant, Topic(self._participant, "rt/map/pointcloud_map", PointCloud2), latched
+        )
+        self._asked = False
+
+    def partial_load(self) -> list[bool]:
+        """The answer to ``enable_partial_load``, once it is there."""
+        matched = self._writer.get_matched_subscriptions() and self._reader.get_matched_publications()
+        if matched and not self._asked:
+            self._asked = True
+            self._writer.write(AskParameters(guid=_GUID, seq=1, names=["enable_partial_load"]))
+        replies = [r for r in self._reader.take(10) if r.sample_info.valid_data and (r.guid, r.seq) == (_GUID, 1)]
+        return [value.type == 1 and value.bool_value for reply in replies for value in reply.values]
+
+    def whole_maps(self) -> list[int]:
+        """Points of the whole maps that came."""
+        return [map_.width for map_ in self._maps.take(10) if map_.sample_info.valid_data]
 
 
 class ForeignClient:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from live.loopback_dds import until
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import check_followed, laid_version, lay_version
 from mapvote.formats.maps.cloud import Cloud
@@ -21,15 +23,19 @@ from mapvote.live.map_loader import (
     DIFFERENTIAL,
     HASH,
     HASH_TOPIC,
+    LOADER_WAITS,
+    NODE,
     PARTIAL,
     SELECTED,
     SERVICES,
     TABLE,
     TABLE_TOPIC,
+    WHOLE_TOPIC,
     Cell,
     MapLoader,
 )
-from mapvote.live.messages import blank_message, from_cdr, to_cdr
+from mapvote.live.messages import CLOUD, blank_message, from_cdr, to_cdr
+from mapvote.live.parameters import NodeParameters
 
 
 def points(*corners: tuple[float, float], z: float = 1.0) -> F64:
@@ -171,6 +177,54 @@ def test_a_version_that_was_half_laid_is_laid_again_and_another_map_is_refused(t
         check_followed(folder, "village")
 
 
+def test_a_height_fitter_of_other_message_types_learns_that_it_may_ask_for_parts_and_gets_the_whole_map(
+    loader: MapLoader, tmp_path: Path, domain: int
+) -> None:
+    pytest.importorskip("cyclonedds")
+    from live.foreign_client import HeightFitter
+    from mapvote.live.dds import Network
+    from mapvote.live.map_loader import LoaderService
+
+    service = LoaderService(Network(domain), MapLoader(tmp_path / "map"))
+    fitter = HeightFitter(domain)
+    assert service.refresh()
+
+    def told() -> list[bool]:
+        service.serve(0.05)
+        return fitter.partial_load()
+
+    assert until(told) == [True]
+    assert until(fitter.whole_maps) == [6]
+    service.close()
+
+
+def test_a_map_that_is_too_large_is_not_published_whole_and_the_parameter_says_so(loader: MapLoader) -> None:
+    assert loader.parameters()["enable_whole_load"]
+    small = replace(LOADER_WAITS, most_whole_bytes=100)
+    loader = MapLoader(loader.folder, small)
+    loader.refresh()
+    assert not loader.parameters()["enable_whole_load"]
+    assert loader.whole(0) is None
+
+
+def test_the_parameters_of_the_loader_are_told_and_never_set(loader: MapLoader) -> None:
+    node = NodeParameters(NODE, loader.parameters)
+
+    def answer(kind: str, **members: Any) -> Any:
+        return node.answer(f"rcl_interfaces/srv/{kind}", SimpleNamespace(**members))
+
+    assert set(node.services().values()) >= {f"{NODE}/{name}_parameters" for name in ("get", "set", "list", "describe")}
+    assert f"{NODE}/get_parameter_types" in node.services().values()
+    listed = answer("ListParameters", prefixes=["enable"], depth=0)["result"].names
+    assert sorted(listed) == [f"enable_{which}_load" for which in ("downsampled_whole", "partial", "selected", "whole")]
+    assert answer("GetParameterTypes", names=["pcd_metadata_path", "use_sim_time"])["types"].tolist() == [4, 1]
+    assert answer("DescribeParameters", names=["use_sim_time"])["descriptors"][0].read_only
+    (value,) = answer("GetParameters", names=["pcd_paths_or_directory"])["values"]
+    assert (value.type, value.string_array_value) == (9, [str(loader.folder / "pointcloud_map.pcd")])
+    assert [r.successful for r in answer("SetParameters", parameters=[1, 2])["results"]] == [False, False]
+    assert not answer("SetParametersAtomically", parameters=[1])["result"].successful
+
+
 def test_a_request_that_cannot_be_read_is_answered_by_its_number_with_no_tile(loader: MapLoader, domain: int) -> None:
     pytest.importorskip("cyclonedds")
     from mapvote.live.dds import Network
@@ -179,7 +233,7 @@ def test_a_request_that_cannot_be_read_is_answered_by_its_number_with_no_tile(lo
     service = LoaderService(Network(domain), loader)
     whole = to_cdr(f"{PARTIAL}_Request", blank_message(f"{PARTIAL}_Request", guid=77, seq=5))
     for cut, numbers in ((4 + 16, (77, 5)), (4 + 20, (77, 5)), (4 + 8, (77, 0)), (2, (0, 0))):
-        reply = from_cdr(f"{PARTIAL}_Response", service._reply(PARTIAL, memoryview(whole[:cut])))
+        reply = from_cdr(f"{PARTIAL}_Response", service._reply(PARTIAL, memoryview(whole[:cut]), loader.answer))
         assert ((reply.guid, reply.seq), len(reply.new_pointcloud_with_ids)) == (numbers, 0)
 
 
@@ -195,9 +249,10 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     service, network = LoaderService(Network(domain), loader), Network(domain)
     assert service.refresh()
 
-    def client(kind: str, guid: int) -> Callable[..., Any]:
-        requests = network.publish(f"rq{SERVICES[kind]}Request", f"{kind}_Request", depth=10)
-        replies = network.subscribe(f"rr{SERVICES[kind]}Reply", f"{kind}_Response", reliable=True, depth=10)
+    def client(kind: str, guid: int, name: str = "") -> Callable[..., Any]:
+        name = name or SERVICES[kind]
+        requests = network.publish(f"rq{name}Request", f"{kind}_Request", depth=10)
+        replies = network.subscribe(f"rr{name}Reply", f"{kind}_Response", reliable=True, depth=10)
         until(lambda: requests.readers and replies.writers, "the service was not found")
 
         def ask(seq: int, **members: Any) -> Any:
@@ -228,11 +283,17 @@ def test_a_client_of_rmw_cyclonedds_gets_its_own_answers_over_dds(
     one = next(iter(loader.cells))
     selected = client(SELECTED, 8)(9, cell_ids=[one])
     assert [c.cell_id for c in selected.new_pointcloud_with_ids] == [one]
+    get = client("rcl_interfaces/srv/GetParameters", 3, f"{NODE}/get_parameters")
+    asked_for = get(1, names=["enable_partial_load", "enable_whole_load"]).values
+    assert [(value.type, value.bool_value) for value in asked_for] == [(1, True), (1, True)]
+    assert list(get(2, names=["enable_partial_load", "unknown"]).values) == [], "as rclcpp has it"
     told = {}
-    for topic, kind in ((HASH_TOPIC, HASH), (TABLE_TOPIC, TABLE)):
+    for topic, kind in ((HASH_TOPIC, HASH), (TABLE_TOPIC, TABLE), (WHOLE_TOPIC, CLOUD)):
         late = network.subscribe(topic, kind, reliable=True, transient_local=True)
         told[kind] = from_cdr(kind, until(late.take)[0][1])
     assert len(told[HASH].pcd) == 64
+    whole = point_cloud_table("/map/pointcloud_map", told[CLOUD])
+    assert sorted(zip(whole["x"].tolist(), whole["z"].tolist(), strict=True)) == [(3, 5), (4, 5), (23, 5), (24, 5)]
     assert told[TABLE].header.frame_id == "map"
     listed = [
         (c.metadata.min_x, c.metadata.min_y, c.metadata.max_x, c.metadata.max_y) for c in told[TABLE].metadata_list

@@ -61,7 +61,9 @@ def module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "rclpy.qos": {"QoSProfile": dict, "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1)},
         "autoware_map_msgs.msg": cells,
         "autoware_map_msgs.srv": dict.fromkeys(services),
-        "sensor_msgs.msg": {"PointField": partial(blank_message, "sensor_msgs/msg/PointField")},
+        "sensor_msgs.msg": {
+            name: partial(blank_message, f"sensor_msgs/msg/{name}") for name in ("PointCloud2", "PointField")
+        },
         "tier4_external_api_msgs.msg": {"MapHash": partial(blank_message, "tier4_external_api_msgs/msg/MapHash")},
     }
     for name, members in stand_ins.items():
@@ -104,6 +106,7 @@ def test_the_node_answers_from_the_folder_and_says_which_map_it_is(module: Modul
     answer(SimpleNamespace(area=area, cached_ids=[cell.cell_id]), response)
     assert response.ids_to_remove == [cell.cell_id]
     assert len({told.pcd for told in node.published["~/output/map_hash"]}) == 2
+    assert [whole.width for whole in node.published["~/output/pointcloud_map"]] == [4, 4]
     assert [len(t.metadata_list) for t in node.published["~/output/pointcloud_map_metadata"]] == [2, 2]
     node.ended.set()
 
@@ -118,5 +121,6 @@ def test_parameters_schema_and_node_name_the_same_things() -> None:
         assert about["default"] == given[name]
         assert f'("{name}", {json.dumps(about["default"])})' in source
     launch = (PACKAGE / "launch/mapvote_map_loader.launch.xml").read_text()
+    assert 'push-ros-namespace namespace="map"' in launch, "its parameters are asked for below /map"
     for name in ("differential", "partial", "selected"):
         assert f'from="~/service/get_{name}_pcd_map" to="/map/get_{name}_pointcloud_map"' in launch

@@ -19,7 +19,7 @@ from autoware_map_msgs.srv import (
 )
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import PointField
+from sensor_msgs.msg import PointCloud2, PointField
 from tier4_external_api_msgs.msg import MapHash
 
 from mapvote import MapClient, MapvoteError
@@ -54,6 +54,10 @@ class MapvoteMapLoader(Node):
         self.loader = MapLoader(Path(folder))
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.hash = self.create_publisher(MapHash, "~/output/map_hash", latched)
+        self.whole = self.create_publisher(PointCloud2, "~/output/pointcloud_map", latched)
+        # map_height_fitter reads these parameters of Autoware's loader, and chooses by them how it asks.
+        for name, value in (("enable_partial_load", True), ("enable_selected_load", True), ("enable_whole_load", True)):
+            self.declare_parameter(name, value)
         self.table = self.create_publisher(PointCloudMapMetaData, "~/output/pointcloud_map_metadata", latched)
         self.offered = False
         self.refresh()
@@ -98,6 +102,11 @@ class MapvoteMapLoader(Node):
             set_square(listed.metadata, cell)
             table.metadata_list.append(listed)
         self.table.publish(table)
+        cloud = self.loader.whole(0)  # None: the map is too large for one message
+        if cloud is not None:
+            whole = PointCloud2()
+            copy_cloud(cloud, whole)
+            self.whole.publish(whole)
 
     def follow(self) -> None:
         """Lay each newer version into the folder."""
@@ -116,7 +125,12 @@ def cell_message(cell: Any) -> PointCloudMapCellWithID:
     """A tile as a message of ROS, from one of mapvote.live.map_loader."""
     out = PointCloudMapCellWithID(cell_id=cell.cell_id)
     set_square(out.metadata, cell.metadata)
-    cloud, points = cell.pointcloud, out.pointcloud
+    copy_cloud(cell.pointcloud, out.pointcloud)
+    return out
+
+
+def copy_cloud(cloud: Any, points: Any) -> None:
+    """Copy a cloud of mapvote.live.messages into a PointCloud2 of ROS."""
     points.header.frame_id = cloud.header.frame_id
     points.height, points.width, points.is_dense = cloud.height, cloud.width, cloud.is_dense
     points.point_step, points.row_step = cloud.point_step, cloud.row_step
@@ -125,7 +139,6 @@ def cell_message(cell: Any) -> PointCloudMapCellWithID:
         for field in cloud.fields
     ]
     points.data = array.array("B", cloud.data.tobytes())
-    return out
 
 
 def set_square(out: Any, square: Any) -> None:

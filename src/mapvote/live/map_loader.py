@@ -20,6 +20,7 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,14 +29,15 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.record import record
-from mapvote.core.types import MapvoteError
+from mapvote.core.types import F32, MapvoteError
 from mapvote.formats.listing import plain_name
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
-from mapvote.formats.maps.cloud import joined
+from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.pcd import stream_pcd
 from mapvote.formats.reading import first_line, read_yaml
 from mapvote.live.dds import Network, Publication, Subscription
-from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
+from mapvote.live.messages import CLOUD, MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
+from mapvote.live.parameters import NodeParameters, Value
 
 log = logging.getLogger("mapvote.live")
 
@@ -51,6 +53,9 @@ class LoaderWaits:
     """Deliveries of an answer; after each a reliable reader has a second to take it."""
     delivery_s: float = 5.0
     """Time for the last answers to arrive before the service ends, seconds."""
+    most_whole_bytes: int = 100_000_000
+    """Size of the files of a map up to which it is published whole: DDS keeps the last one in memory for readers that
+    come late. 100 MB are 8 million points."""
 
 
 LOADER_WAITS = LoaderWaits()
@@ -66,7 +71,7 @@ SERVICES = {
 """Where Autoware's launch files have them."""
 HASH, HASH_TOPIC = "tier4_external_api_msgs/msg/MapHash", "/api/autoware/get/map/info/hash"
 TABLE, TABLE_TOPIC = "autoware_map_msgs/msg/PointCloudMapMetaData", "/map/pointcloud_map_metadata"
-_MSG = "autoware_map_msgs/msg/PointCloudMapCell"
+NODE, WHOLE_TOPIC = "/map/pointcloud_map_loader", "/map/pointcloud_map"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,15 +94,21 @@ class Cell:
     def message(self, kind: str, **more: Any) -> Any:
         """``kind`` of message with the id and the square of the tile."""
         corners = {name: getattr(self, name) for name in ("min_x", "min_y", "max_x", "max_y")}
-        return blank_message(kind, cell_id=self.id, metadata=blank_message(f"{_MSG}MetaData", **corners), **more)
+        return blank_message(
+            kind,
+            cell_id=self.id,
+            metadata=blank_message("autoware_map_msgs/msg/PointCloudMapCellMetaData", **corners),
+            **more,
+        )
 
 
 class MapLoader:
     """The tiles of the folder's newest version."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, waits: LoaderWaits = LOADER_WAITS) -> None:
         """``folder`` as :func:`mapvote.formats.maps.autoware.lay_version` lays it; it may still be empty."""
         self.folder = folder
+        self._most_whole_bytes = waits.most_whole_bytes
         self.cells: dict[str, Cell] = {}
         self._read: tuple[int, int, int] | None = None
         """Time of change, inode and size of the table that was read last."""
@@ -169,16 +180,53 @@ class MapLoader:
         except (MapvoteError, OSError) as error:  # a version was replaced, and its tile deleted, while it was read
             log.warning("%s", error)
             return None
-        columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
-        if "intensity" in cloud.fields:
-            columns["intensity"] = cloud.fields["intensity"]
-        message = cloud_of({name: column.astype(np.float32) for name, column in columns.items()}, 0, MAP_FRAME)
-        return cell.message(f"{_MSG}WithID", pointcloud=message)
+        message = cloud_of(_columns(cloud), 0, MAP_FRAME)
+        return cell.message("autoware_map_msgs/msg/PointCloudMapCellWithID", pointcloud=message)
+
+    @property
+    def is_whole_small(self) -> bool:
+        """Whether the map is published whole, too."""
+        sizes = ((self.folder / TILES / name).stat().st_size for name in self.cells)
+        with suppress(OSError):
+            return sum(sizes) <= self._most_whole_bytes
+        return False
+
+    def whole(self, time_ns: int) -> Any | None:
+        """The map as one cloud; None where it is too large, or a tile of it cannot be read."""
+        if not self.is_whole_small:
+            return None
+        try:
+            tiles = [_columns(joined(stream_pcd(self.folder / TILES / name))) for name in self.cells]
+        except (MapvoteError, OSError) as error:
+            log.warning("%s; the map is not published whole", error)
+            return None
+        names = [name for name in tiles[0] if all(name in tile for tile in tiles)]
+        return cloud_of({name: np.concatenate([tile[name] for tile in tiles]) for name in names}, time_ns, MAP_FRAME)
+
+    def parameters(self) -> dict[str, Value]:
+        """The parameters of Autoware's loader, by which its clients choose how to ask."""
+        return {
+            "enable_whole_load": self.is_whole_small,
+            "enable_downsampled_whole_load": False,
+            "enable_partial_load": True,
+            "enable_selected_load": True,
+            "pcd_paths_or_directory": [str(self.folder / TILES)],
+            "pcd_metadata_path": str(self.folder / METADATA),
+            "use_sim_time": False,
+        }
 
     def table(self, time_ns: int) -> Any:
         """A PointCloudMapMetaData of all tiles."""
-        listed = [cell.message(f"{_MSG}MetaDataWithID") for cell in self.cells.values()]
+        listed = [cell.message("autoware_map_msgs/msg/PointCloudMapCellMetaDataWithID") for cell in self.cells.values()]
         return blank_message(TABLE, header=header_of(time_ns, MAP_FRAME), metadata_list=listed)
+
+
+def _columns(cloud: Cloud) -> dict[str, F32]:
+    """x, y, z and, where it has it, intensity of a cloud, (n,) each."""
+    columns = {axis: cloud.points[:, k] for k, axis in enumerate("xyz")}
+    if "intensity" in cloud.fields:
+        columns["intensity"] = cloud.fields["intensity"]
+    return {name: column.astype(np.float32) for name, column in columns.items()}
 
 
 def _read_table(file: Path) -> dict[str, Cell]:
@@ -194,6 +242,10 @@ def _read_table(file: Path) -> dict[str, Cell]:
     }
 
 
+Answer = Callable[[str, Any], dict[str, Any]]
+"""(type of service, request) to the members of the response."""
+
+
 class LoaderService:
     """The services and topics of a map loader, on one network. They exist from the first table of tiles on."""
 
@@ -201,8 +253,8 @@ class LoaderService:
         self._network = network
         self._loader = loader
         self.answered = 0
-        self._ends: list[tuple[str, Subscription, Publication]] = []
-        self._shown: list[tuple[Publication, str, Callable[[], Any]]] = []
+        self._ends: list[tuple[str, Answer, Subscription, Publication]] = []
+        self._shown: list[tuple[Publication, str, Callable[[], Any | None]]] = []
 
     @property
     def exists(self) -> bool:
@@ -221,8 +273,10 @@ class LoaderService:
             return False
         if not self._ends:
             self._offer()
-        for publication, kind, message in self._shown:
-            self._send(publication, to_cdr(kind, message()))
+        for publication, kind, made in self._shown:
+            message = made()
+            if message is not None:
+                self._send(publication, to_cdr(kind, message))
         return True
 
     def _offer(self) -> None:
@@ -230,44 +284,49 @@ class LoaderService:
         loader = self._loader
         hashed = network.publish(HASH_TOPIC, HASH, transient_local=True, depth=1)
         table = network.publish(TABLE_TOPIC, TABLE, transient_local=True, depth=1)
+        whole = network.publish(WHOLE_TOPIC, CLOUD, transient_local=True, depth=1)
         self._shown = [
             (hashed, HASH, lambda: blank_message(HASH, pcd=loader.hash())),
             (table, TABLE, lambda: loader.table(time.time_ns())),
+            (whole, CLOUD, lambda: loader.whole(time.time_ns())),
         ]
-        for kind, name in SERVICES.items():
+        node = NodeParameters(NODE, loader.parameters)
+        offered = [(kind, name, loader.answer) for kind, name in SERVICES.items()]
+        offered += [(kind, name, node.answer) for kind, name in node.services().items()]
+        for kind, name, answer in offered:
             # Replies first: a client that finds the reader of requests can be answered.
             replies = network.publish(f"rr{name}Reply", f"{kind}_Response", depth=LOADER_WAITS.depth)
             requests = network.subscribe(f"rq{name}Request", f"{kind}_Request", reliable=True, depth=LOADER_WAITS.depth)
-            self._ends.append((kind, requests, replies))
+            self._ends.append((kind, answer, requests, replies))
 
     def serve(self, seconds: float) -> None:
         """Answer the requests that arrived, or wait so long for one."""
         self._network.wait(seconds)
-        for kind, requests, replies in self._ends:
+        for kind, answer, requests, replies in self._ends:
             for _, data in requests.take():
-                self._send(replies, self._reply(kind, data))
+                self._send(replies, self._reply(kind, data, answer))
                 self.answered += 1
 
     def close(self) -> None:
         """Offer the services no more. Requests that arrived are answered first, and their answers delivered."""
         self.serve(0.0)
-        for kind, requests, replies in self._ends:
+        for kind, _, requests, replies in self._ends:
             requests.close()
             if not replies.delivered(LOADER_WAITS.delivery_s):
-                log.warning("%s: a client did not take its answer in %.0f s", SERVICES[kind], LOADER_WAITS.delivery_s)
+                log.warning("%s: a client did not take its answer in %.0f s", kind, LOADER_WAITS.delivery_s)
         self._ends = []
 
-    def _reply(self, kind: str, data: memoryview) -> bytes:
+    def _reply(self, kind: str, data: memoryview, answered: Answer) -> bytes:
         """The response to a request, in CDR. A request that cannot be read is answered with nothing, by its number."""
         try:
             request = from_cdr(f"{kind}_Request", data)
-            answer = self._loader.answer(kind, request)
+            answer = answered(kind, request)
         except MapvoteError as error:
-            log.warning("%s: answered with no tile", error)
+            log.warning("%s: answered with nothing", error)
             numbers = (bytes(data[4:20]) + bytes(16))[:16]  # behind the four bytes of the encoding
             guid, seq = struct.unpack("<Qq" if len(data) > 1 and data[1] & 1 else ">Qq", numbers)
             request = SimpleNamespace(guid=guid, seq=seq)
-            answer = {"header": header_of(0, MAP_FRAME)}
+            answer = {"header": header_of(0, MAP_FRAME)} if kind in SERVICES else {}
         reply = blank_message(f"{kind}_Response", guid=request.guid, seq=request.seq, **answer)
         return to_cdr(f"{kind}_Response", reply)
 
