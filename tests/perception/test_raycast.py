@@ -206,6 +206,7 @@ def test_without_sight_the_same_voxels_are_passed() -> None:
 
 SENSOR = SENSORS["hdl32e"]
 UP = np.array([0.0, 0.0, 1.0])
+FORWARD = np.array([1.0, 0.0, 0.0])
 BEAMS = np.array(SENSOR.elevations_deg)
 
 
@@ -223,7 +224,7 @@ def directions(sensor: Sensor = SENSOR) -> tuple[F64, F64, F64]:
 def sky_of(answered: Bool, sensor: Sensor = SENSOR, up: F64 = UP, R: F64 | None = None) -> Rays:
     """Rays into the sky if those ``answered``, from 20 m; the sensor turned by ``R`` (3, 3)."""
     rays = 20.0 * directions(sensor)[0][answered] @ (np.eye(3) if R is None else R).T
-    return Sky(sensor).rays(up, follow_rays(np.ascontiguousarray(rays.T, dtype=np.float32), 0.45))
+    return Sky(sensor).rays(up, FORWARD, follow_rays(np.ascontiguousarray(rays.T, dtype=np.float32), 0.45))
 
 
 def azimuths_of(sky: Rays) -> F32:
@@ -297,7 +298,7 @@ def test_the_rays_lean_as_the_sensor_does(roll_deg: float, pitch_deg: float) -> 
 def test_of_a_sensor_whose_beams_nobody_knows_nothing_is_told(sensor: Sensor) -> None:
     answered = directions()[2] < 0.0
     rays = follow_rays(np.ascontiguousarray(20.0 * directions()[0][answered].T, dtype=np.float32), 0.45)
-    assert len(Sky(sensor).rays(UP, rays).reach) == 0
+    assert len(Sky(sensor).rays(UP, FORWARD, rays).reach) == 0
 
 
 WINDOW_M = 40.0
@@ -315,7 +316,7 @@ def test_hardly_a_ray_into_the_sky_meets_anything_in_the_window(tmp_path: Path) 
         for i in range(0, len(drive), 8):
             T = poses[i]
             points = deskew(drive.read_scan(i), motion_at(drive.stamps_ns, poses, i)) @ T[:3, :3].T + T[:3, 3]
-            rays = sky.rays(T[:3, 2].copy(), follow_rays(rows_from(points, T[:3, 3].copy()), 0.45))
+            rays = sky.rays(T[:3, 2].copy(), T[:3, 0].copy(), follow_rays(rows_from(points, T[:3, 3].copy()), 0.45))
             way = np.column_stack([rays.x, rays.y, rays.slope * CELL_SIZE])
             length = np.linalg.norm(way, axis=1)
             starts = np.broadcast_to(T[:3, 3].astype(np.float32), way.shape).copy()

@@ -28,7 +28,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, PosePrior, Reference, Scan
 from mapvote.matching.localiser import Localise
 from mapvote.matching.odometry import Fix
-from mapvote.perception.raycast import ScanView, Sky, cast_rays, find_obstacles
+from mapvote.perception.raycast import Fired, ScanView, Sky, cast_rays, find_obstacles
 
 
 @record()
@@ -155,6 +155,8 @@ class PlacedScan:
     """Whether the vehicle's first LiDAR took it, which the drive's sensor is."""
     fields: Fields = field(default_factory=dict)
     """Attributes (n,) of the points that the sensor measures."""
+    forward_map: F64 = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    """(3,) the sensor's own x axis, in the map's frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +202,7 @@ class Frontend:
         self._compared = compared
         self._with_sight = with_sight
         self._sky = None if sensor is None else Sky(sensor)
+        self._every_fan = sensor is not None and not sensor.rings
         self._waiting: deque[PlacedScan] = deque()
         self._observed = -1
         self._ended = False
@@ -283,10 +286,21 @@ class Frontend:
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
-        up_map = T_map_lidar[:3, 2]
+        forward_map, _, up_map = T_map_lidar[:3, :3].T
         by_first = scan.origin is None
         return PlacedScan(
-            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, by_first, scan.fields
+            index,
+            points_map,
+            origin_map,
+            up_map,
+            sigma_m,
+            reference,
+            outer,
+            obstacle,
+            cell,
+            by_first,
+            scan.fields,
+            forward_map,
         )
 
     def _see(self, decided: list[Bool]) -> list[Observation]:
@@ -300,9 +314,18 @@ class Frontend:
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 cell = scan.cell if self._compared is None else None
-                sky = partial(self._sky.rays, scan.up_map) if self._sky is not None and scan.by_first else None
+                fired = Fired(every_fan=self._every_fan)
+                if self._sky is not None and scan.by_first:
+                    fired = fired._replace(sky=partial(self._sky.rays, scan.up_map, scan.forward_map))
                 view = cast_rays(
-                    scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight, sky
+                    scan.points_map,
+                    scan.origin_map,
+                    scan.obstacle,
+                    moving,
+                    reference,
+                    cell,
+                    self._with_sight,
+                    fired,
                 )
             out.append(Observation(scan, moving, view, reference))
         return out

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,6 +156,15 @@ def _mark_sight(
                 next_r += width_r
 
 
+class Fired(NamedTuple):
+    """How the sensor of a scan fires."""
+
+    sky: Callable[[Rays], Rays] | None = None
+    """From the rays that returned to those that passed into the sky (:class:`Sky`), which are followed, too."""
+    every_fan: bool = False
+    """Whether no two fans hold the same elevations (:func:`mapvote.perception.fans.gather_rays`)."""
+
+
 def cast_rays(
     points_map: F64,
     origin_map: F64,
@@ -163,15 +173,15 @@ def cast_rays(
     reference: Reference,
     cell: I32 | None = None,
     with_sight: bool = True,
-    sky: Callable[[Rays], Rays] | None = None,
+    fired: Fired = Fired(),  # noqa: B008 - a tuple
 ) -> ScanView:
     """One scan's planes over ``reference.grid``, which must hold the sensor.
 
     ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
     occupy (docs/method.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
-    the view has none: rays are followed to their ends only. ``sky``: which rays passed into the
-    sky (:class:`Sky`); they are followed, too.
+    the view has none: rays are followed to their ends only. ``fired``: what the sensor is known to
+    have done beside its returns.
     """
     if cell is None:
         _, cell = find_obstacles(points_map, reference)
@@ -183,10 +193,10 @@ def cast_rays(
     base = np.ascontiguousarray(reference.base)
     _enter_hits(points_map, cell, obstacle & ~moving, base.ravel(), counts.ravel(), hit.ravel())
     rays = follow_rays(rows_from(points_map, origin_map), CLEARANCE_M)
-    fans = gather_rays(rays)
+    fans = gather_rays(rays, every_fan=fired.every_fan)
     mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
-    if sky is not None:
-        mark_passed(gather_rays(sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    if fired.sky is not None:
+        mark_passed(gather_rays(fired.sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
         mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)
@@ -215,26 +225,29 @@ SKY_RULE = SkyRule()
 
 
 @kernel
-def _highest(rays: Rays, lean: F64, least: float, top: F32, count: I32) -> None:
+def _highest(rays: Rays, lean: F64, top: F32, count: I32) -> None:
     """Enter into ``top`` (SKY_SECTORS,), which holds -inf, the steepest slope of a return in each sector, from the
-    sensor's own plane; infinite where fewer than ``least`` came. ``count`` (SKY_SECTORS,): scratch of zeros."""
+    sensor's own plane, and into ``count`` (SKY_SECTORS,), which holds 0, how many came."""
     wide = FANS // SKY_SECTORS
     for i in range(np.uint64(0), np.uint64(len(rays.reach))):
         sector = np.uint64(rays.fan[i] // wide)
         slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
         top[sector] = max(top[sector], slope)
         count[sector] += 1
-    for s in range(SKY_SECTORS):
-        if count[s] < least:
-            top[s] = np.inf
 
 
 class Sky:
-    """The elevations above which a sensor's rays passed into the sky."""
+    """The elevations above which a sensor's rays passed into the sky.
+
+    Beams on rings are known. A sensor without rings fires everywhere in its field of view, whose upper edge is where
+    returns have come from so far in the drive, sector by sector.
+    """
 
     def __init__(self, sensor: Sensor, rule: SkyRule = SKY_RULE) -> None:
         self._rule = rule
-        beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere the end of a ray is unknown
+        beams = sorted(sensor.elevations_deg)
+        self._edge = None if sensor.rings else np.full(SKY_SECTORS, -np.inf, np.float32)
+        """(SKY_SECTORS,) slope of the upper edge of the field of view, counter-clockwise from forward."""
         upright = np.tan(np.radians(beams)).astype(np.float32)
         self._slopes = {True: upright, False: np.ascontiguousarray(-upright[::-1])}
         """By whether the sensor's z axis points up: upside down, the lowest beam is the highest."""
@@ -244,24 +257,42 @@ class Sky:
         self._x = np.cos(azimuth).astype(np.float32)
         self._y = np.sin(azimuth).astype(np.float32)
 
-    def rays(self, up_map: F64, rays: Rays) -> Rays:
+    def rays(self, up_map: F64, forward_map: F64, rays: Rays) -> Rays:
         """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the axis that the
         sensor turns about, in their frame; it may point down, and lean by up to 30 deg. A sensor that leans by more
-        gets no ray into the sky: its beams are no cones about the vertical."""
+        gets no ray into the sky: its beams are no cones about the vertical. ``forward_map`` (3,): its x axis."""
         if abs(up_map[2]) < self._rule.min_upright * np.linalg.norm(up_map):
-            return self._above_returns(rays, np.zeros(0, np.float32), np.zeros(2), np.inf)
-        return self._above_returns(rays, self._slopes[bool(up_map[2] > 0.0)], up_map[:2] / up_map[2], self._least)
-
-    def _above_returns(self, rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
-        """Rays of the beams, of ascending ``slopes`` (beams,), that lie above all returns of their sector and its
-        neighbours."""
+            nowhere = np.full(SKY_SECTORS, np.inf, np.float32)
+            return self._above_returns(nowhere, nowhere, np.zeros(0, np.float32), np.zeros(2))
+        lean = up_map[:2] / up_map[2]
         top = np.full(SKY_SECTORS, -np.inf, np.float32)
-        _highest(rays, lean, least, top, np.zeros(SKY_SECTORS, np.int32))
+        count = np.zeros(SKY_SECTORS, np.int32)
+        _highest(rays, lean, top, count)
+        edge = self._edge_seen(top, forward_map)
+        return self._above_returns(
+            np.where(count < self._least, np.inf, top), edge, self._slopes[up_map[2] > 0.0], lean
+        )
+
+    def _edge_seen(self, top: F32, forward_map: F64) -> F32:
+        """(SKY_SECTORS,) slope up to which the sensor fires in each sector of the map, after one more scan with its
+        highest returns ``top``; infinite where its beams lie on rings."""
+        if self._edge is None:
+            return np.full(SKY_SECTORS, np.inf, np.float32)
+        turned = round(float(np.arctan2(forward_map[1], forward_map[0])) / (2.0 * np.pi) * SKY_SECTORS)
+        np.maximum(self._edge, np.roll(top, -turned), out=self._edge)
+        edge = np.roll(self._edge, turned)
+        return np.minimum(edge, np.minimum(np.roll(edge, 1), np.roll(edge, -1)))
+
+    def _above_returns(self, top: F32, edge: F32, slopes: F32, lean: F64) -> Rays:
+        """Rays of the beams, of ascending ``slopes`` (beams,), that lie above the highest returns ``top`` of their
+        sector and its neighbours and below the ``edge`` of the field of view, (SKY_SECTORS,) each."""
         most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
         # The beam next to the highest return may have grazed the same surface: it is left out.
         above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))
-        above = above[self._fan // (FANS // SKY_SECTORS)]
-        beams_above = len(slopes) - above
+        below = np.maximum(np.searchsorted(slopes, edge, side="right"), above)
+        sector = self._fan // (FANS // SKY_SECTORS)
+        above = above[sector]
+        beams_above = below[sector] - above
         fan_of = np.repeat(np.arange(len(self._fan)), beams_above)
         n_rays = int(beams_above.sum())
         beam = np.arange(n_rays) - np.repeat(np.cumsum(beams_above) - beams_above - above, beams_above)
