@@ -50,7 +50,7 @@ def decompressed(source: str, message: Any) -> bytes:
             f"{source}: its points do not decompress by {form} ({error}): the message is damaged"
         ) from error
     if len(data) != size:
-        size_length = f"more than {size}" if len(data) > size else f"{len(data)}"
+        size_found = f"more than {size}" if len(data) > size else f"{len(data)}"
         raise MapvoteError(
             f"{source}: {size_found} bytes after {form}, but its header says {size}: the message is cut off"
         )
