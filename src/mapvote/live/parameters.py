@@ -39,8 +39,8 @@ class NodeParameters:
             listed = [name for name in values if not prefixes or any(name.startswith(p) for p in prefixes)]
             return {"result": blank_message("rcl_interfaces/msg/ListParametersResult", names=listed, prefixes=[])}
         if kind.startswith("SetParameters"):
-            why = "parameters of mapvote are the options of its command"
-            refused = blank_message("rcl_interfaces/msg/SetParametersResult", successful=False, reason=why)
+            reason = "parameters of mapvote are the options of its command"
+            refused = blank_message("rcl_interfaces/msg/SetParametersResult", successful=False, reason=reason)
             return (
                 {"result": refused} if kind.endswith("Atomically") else {"results": [refused] * len(request.parameters)}
             )
