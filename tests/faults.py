@@ -24,7 +24,7 @@ from mapvote.formats.drives.scan_folder import write_poses
 
 VAGUE = "do not belong together|do not fit|leap|the vehicle drives at|off the scans' motion|fits the scans in|nowhere"
 """Errors that say something is wrong without saying what."""
-MIRROR, UP, TWICE = "left-handed|mirrored", "upside down", "there twice"
+MIRROR, UP, TWICE = "left-handed|mirrored", "upside down", "occurs? twice"
 TURN = r"turned by|turned against each other|headings are off|backward|turned about z"
 SCALE, ORDER = r"too large|too small|in scale|scaled by", "in order of time|reverse order|out of order"
 TILT = "tilted|pitched|rolled|lean by"
@@ -395,7 +395,7 @@ DRIVES: list[tuple[str, str, Break | Files]] = [
     ("one row not a number", "nan|number|finite", lines("prior.txt", lambda t: [*t[:4], "nan " * 12, *t[5:]])),
     ("rotations scaled", "orthonormal|rigid",
      lines("prior.txt", lambda t: [" ".join(str(2 * float(v)) for v in one.split()) for one in t])),
-    ("fixes that are all at latitude 0, longitude 0", "none of its .* fixes is one",
+    ("fixes that are all at latitude 0, longitude 0", "none of its .* fixes is valid",
      pose_table("time,longitude,latitude,altitude,yaw", lambda p, q: np.zeros((len(p), 4)))),
     ("latitude and longitude of fixes swapped", "swapped|another place|lies at",
      pose_table("time,latitude,longitude,altitude,yaw", lambda p, q: np.column_stack(

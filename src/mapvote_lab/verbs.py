@@ -119,14 +119,14 @@ def evaluate(
         if drive is None:
             raise typer.BadParameter(f"name what to evaluate: mapvote evaluate {scenario} FOLDER", param_hint="DRIVE")
         if figures is not None:
-            raise typer.BadParameter("of recorded scans --out draws the pictures", param_hint="--figures")
+            raise typer.BadParameter("--out draws the pictures of recorded scans", param_hint="--figures")
         if scenario == "real":
             _evaluate_real(drive, case, scans, seed, json, out, load_settings(config))
         else:
             _evaluate_court(drive, case, json, load_settings(config))
         return
     if drive is not None:
-        raise typer.BadParameter(f"{drive}: a folder follows real and court only", param_hint="DRIVE")
+        raise typer.BadParameter(f"{drive}: only real and court take a folder", param_hint="DRIVE")
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     from mapvote.config import cache_folder, load_with_sources
@@ -198,7 +198,7 @@ def _evaluate_real(
     method = settings.voting.method
     cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))
     if len(cases) > 1:
-        raise typer.BadParameter(f"{case}: of a recorded drive one case is judged at a time", param_hint="--case")
+        raise typer.BadParameter(f"{case}: a recorded drive is evaluated for one case at a time", param_hint="--case")
     with stages() as report:
         result = bench(drive, settings, cases, report, scans=scans, seed=seed)
     sheets = real_tables(result, cases[0].name)

@@ -124,7 +124,7 @@ def test_a_mount_that_the_prior_does_not_know_is_an_error(
 def test_a_prior_that_turns_a_sensor_over_which_stands_upright_is_named(tmp_path: Path, sound: Recording) -> None:
     replace(mounted(sound, (180, 0, 0)), scans=sound.scans).write(tmp_path / "d")
     what = " ".join(serious(diagnose(tmp_path / "d").findings))
-    assert "the prior tilts the sensor by 180 deg, but no road lies below it then" in what
+    assert "the prior tilts the sensor by 180 deg, but the points show no road below it" in what
 
 
 def test_what_else_is_wrong_with_a_sensor_upside_down_is_named(tmp_path: Path, sound: Recording) -> None:
@@ -198,7 +198,7 @@ LIES = {
     "pitched by 3 deg + scaled by 1.03": r"tilted by 3\.00 deg \(\+-0\.50\), scaled by 1\.0300 \(\+-0\.0019\)",
     "mirrored, y negated": "the map is mirrored against the scans: 4 mirrored scans fit it, unmirrored none",
     "in feet": "the map is in feet: made metres, it fits 6 of 6 scans checked",
-    "bent": "the drive fits the map nowhere: at best to 0.33",
+    "bent": "the drive fits the map nowhere: the best fit is 0.33",
 }
 """How maps lie on the drive, in words."""
 ON_MAP = [kind for kind in kinds_of("maps") if " + " in kind or "shifted" in kind or kind in LIES]

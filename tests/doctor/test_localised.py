@@ -72,13 +72,13 @@ def _swapped() -> LocalisedDrive:
 @pytest.mark.parametrize(
     ("drive", "named"),
     [
-        (replace(_drive(), sure=np.arange(N) % 3 == 0), "have a sure place"),
+        (replace(_drive(), sure=np.arange(N) % 3 == 0), "could be localised"),
         (_leaping(), "the localised path leaps"),
         (_swapped(), "the localised path leaps once before scan 30"),
-        (_prior(lambda T: T[np.random.default_rng(1).permutation(N)]), "way by the prior"),
+        (_prior(lambda T: T[np.random.default_rng(1).permutation(N)]), "prior differ in length"),
         (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, yaw=np.pi / 2)), "attitude differs by 90 deg"),
         (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, roll=np.pi)), "attitude differs by 180 deg"),
-        (_prior(lambda T: T[::-1]), "attitude differs|way by the prior|about its mean difference"),
+        (_prior(lambda T: T[::-1]), "attitude differs|prior differ in length|about its mean offset"),
     ],
 )
 def test_a_drive_that_did_not_know_its_place_is_an_error(drive: LocalisedDrive, named: str) -> None:

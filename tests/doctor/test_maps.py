@@ -1,4 +1,4 @@
-"""The doctor looks at a map by itself: units, axes, layers that are there twice, holes, rounding."""
+"""The doctor looks at a map by itself: units, axes, layers that occur twice, holes, rounding."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def test_what_is_wrong_with_a_map_is_named_without_a_drive_one_fault_and_two(poi
     [
         (lambda p: p[:, [2, 1, 0]], r"error: .*axis \+x points up"),
         (lambda p: np.concatenate([p, [[9e5, 0, 0]]]), "warning: 1 of 105001 points lie far off all others"),
-        (lambda p: p[:10], "warning: .*10 points only"),
-        (lambda p: np.concatenate([p, moved(z=0.6)(p)]), r"error: the road lies there twice, 0\.6"),
+        (lambda p: p[:10], "warning: .*only 10 points"),
+        (lambda p: np.concatenate([p, moved(z=0.6)(p)]), r"error: the road occurs twice, 0\.6"),
         (lambda p: np.concatenate([p, moved(x=3.0, y=-1.0)(p)]), r"twice, shifted by 3\.2 m \(x [+-]3.0, y [+-]1.0\)"),
         (moved(pitch=3.0), r"lean by (2\.9|3\.[01]) deg"),
         (

@@ -62,7 +62,7 @@ def test_topics_rates_and_the_mount_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "name"),
     [
-        ({"T": None}, "warning: /odom tracks base_link, the scans are of lidar; nothing in /tf_static says"),
+        ({"T": None}, "warning: /odom tracks base_link, the scans are of lidar; /tf_static holds no"),
         ({"poses_later_s": 60.0}, "error: /odom has no pose at the time of 100% of the scans"),
         ({"tick_ns": 0}, "warning: /points has 5 stamps that an earlier message has too"),
     ],
@@ -88,10 +88,10 @@ def test_a_sound_ballot_is_not_blamed() -> None:
 @pytest.mark.parametrize(
     ("said", "name"),
     [
-        ({"end_ns": 0}, "the drive ends before it begins"),
+        ({"end_ns": 0}, "its drive ends before it begins"),
         ({"scans_localised": 3}, "only 3 of 10 scans were localised"),
-        ({"median_sigma_m": 0.4}, "knew where it was to 0.40 m only"),
-        ({"prior_misfit_m": 2.0, "prior_sigma_m": 0.1}, "2.0 m off its prior"),
+        ({"median_sigma_m": 0.4}, "the sigma of the vehicle's position was 0.40 m"),
+        ({"prior_misfit_m": 2.0, "prior_sigma_m": 0.1}, "2.0 m off the localised path"),
         ({"tiles": []}, "votes on no tile"),
         ({"fill": GONE}, "judges changed"),
     ],

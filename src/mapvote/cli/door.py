@@ -182,7 +182,7 @@ def check_ending(file: Path | None, option: str, *endings: str) -> None:
     if file is None:
         return
     if file.suffix.lower() not in endings:
-        raise MapvoteError(f"{option} {file}: is written as {' or '.join(endings)}; give the file such an ending")
+        raise MapvoteError(f"{option} {file}: its format is {' or '.join(endings)}; give the file that ending")
     require_for(file, f"{option} {file}")
 
 

@@ -81,7 +81,7 @@ class Connection:
                 wait_s = 0.0
                 continue
             except (httpx2.InvalidURL, httpx2.UnsupportedProtocol) as error:
-                raise MapvoteError(f"{self.url}: is no address of a server ({error})") from error
+                raise MapvoteError(f"{self.url}: not the address of a server ({error})") from error
             if answer.status_code in (429, 500, 502, 503, 504):  # the next answer may be better
                 trouble = detail_of(answer)
                 wait_s = _asked_to_wait_s(answer)

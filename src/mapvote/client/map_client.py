@@ -105,7 +105,7 @@ class MapClient:
         """The map that was fetched last, without a request. Unreachable if nothing, or not all of it, is kept."""
         manifest = self.kept_manifest()
         if manifest is None:
-            raise Unreachable(f"{self._url}: is away, and no version of its map is kept here")
+            raise Unreachable(f"{self._url}: does not answer, and no version of its map is kept here")
         return self._as_map(manifest, region)
 
     def has(self, planes: TileHashes) -> bool:
@@ -237,7 +237,7 @@ class MapClient:
                 return frame
         raw = self._server.ask("GET", f"/v1/tiles/{digest}").content
         if hashlib.sha256(raw).hexdigest() != digest:
-            raise MapvoteError(f"{self._url}: tile plane {digest[:12]} came damaged; fetch again")
+            raise MapvoteError(f"{self._url}: tile plane {digest[:12]} arrived damaged; fetch it again")
         frame = compress(raw, 1)
         write_whole(kept, frame, private=True)
         return frame

@@ -29,7 +29,7 @@ def unpack_fields(raw: bytes, n: int, part: str) -> dict[str, NDArray[Any]]:
     fields = {}
     for name, (kind, values) in decode_fields(raw, part).items():
         if kind not in FIELD_TYPES:
-            raise MapvoteError(f"{part}: {name}: of type {kind[:20]!r}, which no field has; fetch or send it again")
+            raise MapvoteError(f"{part}: {name} has the type {kind[:20]!r}, which no field has; fetch or send it again")
         if len(values) != n * np.dtype(kind).itemsize:
             held = f"{name} has {len(values)} bytes, but there are {n} points"
             raise MapvoteError(f"{part}: {held}; fetch or send it again")
@@ -42,4 +42,4 @@ def decode_fields(raw: bytes, part: str) -> dict[str, tuple[str, bytes]]:
     try:
         return _FIELDS.decode(raw)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MapvoteError(f"{part}: no fields of points ({error}); fetch or send it again") from error
+        raise MapvoteError(f"{part} holds no fields of points ({error}); fetch or send it again") from error

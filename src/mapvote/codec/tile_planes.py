@@ -135,7 +135,7 @@ def check_plane(data: bytes, digest: str) -> bytes:
     """The content of a plane; MapvoteError if it is not what its hash says."""
     raw = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, f"tile plane {digest[:12]}")
     if hashlib.sha256(raw).hexdigest() != digest:
-        raise MapvoteError(f"tile plane {digest[:12]} is not what its hash says; fetch it again")
+        raise MapvoteError(f"tile plane {digest[:12]} does not match its hash; fetch it again")
     return raw
 
 

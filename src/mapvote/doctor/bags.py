@@ -74,7 +74,7 @@ def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
         late_s = float(np.median(received - stamps)) * 1e-9
         if abs(late_s) > 0.5:  # more than any transport takes
             problem = f"{topic}: messages were received {late_s:.2f} s after their stamps (median)"
-            mend = "the sensor or a simulator (use_sim_time) keeps another clock: do the poses keep the same one?"
+            mend = "the sensor or a simulator (use_sim_time) has another clock: check that the poses use the same one"
             yield Finding("note", problem, mend)
 
 
@@ -98,7 +98,7 @@ def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding
         outside = float(((scans < stamps.min()) | (scans > stamps.max())).mean()) if len(stamps) and len(scans) else 0.0
         if outside > 0.05:
             grave: Severity = "error" if outside > 0.9 else "warning"
-            mend = "do both keep one clock? Use times of one computer, or PTP"
+            mend = "take the times of both from one computer, or use PTP"
             problem = f"{topic} has no pose at the time of {outside:.0%} of the scans"
             yield Finding(grave, problem, mend if outside > 0.9 else "leave these scans out with --scans")
         tracked = frame_id(bag, topic, child=True)
@@ -110,9 +110,9 @@ def _poses(bag: Bag, orders: _Orders, options: DriveOptions) -> Iterator[Finding
 def _mounted(difference: str, T: F64 | None, options: DriveOptions) -> Finding:
     if T is None:
         mend = "give it: --mount X,Y,Z,ROLL,PITCH,YAW (metres, degrees)"
-        return Finding("warning", f"{difference}; nothing in /tf_static says where that sits on it", mend)
+        return Finding("warning", f"{difference}; /tf_static holds no transform between the two", mend)
     if options.mount or options.T_base_lidar or np.allclose(T, np.eye(4), atol=1e-3):
-        return Finding("note", f"{difference}: /tf_static says where that sits on it")
+        return Finding("note", f"{difference}: /tf_static holds the transform between the two")
     rpy_deg = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
     mend = "--mount " + ",".join(f"{v:.3f}" for v in (*T[:3, 3], *rpy_deg))
-    return Finding("warning", f"{difference}: /tf_static says where that sits on it, the prior does not know", mend)
+    return Finding("warning", f"{difference}: /tf_static holds the transform, but the prior does not use it", mend)

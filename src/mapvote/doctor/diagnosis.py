@@ -190,26 +190,26 @@ def check_ballot(data: bytes) -> Iterator[Finding]:
             if tile.states is not None:
                 counts += np.bincount(unpack_states(tile.states).ravel(), minlength=256)
     except MapvoteError as error:
-        yield Finding("error", str(error), "cast it again from the drive, or copy it again")
+        yield Finding("error", str(error), "vote again with the drive, or copy the ballot again")
         return
     changed = int(counts[[CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]].sum())
     determined = changed + int(counts[[CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY]].sum())
     if not ballot.tiles:
-        problem = "it votes on no tile: the vehicle never knew where it was, or saw no cell of the map"
+        problem = "it votes on no tile: no scan was localised, or none saw a cell of the map"
         yield Finding("error", problem, "see mapvote doctor DRIVE --map MAP")
     elif determined and changed > BALLOT_CHECK.most_changed * determined:
         problem = f"it calls {changed / determined:.0%} of the {determined:,} cells that it judges changed"
         yield Finding("warning", problem, "a lost vehicle, or the wrong map? Streets change by a few per cent")
     if ballot.end_ns <= ballot.start_ns:
-        yield Finding("error", "the drive ends before it begins", "mend the times of the drive, and vote again")
+        yield Finding("error", "its drive ends before it begins", "mend the times of the drive, and vote again")
     if ballot.scans_localised < 0.5 * ballot.scans:
         problem = f"only {ballot.scans_localised} of {ballot.scans} scans were localised"
         yield Finding("warning", problem, "is it the map of this street? mapvote doctor DRIVE --map MAP")
     if ballot.median_sigma_m > BALLOT_CHECK.sigma_m:
-        problem = f"the vehicle knew where it was to {ballot.median_sigma_m:.2f} m only (median)"
-        yield Finding("warning", problem, "cells are 0.3 m: such votes blur")
+        problem = f"the sigma of the vehicle's position was {ballot.median_sigma_m:.2f} m (median)"
+        yield Finding("warning", problem, "cells are 0.3 m wide: such votes blur")
     misfit_m = ballot.prior_misfit_m
     sigma_m = ballot.prior_sigma_m
     if misfit_m is not None and sigma_m is not None and misfit_m > max(3.0 * sigma_m, 0.5):
-        problem = f"the vehicle was {misfit_m:.1f} m off its prior (median), which claims {sigma_m:.2f} m"
+        problem = f"the prior was {misfit_m:.1f} m off the localised path (median), but states {sigma_m:.2f} m"
         yield Finding("warning", problem, "measure the offset: mapvote doctor DRIVE --map MAP")

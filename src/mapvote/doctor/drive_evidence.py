@@ -463,7 +463,7 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
         problem = f"the road lies only {road.depth_m:.1f} m below the points' origin"
         yield Finding("warning", problem, "are the points in the vehicle's frame? Give them in the sensor's")
     if road.depth_m > ROAD_PLANE.highest_m:
-        problem = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
+        problem = f"the road lies {road.depth_m:.1f} m below the sensor, as under no vehicle: the scans are too large"
         mend = (
             f"multiply their points by 0.3048 if they are feet (the road then lies {0.3048 * road.depth_m:.1f} m below)"
         )
@@ -476,8 +476,8 @@ def check_road(e: DriveEvidence) -> Iterator[Finding]:
         pitch = np.degrees(np.arcsin(-road.normal[0]))
         roll = np.degrees(np.arcsin(road.normal[1]))
         problem = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg"
-        mend = f"turn the points by {roll:.1f} deg about x and {pitch:.1f} deg about y, which levels the road in them, "
-        mend += "or put the sensor's tilt into the prior's rotations; on a hill all is well"
+        mend = f"turn the points by {roll:.1f} deg about x and {pitch:.1f} deg about y, which levels the road, "
+        mend += "or put the sensor's tilt into the prior's rotations; ignore this on a hill"
         yield Finding("error" if tilt_deg > 8.0 else "warning", problem, mend)
 
 
@@ -491,12 +491,12 @@ def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
     mend = f"are the scans in order of time ({times}), of one drive, and whole?"
     if len(broken) > 0.5 * len(runs):
         fit = float(np.median([run.usual_fit for run in runs]))
-        problem = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"
+        problem = f"scans do not fit those before them: {fit:.0%} of the points agree (sound drives: 75 to 95 %)"
     elif len(leaps) and leaps.mean() > 0.25:
         problem = (
-            "the scans leap: they are out of order, or their times are wrong (the vehicle would brake or start as "
+            f"the scans leap: {leaps.mean():.0%} of the steps need an acceleration that no vehicle has. They are out "
+            "of order, or their times are wrong"
         )
-        problem += f"none can in {leaps.mean():.0%} of the steps)"
     elif np.median(speed) > 70.0:
         problem = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
         mend = "check the times (seconds), and that the points are metres"

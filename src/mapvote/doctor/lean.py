@@ -48,7 +48,10 @@ def check_lean(drive: Drive, index: int, rules: RoadBelow = RULES) -> Iterator[F
     low, high = rules.depth_m
     problem = f"the prior tilts the sensor by {mount.lean_deg:.0f} deg"
     if low <= -densest_m <= high and layers.max() >= rules.share * max(len(heights), 1):
-        yield Finding("note", f"{problem}, and by the points a road lies {-densest_m:.1f} m below it: it is mounted so")
+        yield Finding(
+            "note",
+            f"{problem}: it is mounted that way, for its points show a road {-densest_m:.1f} m below it",
+        )
         return
-    mend = "is it mounted so? Else mend the prior's rotations: x is forward, z up"
-    yield Finding("warning", f"{problem}, but no road lies below it then", mend)
+    mend = "if it is not mounted that way, correct the prior's rotations: x is forward, z up"
+    yield Finding("warning", f"{problem}, but the points show no road below it", mend)

@@ -132,7 +132,7 @@ def _measured(
         off_deg = float(np.degrees(np.linalg.norm(off[3:])))
         steady = np.linalg.norm(spread[:3]) < 0.3 * off_m or np.degrees(np.linalg.norm(spread[3:])) < 0.3 * off_deg
         if steady and (off_m > rules.off_m or off_deg > rules.off_deg):
-            problem = f"by its points {topics[k + 1]} sits {off_m:.2f} m and {off_deg:.1f} deg off its stated place"
+            problem = f"the points of {topics[k + 1]} show it {off_m:.2f} m and {off_deg:.1f} deg off its stated place"
             measured = T_base_lidars.copy()
             measured[k + 1] = T_base_lidars[0] @ T @ exp(off)
             yield Finding("warning", problem, f"{_line(topics, measured)}; or leave it out with --topic")

@@ -156,7 +156,7 @@ def _share(drive: LocalisedDrive, point_map: PointMap | None, rules: LocalisedRu
     scans = int(on_map.sum())
     sure = int(drive.sure.sum())
     if scans >= rules.least_scans and sure < rules.least_share * scans:
-        problem = f"only {sure} of {scans} scans that lie on the map have a sure place in it"
+        problem = f"only {sure} of {scans} scans that lie on the map could be localised in it"
         yield Finding("error", problem, f"is it the map of this street? {_PLACE_MEND}")
 
 
@@ -190,7 +190,8 @@ def _ways(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iter
     if np.median(np.abs(came_m - believed_m) - slack_m) > 0.0:
         apart_m = float(np.median(np.abs(came_m - believed_m)))
         problem = (
-            f"over pieces of {piece:.0f} m the way found and the way by the prior differ by {apart_m:.1f} m (median)"
+            f"over stretches of {piece:.0f} m the localised path and the prior differ in length by {apart_m:.1f} m "
+            "(median)"
         )
         yield Finding("error", problem, _PLACE_MEND)
 
@@ -201,7 +202,7 @@ def _attitude(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> 
     apart_deg = np.degrees(scipy.spatial.transform.Rotation.from_matrix(apart).magnitude())
     median_deg = float(np.median(apart_deg))
     if median_deg > rules.turn_deg + 4.0 * drive.sigma_deg:
-        problem = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the one found"
+        problem = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the localised one"
         yield Finding("error", problem, f"are the axes of prior and points the same (x forward, z up)? {_PLACE_MEND}")
 
 
@@ -211,6 +212,6 @@ def _positions(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) ->
     scatter_m = float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
     if scatter_m > rules.off_m + 4.0 * drive.sigma_m:
         problem = (
-            f"the prior lies {scatter_m:.1f} m (median) about its mean difference from the places found, but states "
+            f"the prior lies {scatter_m:.1f} m (median) about its mean offset from the localised path, but states "
         )
         yield Finding("error", f"{problem}{drive.sigma_m:.2f} m", _PLACE_MEND)

@@ -194,9 +194,12 @@ def check_on_map(
     good = fitting(places)
     if len(good) < 2:
         best = max(places, key=lambda p: p.fit)
-        problem = f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the "
+        problem = (
+            f"the drive fits the map nowhere: the best fit is {best.fit:.2f} (scan {best.index}), and scans of the "
+            f"mapped street fit above {POSE_CHECK.min_fit}"
+        )
         mend = "is it the map of another street, in another scale or tilt, or all changed?"
-        return [*findings, Finding("error", f"{problem}same street fits above {POSE_CHECK.min_fit}", mend)], T
+        return [*findings, Finding("error", problem, mend)], T
     # Places far apart show the scale as well, but no better than the prior's positions are known.
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
@@ -384,9 +387,7 @@ def _outside(T: F64, point_map: PointMap) -> Iterator[Finding]:
             f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
             f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
         )
-        yield Finding(
-            "error", problem, "have prior and map the same frame and origin (for oxts: origin in drive.toml)?"
-        )
+        yield Finding("error", problem, "give prior and map the same frame and origin (for oxts: origin in drive.toml)")
     elif share < 0.95:
         yield Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote")
 

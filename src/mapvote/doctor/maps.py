@@ -141,7 +141,7 @@ def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
     """Findings on points in map metres, as a file holds them. ``ground``: the points that it classifies as ground."""
     n = sum(map(len, pieces()))
     if n < MAP_CHECK.few_points:
-        return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
+        return [Finding("warning", f"the map holds only {n} points", "is the file cut off, or the wrong one?")]
     sample = _every(pieces, max(1, n // MAP_CHECK.checked_points))
     low, high = np.quantile(sample, (0.001, 0.999), axis=0)
     apart_m = spacing(pieces, sample)
@@ -152,9 +152,7 @@ def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
         findings += which_way_up(sample, high - low, classified)
     twice = float((apart_m < 1e-6).mean())
     if twice >= 0.05:
-        findings.append(
-            Finding("warning", f"{twice:.0%} of the points are there twice", "the map was joined with itself?")
-        )
+        findings.append(Finding("warning", f"{twice:.0%} of the points occur twice", "was the map merged with itself?"))
     return [*findings, *_rounded(sample)]
 
 
@@ -317,7 +315,7 @@ def check_map(point_map: PointMap) -> Iterator[Finding]:
     height = np.concatenate([t.points_map[:, 2] - t.ground_z.reshape(-1)[t.cells] for t in tiles])
     yield from _ground(points, height)
     for problem in filter(None, (check_heights(point_map, path).complaint for path in point_map.driven)):
-        mend = "where drives run above each other it keeps one level, and the other cannot vote there"
+        mend = "each cell stores one ground level, and vehicles on the other level cannot vote there"
         yield Finding("warning", problem, f"build the map anew; {mend}")
     yield from _missing_tiles(point_map)
     if middle is not point_map:
@@ -328,19 +326,19 @@ def check_map(point_map: PointMap) -> Iterator[Finding]:
     lone = sum(int(lone_points(tile).sum()) for tile in middle.tiles.values())
     if lone > MAP_CHECK.most_lone * middle.n_points:
         problem = f"{lone} of {middle.n_points} points stand above the ground and touch no other"
-        yield Finding("note", problem, "vehicles will deny them; mapvote import --clean drops them")
+        yield Finding("note", problem, "vehicles will vote them away; mapvote import --clean drops them")
     standing = points[(height > 0.5) & (height < 6.0)]
     yield from _lean(standing)
     layer_m = ghost_layer(height)
     if layer_m is not None:
-        problem = f"the road lies there twice, {abs(layer_m):.2f} m apart in height: a ghost layer"
+        problem = f"the road occurs twice, {abs(layer_m):.2f} m apart in height: a ghost layer"
         yield Finding("error", problem, "two drives of different height were merged: align them")
     elif float(np.median(spacing(in_memory(points), points))) < MAP_CHECK.sparse_m:
         shift = ghost_shift(standing)
         if shift is not None:
             x, y = shift
             by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
-            problem = f"walls and poles are there twice, shifted by {by}: a ghost layer"
+            problem = f"walls and poles occur twice, shifted by {by}: a ghost layer"
             yield Finding("error", problem, "two drives were merged without alignment: align them")
     yield _frame(point_map)
 

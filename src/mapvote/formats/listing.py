@@ -15,7 +15,7 @@ def plain_name(name: str, said_by: Path) -> str:
     """``name``, which ``said_by`` gives to a file or folder. MapvoteError if it leads elsewhere ("..", "a/b", "C:x"):
     content never opens a file that nobody handed over."""
     if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,255}", name) or name in (".", "..") or PureWindowsPath(name).drive:
-        raise MapvoteError(f"{said_by}: {name[:80]!r} is no plain name of a file; name a file beside this one")
+        raise MapvoteError(f"{said_by}: {name[:80]!r} is not a plain file name; name a file beside this one")
     return name
 
 

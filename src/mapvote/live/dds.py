@@ -75,7 +75,7 @@ class Network:
         except Exception as error:
             raise MapvoteError(
                 f"DDS domain {self.domain}: cannot be joined ({first_line(error)}). Is a network interface up, is it "
-                "the one that CYCLONEDDS_URI names, and is the XML there whole? (The line above says more)"
+                "the one that CYCLONEDDS_URI names, and is the XML there whole? (The line above tells more)"
             ) from error
         self._own = str(self._participant.guid)
         self._waitset = self._core.WaitSet(self._participant)

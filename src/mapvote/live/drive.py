@@ -167,7 +167,7 @@ class FirstSeconds:
         return in_order(findings)
 
     def _on_map(self, drive: Drive, point_map: PointMap, lost: int, decided: int) -> list[Finding]:
-        problem = f"{lost} of the first {decided} scans have no sure place on map {point_map.map_id}"
+        problem = f"{lost} of the first {decided} scans are not localised on map {point_map.map_id}"
         lost_scans = Finding("warning", problem, "they cast no vote; is this the map of this road?")
         if drive.T_map_lidar_prior is None:
             return [lost_scans]

@@ -53,7 +53,7 @@ class FixTopics:
         height_m = message.altitude if np.isfinite(message.altitude) else self._height_m
         lonlat = np.array([[message.longitude, message.latitude, height_m]])
         if message.status.status < 0:
-            raise MapvoteError("a fix whose status says that it is none: the receiver finds no satellites")
+            raise MapvoteError("a fix whose status is NO_FIX: the receiver finds no satellites")
         _, place = sound_fixes("a fix", lonlat)
         self._height_m = float(place[0, 2])
         times_ns = np.array([stamp_ns(message.header)], dtype=np.int64)

@@ -49,7 +49,7 @@ def ros_names(namespace: str = "", remaps: Sequence[str] = ()) -> RosNames:
         if source == "__ns":
             namespace = target
         elif source.startswith("__"):
-            raise MapvoteError(f"-r {remap}: of the special names only __ns is known here")
+            raise MapvoteError(f"-r {remap}: the only special name that is supported is __ns")
         else:
             pairs.append((source, target))
     base = _absolute(namespace.rstrip("/"), "/") if namespace.strip("/") else "/"
@@ -72,6 +72,6 @@ def sim_time_of(parameters: Sequence[str]) -> bool:
     for parameter in parameters:
         name, _, value = parameter.partition(":=")
         if name != "use_sim_time" or value not in ("true", "false"):
-            raise MapvoteError(f"-p {parameter}: known is use_sim_time:=true or use_sim_time:=false")
+            raise MapvoteError(f"-p {parameter}: give use_sim_time:=true or use_sim_time:=false, the only parameter")
         use_sim_time = value == "true"
     return use_sim_time

@@ -25,7 +25,7 @@ from mapvote.live.sweeps import Cloud
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")
-_NO_PLACE = "no scan has a sure place: is this the map of this road? mapvote doctor says more"
+_NO_PLACE = "no scan is localised: is this the map of this road? mapvote doctor tells more"
 
 
 @record()

@@ -90,7 +90,7 @@ def place_without_prior(points_a: F64, points_b: F64, numbers: CoarseSearch = CO
     local = points_b - middle_b
     (cells_a, weight_a), (cells_b, weight_b) = _weights(points_a, numbers), _weights(local, numbers)
     if not len(cells_a) or not len(cells_b):
-        raise MapvoteError("nothing stands in one of the clouds: two planes of ground cannot be registered")
+        raise MapvoteError("one of the clouds holds nothing but ground: two planes cannot be registered")
     tall = np.column_stack([(cells_b + 0.5) * numbers.cell_m, weight_b])
     sample = local[np.random.default_rng(0).permutation(len(local))[: numbers.sample]]
     height_over = _heights(points_a, numbers)

@@ -94,7 +94,7 @@ def test_an_mcap_that_is_cut_off_is_read_up_to_the_cut(tmp_path: Path, share: fl
     data = whole.read_bytes()
     whole.write_bytes(data[: int(share * len(data))])
     found = [f for f in check_bag(tmp_path / "bag") if f.severity == "warning"]
-    assert "bytes are no whole record and left out. `mcap recover" in found[0].what
+    assert "bytes are an incomplete record and left out. `mcap recover" in found[0].what
     drive = open_drive(tmp_path / "bag", sensor="hdl32e")
     assert share * N - 4 <= len(drive) <= share * N + 1
     for scan, sound in zip(drive, scans, strict=False):

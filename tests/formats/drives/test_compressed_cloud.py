@@ -67,7 +67,7 @@ def test_a_driver_that_sends_one_cloud_in_several_formats_is_one_lidar(tmp_path:
     [
         ("draco", b"DRACO", r"compressed by draco: send zstd or zlib, or .*republish .*in_transport:=draco"),
         ("cloudini/v1", b"", r"compressed by cloudini/v1"),
-        ("", b"", r"compressed by nobody knows what: .*in_transport:=FORMAT"),
+        ("", b"", r"compressed by an unnamed method: .*in_transport:=FORMAT"),
         ("zstd", zstd.compress(POINTS.tobytes())[:-9], r"cut off|do not decompress"),
         ("zstd", b"no zstd at all", r"do not decompress by zstd"),
         ("zlib", gzip.compress(POINTS.tobytes())[:100], r"cut off"),

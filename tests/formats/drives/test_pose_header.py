@@ -106,5 +106,5 @@ def test_altitudes_that_are_all_missing_are_told(caplog: pytest.LogCaptureFixtur
     _, place = sound_fixes("bag: /fix", np.array([[8.4, 49.0, np.nan]] * 2))
     assert place[:, 2].tolist() == [0.0, 0.0]
     assert "taken as 0 m" in caplog.text
-    with pytest.raises(MapvoteError, match="none of its 2 fixes is one"):
+    with pytest.raises(MapvoteError, match="none of its 2 fixes is valid"):
         sound_fixes("bag: /fix", np.zeros((2, 3)))

@@ -141,7 +141,7 @@ def matrix_in(bag: Bag, topic: str, p: Any, q: Any) -> F64:
     """T (4, 4) of the position and quaternion of a message. MapvoteError names the topic where they are no pose."""
     if not np.any([q.x, q.y, q.z, q.w]):
         raise MapvoteError(
-            f"{bag.path}: {topic} holds a quaternion of zeros, which is no rotation: mend who writes it, or choose "
+            f"{bag.path}: {topic} holds a quaternion of zeros, which is no rotation: correct its publisher, or choose "
             f"another topic (poses: --prior TOPIC or --prior none; LiDARs: --topic)"
         )
     return pose_of_message(p, q)

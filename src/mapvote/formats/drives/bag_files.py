@@ -148,7 +148,7 @@ def _storage_files(files: list[Path], mended: list[str]) -> BagFiles:
         paths.append(whole)
         lost = file.stat().st_size - whole.end
         problem = (
-            f"{file}: cut off, the recording was not stopped properly; its last {lost:,} bytes are no whole record"
+            f"{file}: cut off, the recording was not stopped properly; its last {lost:,} bytes are an incomplete record"
         )
         mended.append(f"{problem} and left out. `{mend_of(file)}` writes a whole file")
     return BagFiles(paths, mended)

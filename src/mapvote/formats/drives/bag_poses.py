@@ -116,7 +116,7 @@ def prior_of_bag(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: Poses) 
     except MapvoteError as error:
         if options.prior is not None:
             raise
-        log.warning("%s. No prior is used; --prior TOPIC says which one counts", error)
+        log.warning("%s. No prior is used; --prior TOPIC chooses one", error)
         return Prior()
 
 

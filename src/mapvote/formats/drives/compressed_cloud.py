@@ -41,7 +41,7 @@ def decompressed(source: str, message: Any) -> bytes:
     read."""
     form = str(message.format).strip().lower()
     if form not in _READ:
-        raise MapvoteError(f"{source}: its points are compressed by {form or 'nobody knows what'}: {republished(form)}")
+        raise MapvoteError(f"{source}: its points are compressed by {form or 'an unnamed method'}: {republished(form)}")
     size = int(message.height) * max(int(message.row_step), int(message.width) * int(message.point_step))
     try:
         data = _READ[form](bytes(message.compressed_data), size)

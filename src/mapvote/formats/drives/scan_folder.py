@@ -85,7 +85,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     if stamps_ns is not None:
         return stamps_ns
     if options.rate_hz is None:
-        raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
+        raise MapvoteError(f"{table}: missing; write one line of seconds per scan, or give --rate HZ (10 for KITTI)")
     return options.start_ns + np.round(np.arange(len(files)) * (1e9 / options.rate_hz)).astype(np.int64)
 
 

@@ -237,7 +237,7 @@ def sound_fixes(source: str, lonlat: F64, status: F64 | None = None) -> tuple[Bo
         )
         log.warning(problem, source, (~keep).sum(), len(keep), no_fix.sum(), (at_zero & ~no_fix).sum(), (~finite).sum())
     if not keep.any():
-        raise MapvoteError(f"{source}: none of its {len(keep)} fixes is one; choose another prior, or --prior none")
+        raise MapvoteError(f"{source}: none of its {len(keep)} fixes is valid; choose another prior, or --prior none")
     place = np.array(lonlat[keep], dtype=np.float64)
     high = np.isfinite(place[:, 2])
     if not high.all():

@@ -125,13 +125,13 @@ def _in_metres(source: str, wanted: MapFrame) -> MapFrame:
     crs = read_crs(wanted.crs)
     if crs.is_geographic or crs.is_geocentric:
         raise MapvoteError(
-            f"{source}: a map needs metres, but {crs.name} is none of a projection; give --crs EPSG:326zz"
+            f"{source}: a map needs metres, but {crs.name} is not a projected system; give --crs EPSG:326zz"
         )
     if _units(crs) == (1.0, 1.0):
         return wanted
     horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
     in_metres = pyproj().CRS.from_json_dict(_with_unit(horizontal.to_json_dict(), "metre"))
-    log.warning("%s: a map is in metres: %s is taken so", source, horizontal.name)
+    log.warning("%s: a map is in metres, so the units of %s are taken as metres", source, horizontal.name)
     return replace(wanted, crs=_short(in_metres.to_wkt()))
 
 

@@ -111,7 +111,7 @@ def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
     try:
         named = {tile_index(key): hashes for key, hashes in manifest.tiles.items()}
     except ValueError as error:
-        raise MapvoteError(f"{path / MANIFEST}: names a tile by no row and column ({error})") from error
+        raise MapvoteError(f"{path / MANIFEST}: the name of a tile is no row and column ({error})") from error
 
     side_m = np.float32(TILE_CELLS * CELL_SIZE)
 

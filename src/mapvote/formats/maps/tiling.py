@@ -68,7 +68,7 @@ class Spill:
                 self._end += self._file.write(np.ascontiguousarray(column).reshape(-1).view(np.uint8).data)
         except OSError as error:
             folder = self._folder or tempfile.gettempdir()
-            raise MapvoteError(f"{folder}: no room for temporary files ({error.strerror or error})") from error
+            raise MapvoteError(f"{folder}: temporary files cannot be written ({error.strerror or error})") from error
         return len(self._blocks) - 1
 
     def read(self, number: int) -> Columns:
@@ -205,7 +205,7 @@ class _Taken:
     def lattice(self) -> Lattice:
         """Where the map's cells lie. MapvoteError if no map can be made of what was taken."""
         if not self.total:
-            raise MapvoteError(f"{self.where}: holds no points; a map needs some")
+            raise MapvoteError(f"{self.where}: holds no points; a map needs at least one")
         if self.bad == self.total or self.bad > self.most_bad * self.total:
             raise MapvoteError(
                 f"{self.where}: {self.bad} of {self.total} points are not finite or no coordinates, more than "
