@@ -25,9 +25,9 @@ from mapvote_server.api import (
     vehicle_routes,
 )
 from mapvote_server.api.event_routes import deliver
-from mapvote_server.api.openapi import describe_keys, not_allowed
+from mapvote_server.api.openapi import complete_document
+from mapvote_server.api.problems import failed, not_allowed, unknown_path, unreadable, unusable
 from mapvote_server.api.proxies import Proxies
-from mapvote_server.api.schemas import unreadable, unusable
 from mapvote_server.api.security import Guard, Hosts, Watch
 from mapvote_server.api.services import Services
 from mapvote_server.errors import Unavailable
@@ -83,8 +83,10 @@ def create_app(
         app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
     app.add_exception_handler(RequestValidationError, unusable)
+    app.add_exception_handler(404, unknown_path)
     app.add_exception_handler(405, not_allowed)
-    describe_keys(app)
+    app.add_exception_handler(Exception, failed)
+    complete_document(app)
     hosts = Hosts(parts.settings.server.hosts)
     guard = Guard(parts, opened=opened, owner=owner)
     app.add_middleware(Watch, hosts=hosts, guard=guard, proxies=Proxies(parts.settings.server.proxies), parts=parts)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 from mapvote.shapes.geojson import Changes, feature_rows
 from mapvote_server.api.etags import has_already, tag_of
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
     AS_YOU_HAVE,
@@ -18,7 +19,6 @@ from mapvote_server.api.schemas import (
     MOST,
     as_json,
     as_table,
-    problems,
 )
 from mapvote_server.api.services import Known, Parts
 from mapvote_server.questions.changes import Comparison, changes_between, compare_versions, page_between
@@ -45,6 +45,7 @@ class ChangesAsked(Between):
 
 @router.get(
     "/v1/changes",
+    operation_id="list_changes",
     response_model=Changes,
     responses=problems(404) | AS_CSV | AS_YOU_HAVE,
     summary="What changed, as GeoJSON in map metres or as CSV",
@@ -60,10 +61,10 @@ def changes(request: Request, parts: Parts, known: Known, asked: Annotated[Chang
     if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     shown: dict[str, Any] = {"limit": asked.limit, "offset": asked.offset}
-    found = changes_between(parts.store, asked.old, newest, asked.min_cells, lonlat=asked.lonlat, known=known, **shown)
-    answer = as_table(feature_rows(found.features)) if asked.format == "csv" else as_json(found)
-    after = asked.offset + found.numberReturned
-    if after < found.numberMatched:
+    listed = changes_between(parts.store, asked.old, newest, asked.min_cells, lonlat=asked.lonlat, known=known, **shown)
+    answer = as_table(feature_rows(listed.features)) if asked.format == "csv" else as_json(listed)
+    after = asked.offset + listed.numberReturned
+    if after < listed.numberMatched:
         following = dict(request.query_params) | {"to": str(newest), "offset": str(after)}
         headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
     answer.headers.update(headers)
@@ -72,6 +73,7 @@ def changes(request: Request, parts: Parts, known: Known, asked: Annotated[Chang
 
 @router.get(
     "/v1/changes/page",
+    operation_id="get_changes_page",
     response_class=Response,
     responses=problems(404) | AS_YOU_HAVE | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
     summary="What changed, as a page that needs no server",

@@ -13,6 +13,7 @@ from mapvote.core.answers import answer
 from mapvote.shapes.geojson import feature_rows
 from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
+from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
     MOST_SEQ,
@@ -22,7 +23,6 @@ from mapvote_server.api.schemas import (
     TableOrMap,
     as_json,
     as_table,
-    problems,
     sends_bytes,
 )
 from mapvote_server.api.services import Parts, Reviewer, Services
@@ -43,6 +43,7 @@ class ReviewAsk(Ask):
 
 @router.get(
     "/v1/desk",
+    operation_id="get_desk",
     response_model=DeskAnswer | Pending,
     responses=problems(403) | AS_CSV,
     summary="What a publish would change now",
@@ -54,14 +55,19 @@ async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") ->
 
     ``geojson`` and ``csv`` hold all of them in one list.
     """
-    found = (await _look(parts)).answer
+    shown = (await _look(parts)).answer
     if format == "json":
-        return as_json(found)
-    listed = found.in_one()
+        return as_json(shown)
+    listed = shown.in_one()
     return as_json(listed) if format == "geojson" else as_table(list(map(_flat, feature_rows(listed.features))))
 
 
-@router.get("/v1/desk/clouds", summary="Points that a publish would add and delete", **sends_bytes(403))
+@router.get(
+    "/v1/desk/clouds",
+    operation_id="get_pending_clouds",
+    summary="Points that a publish would add and delete",
+    **sends_bytes(403),
+)
 async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Response:
     """Tile by tile, two clouds each, as `/v1/clouds/changed` gives them."""
     return packed(request, (await _look(parts)).clouds, "no-store")
@@ -69,9 +75,9 @@ async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Respon
 
 async def _look(parts: Services) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
-    found = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
-    parts.clouds.propose((made.hashes, made.make) for made in found.edited.values())
-    return found
+    looked_at = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
+    parts.clouds.propose((made.hashes, made.make) for made in looked_at.edited.values())
+    return looked_at
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -92,7 +98,12 @@ class VerdictGiven:
     seq: int
 
 
-@router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
+@router.post(
+    "/v1/desk/reviews",
+    operation_id="review_change",
+    responses=problems(403, 404, 409),
+    summary="Accept, hold or reject a change",
+)
 async def decide(by: Reviewer, parts: Parts, ask: ReviewAsk) -> VerdictGiven:
     """A publish obeys it: the votes of a rejected change do not count any more, those of a held one wait.
 
@@ -104,7 +115,12 @@ async def decide(by: Reviewer, parts: Parts, ask: ReviewAsk) -> VerdictGiven:
     )
 
 
-@router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
+@router.delete(
+    "/v1/desk/reviews/{seq}",
+    operation_id="undo_review",
+    responses=problems(403, 404, 409),
+    summary="Take a verdict back",
+)
 @on("commands")
 def take_back(by: Reviewer, parts: Parts, seq: Annotated[int, Path(ge=0, le=MOST_SEQ)]) -> VerdictGiven:
     """The change is pending again."""

@@ -19,7 +19,8 @@ from standardwebhooks import Webhook
 
 from mapvote.core.record import record
 from mapvote_server.api.connections import step_aside
-from mapvote_server.api.schemas import MOST_SEQ, problems
+from mapvote_server.api.problems import problems
+from mapvote_server.api.schemas import MOST_SEQ
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import TooMany, Unauthorised, Unavailable
 from mapvote_server.questions.history import Event, newest_event, take, taken_up_to, without_names
@@ -47,6 +48,7 @@ router = APIRouter()
 
 @router.get(
     "/v1/events",
+    operation_id="listen",
     responses=problems() | {200: {"content": {"text/event-stream": {}}}},
     response_class=StreamingResponse,
     summary="What happens, as it happens",

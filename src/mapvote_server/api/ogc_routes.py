@@ -18,6 +18,7 @@ from fastapi import APIRouter, Request, Response
 
 from mapvote.core.times import utc
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import PROBLEM_JSON
 from mapvote_server.api.schemas import LEAST, MOST
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import BadRequest, Forbidden, NotFound
@@ -327,7 +328,8 @@ def _openapi(request: Request) -> dict[str, Any]:
 
     def get(summary: str, kind: str = _JSON, parameters: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
         answers = {"200": {"description": summary, "content": {kind: {"schema": {"type": "object"}}}}}
-        bad = {code: {"description": "refused; the body says why"} for code in ("400", "401", "404")}
+        problem = {PROBLEM_JSON: {"schema": {"type": "object"}}}
+        bad = {code: {"description": "refused; the body says why", "content": problem} for code in (400, 401, 404)}
         return {"get": {"summary": summary, "parameters": [*parameters], "responses": answers | bad}}
 
     paths = {

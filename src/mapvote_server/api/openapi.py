@@ -1,14 +1,19 @@
-"""Additions to FastAPI: keys in the OpenAPI document, and every method of a path in the Allow of a 405."""
+"""Additions to FastAPI's OpenAPI document: groups of operations, examples, how a key is sent, the one shape
+of errors."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
 from typing import Any
 
-from fastapi import FastAPI, Request, Response
-from fastapi.responses import JSONResponse
-from starlette.routing import Match, Route
+from fastapi import FastAPI
+from pydantic import TypeAdapter
 
 from mapvote_server.api.key_form import COOKIE
+from mapvote_server.api.problems import Problem
 
 SCHEMES: dict[str, dict[str, Any]] = {
     "bearer": {"type": "http", "scheme": "bearer", "description": "the key"},
@@ -16,29 +21,67 @@ SCHEMES: dict[str, dict[str, Any]] = {
     "cookie": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "a browser's, set by its form"},
 }
 KEYLESS = "/livez", "/readyz"
+GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "map": ("Versions of the map, and the planes of its tiles", ("map", "tiles", "clouds")),
+    "ballots": ("Votes of vehicles", ("ballots",)),
+    "changes": ("What was built and demolished, and the votes for it", ("changes", "cells", "evidence")),
+    "coverage": ("Where vehicles have been, and where one should drive next", ("coverage", "paths", "vehicles")),
+    "review": ("Changes before they are published", ("desk",)),
+    "publishing": ("New versions, and the policy for them", ("publish", "rollback", "replay", "policy")),
+    "events": ("What happens, and what has happened", ("events", "log")),
+    "store": ("What the store holds, damage, retention", ("info", "check", "gc")),
+    "keys": ("Who may do what", ("keys",)),
+    "health": ("Probes and metrics", ("livez", "healthz", "readyz", "metrics")),
+}
+"""Groups of operations: each with its description, and the first words of its paths below /v1."""
 
 
-def describe_keys(app: FastAPI) -> None:
-    """State in the app's OpenAPI document how a key is sent, and which paths need none."""
-    without_keys = app.openapi
+def complete_document(app: FastAPI) -> None:
+    """Complete the app's OpenAPI document."""
+    by_fastapi = app.openapi
 
     def described() -> dict[str, Any]:
-        document = without_keys()
-        document["components"]["securitySchemes"] = SCHEMES
-        document["security"] = [{name: []} for name in SCHEMES]
-        for path in KEYLESS:
-            for operation in document["paths"][path].values():
-                operation["security"] = [{}, *document["security"]]
-        return document
+        if app.openapi_schema is None:
+            app.openapi_schema = completed(by_fastapi())
+        return app.openapi_schema
 
     app.openapi = described  # type: ignore[method-assign]
 
 
-async def not_allowed(request: Request, error: Exception) -> Response:
-    """405, with every method that the path has: its routes are apart, and each knows its own methods only."""
-    methods: set[str] = set()
-    for route in request.app.routes:
-        if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE:
-            methods |= route.methods or set()
-    allow = ", ".join(sorted(methods))
-    return JSONResponse({"detail": f"this path takes {allow}"}, 405, {"Allow": allow})
+def completed(document: dict[str, Any]) -> dict[str, Any]:
+    """FastAPI's ``document`` with all that this module adds."""
+    document["tags"] = [{"name": name, "description": about} for name, (about, _) in GROUPS.items()]
+    document["components"]["schemas"]["Problem"] = TypeAdapter(Problem).json_schema()
+    document["components"]["securitySchemes"] = SCHEMES
+    document["security"] = [{name: []} for name in SCHEMES]
+    groups = {word: name for name, (_, words) in GROUPS.items() for word in words}
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            operation["tags"] = [groups[path.removeprefix("/v1").split("/")[1]]]
+            _add_examples(operation)
+            if path in KEYLESS:
+                operation["security"] = [{}, *document["security"]]
+    return document
+
+
+@cache
+def examples() -> dict[str, Any]:
+    """Recorded requests and answers (benchmarks/document_contract.py): "parameters" by name, "requests" and "answers"
+    by operation."""
+    text = (resources.files("mapvote_server.api") / "examples.json").read_text()
+    recorded: dict[str, Any] = json.loads(text)
+    return recorded
+
+
+def _add_examples(operation: dict[str, Any]) -> None:
+    recorded = examples()
+    name = operation["operationId"]
+    for parameter in operation.get("parameters", ()):
+        if parameter["name"] in recorded["parameters"]:
+            parameter["example"] = recorded["parameters"][parameter["name"]]
+    if name in recorded["requests"]:
+        operation["requestBody"]["content"]["application/json"]["example"] = recorded["requests"][name]
+    for code in ("200", "201"):
+        content = operation["responses"].get(code, {}).get("content", {})
+        if name in recorded["answers"] and "application/json" in content:
+            content["application/json"]["example"] = recorded["answers"][name]

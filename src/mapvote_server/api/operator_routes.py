@@ -13,9 +13,11 @@ from fastapi import APIRouter, Query, Request, Response
 from prometheus_client import generate_latest
 
 from mapvote.core.answers import answer
+from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import Places, tile_squares
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
     Digest,
@@ -30,7 +32,6 @@ from mapvote_server.api.schemas import (
     TableOrMap,
     as_json,
     as_table,
-    problems,
 )
 from mapvote_server.api.services import Known, Operator, Parts, Progress, Reviewer, Services
 from mapvote_server.api.vehicle_routes import Withdrawn
@@ -56,12 +57,24 @@ from mapvote_server.store.rollback import replay, rollback
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import withdraw
 
-_MOST_EVIDENCE = 50
+
+@record()
+@dataclass(frozen=True, slots=True)
+class OperatorSizes:
+    """Sizes of answers to operators."""
+
+    evidence: int = 50
+    """Contradictions of a vehicle that are told, at most."""
+    damaged: int = 20
+    """Damaged things that /readyz names; the log has all."""
+
+
+OPERATOR_SIZES = OperatorSizes()
 Everybody = Annotated[bool, Query(json_schema_extra={"const": True})]
 router = APIRouter()
 
 
-@router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
+@router.post("/v1/publish", operation_id="publish", responses=problems(403, 409), summary="Publish the next version")
 async def publish_now(by: Operator, parts: Parts, ask: PublishAsk) -> Published:
     """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
     return await parts.rounds.run(_publish, parts, ask, by)
@@ -75,7 +88,13 @@ class Publishes:
     running: list[Progress]
 
 
-@router.get("/v1/publish", response_model=Publishes, responses=problems(403), summary="How far a publish is")
+@router.get(
+    "/v1/publish",
+    operation_id="list_publishes",
+    response_model=Publishes,
+    responses=problems(403),
+    summary="How far a publish is",
+)
 async def publishing_now(by: Reviewer, parts: Parts) -> Response:
     """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
     return as_json(Publishes(parts.publishing.now()))
@@ -90,7 +109,11 @@ class Cancelled:
 
 
 @router.delete(
-    "/v1/publish", response_model=Cancelled, responses=problems(403, 404), summary="Cancel what is being published"
+    "/v1/publish",
+    operation_id="cancel_publish",
+    response_model=Cancelled,
+    responses=problems(403, 404),
+    summary="Cancel what is being published",
 )
 async def cancel_publishing(by: Operator, parts: Parts) -> Response:
     """Every publish under way ends before its next tiles with 409; no part of it is published."""
@@ -141,7 +164,11 @@ class RolledBack:
 
 
 @router.post(
-    "/v1/rollback", response_model=RolledBack, responses=problems(403, 404, 409), summary="Go back to an older version"
+    "/v1/rollback",
+    operation_id="roll_back",
+    response_model=RolledBack,
+    responses=problems(403, 404, 409),
+    summary="Go back to an older version",
 )
 async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     """A new version with the tiles of the old one; the votes that led away from it count no more."""
@@ -149,7 +176,13 @@ async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     return as_json(RolledBack(version.number))
 
 
-@router.get("/v1/cells", response_model=CellStory, responses=problems(), summary="The votes behind one cell")
+@router.get(
+    "/v1/cells",
+    operation_id="explain_cell",
+    response_model=CellStory,
+    responses=problems(),
+    summary="The votes behind one cell",
+)
 @on("questions")
 def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
     """Each ballot's statement on the cell at (x, y), map metres, whether it counts, and the decision of each
@@ -167,6 +200,7 @@ class Coverage:
 
 @router.get(
     "/v1/coverage",
+    operation_id="list_coverage",
     response_model=Coverage | Places,
     responses=problems() | AS_CSV,
     summary="Freshness of every tile",
@@ -181,7 +215,13 @@ def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
     return as_table(rows) if format == "csv" else as_json(tile_squares(rows, parts.store.lattice))
 
 
-@router.get("/v1/coverage/passes", response_model=Passes, responses=problems(403), summary="Where to drive next")
+@router.get(
+    "/v1/coverage/passes",
+    operation_id="list_passes",
+    response_model=Passes,
+    responses=problems(403),
+    summary="Where to drive next",
+)
 @on("questions")
 def passes(by: Reviewer, parts: Parts) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
@@ -198,6 +238,7 @@ class Vehicles:
 
 @router.get(
     "/v1/vehicles",
+    operation_id="list_vehicles",
     response_model=Vehicles | Places,
     responses=problems(403) | AS_CSV,
     summary="Vehicles that contradict the others",
@@ -210,10 +251,14 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
         return as_table(standing_rows(found))
     if format == "geojson":
         return as_json(contradictions(found))
-    return as_json(Vehicles([replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]))
+    return as_json(
+        Vehicles([replace(standing, evidence=standing.evidence[: OPERATOR_SIZES.evidence]) for standing in found])
+    )
 
 
-@router.get("/v1/policy", response_model=PolicyChange, responses=problems(), summary="The policy")
+@router.get(
+    "/v1/policy", operation_id="get_policy", response_model=PolicyChange, responses=problems(), summary="The policy"
+)
 @on("questions")
 def policy(parts: Parts, known: Known) -> Response:
     """The policy in force, who set it and why. Only reviewers and operators see the name of its gate drive."""
@@ -226,7 +271,13 @@ def _policy_of(parts: Services, known: bool) -> Response:
     return as_json(replace(newest, policy=told))
 
 
-@router.patch("/v1/policy", response_model=PolicyChange, responses=problems(403), summary="Change the policy")
+@router.patch(
+    "/v1/policy",
+    operation_id="change_policy",
+    response_model=PolicyChange,
+    responses=problems(403),
+    summary="Change the policy",
+)
 @on("commands")
 def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
@@ -234,14 +285,16 @@ def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     return _policy_of(parts, known=True)
 
 
-@router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
+@router.get(
+    "/v1/info", operation_id="get_info", response_model=Info, responses=problems(), summary="What is in the store"
+)
 @on("questions")
 def info(parts: Parts) -> Response:
     """The map, its newest version, and how much there is of everything."""
     return as_json(overview(parts.store))
 
 
-@router.get("/v1/log", response_model=Log, responses=problems(403), summary="What happened")
+@router.get("/v1/log", operation_id="get_log", response_model=Log, responses=problems(403), summary="What happened")
 @on("questions")
 def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
     """Every version, and the last so many events."""
@@ -256,13 +309,25 @@ class Checked:
     damage: list[Damage]
 
 
-@router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
+@router.get(
+    "/v1/check",
+    operation_id="check_store",
+    response_model=Checked,
+    responses=problems(403),
+    summary="Is every byte as written?",
+)
 async def whole(by: Operator, parts: Parts) -> Response:
     """Reads the whole store and names what is damaged. Nothing is changed."""
     return as_json(Checked(await parts.rounds.run(check, parts.store)))
 
 
-@router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
+@router.post(
+    "/v1/check",
+    operation_id="quarantine_damage",
+    response_model=Checked,
+    responses=problems(403),
+    summary="Set aside what is damaged",
+)
 async def mend(by: Operator, parts: Parts) -> Response:
     """As GET; damaged items are also quarantined."""
     return as_json(Checked(await parts.rounds.run(check, parts.store, mend=True, by=by)))
@@ -276,14 +341,24 @@ class Restored:
     restored: bool
 
 
-@router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413, 429), summary="Put a damaged plane back")
+@router.put(
+    "/v1/tiles/{digest}",
+    operation_id="restore_plane",
+    responses=problems(403, 404, 413, 429),
+    summary="Put a damaged plane back",
+)
 async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
     raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
     return Restored(restored=await parts.commands.run(restore_plane, parts.store, digest, raw, by=by))
 
 
-@router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
+@router.delete(
+    "/v1/ballots",
+    operation_id="withdraw_all",
+    responses=problems(403, 404),
+    summary="Withdraw the ballots of all vehicles",
+)
 async def begin_anew(by: Operator, parts: Parts, everybody: Everybody) -> Withdrawn:
     """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
     if not everybody:
@@ -291,7 +366,12 @@ async def begin_anew(by: Operator, parts: Parts, everybody: Everybody) -> Withdr
     return Withdrawn(withdrawn=await parts.commands.run(withdraw, parts.store, None, by=by))
 
 
-@router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
+@router.post(
+    "/v1/replay",
+    operation_id="replay",
+    responses=problems(403, 404, 409),
+    summary="The map as if a vehicle had never voted",
+)
 async def replay_without(by: Operator, parts: Parts, ask: ReplayAsk) -> Published:
     """Every version again without its votes; the difference to the newest is one new version."""
     return await parts.rounds.run(_replay, parts, ask, by)
@@ -302,13 +382,25 @@ def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
         return replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor)
 
 
-@router.get("/v1/gc", response_model=Cleared, responses=problems(403), summary="What the policy does not keep")
+@router.get(
+    "/v1/gc",
+    operation_id="list_clearable",
+    response_model=Cleared,
+    responses=problems(403),
+    summary="What the policy does not keep",
+)
 async def clearable(by: Operator, parts: Parts) -> Response:
     """Old versions and ballots that POST would delete."""
     return as_json(await parts.rounds.run(clear, parts.store, dry_run=True))
 
 
-@router.post("/v1/gc", response_model=Cleared, responses=problems(403), summary="Delete what it does not keep")
+@router.post(
+    "/v1/gc",
+    operation_id="clear",
+    response_model=Cleared,
+    responses=problems(403),
+    summary="Delete what it does not keep",
+)
 async def clear_now(by: Operator, parts: Parts) -> Response:
     """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
     return as_json(await parts.rounds.run(clear, parts.store, dry_run=False, by=by))
@@ -322,7 +414,9 @@ class KeysAnswer:
     keys: list[KeyEntry]
 
 
-@router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
+@router.get(
+    "/v1/keys", operation_id="list_keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys"
+)
 @on("questions")
 def listed_keys(by: Operator, parts: Parts) -> Response:
     """All keys ever issued, revoked and expired ones too."""
@@ -337,14 +431,22 @@ class KeyIssued:
     key: str
 
 
-@router.post("/v1/keys", response_model=KeyIssued, responses=problems(403, 409), summary="Issue a key")
+@router.post(
+    "/v1/keys", operation_id="issue_key", response_model=KeyIssued, responses=problems(403, 409), summary="Issue a key"
+)
 @on("commands")
 def issue_key(by: Operator, parts: Parts, ask: IssueAsk) -> Response:
     """The answer is the only place where the key is ever seen: the store keeps its hash."""
     return as_json(KeyIssued(keys.issue(parts.store, ask.name, ask.role, by=by, days=ask.days)))
 
 
-@router.post("/v1/keys/rotate", response_model=KeyIssued, responses=problems(403, 404), summary="Replace a key")
+@router.post(
+    "/v1/keys/rotate",
+    operation_id="rotate_key",
+    response_model=KeyIssued,
+    responses=problems(403, 404),
+    summary="Replace a key",
+)
 @on("commands")
 def rotate_key(by: Operator, parts: Parts, ask: RotateAsk) -> Response:
     """A new key of the same role and length for who has a valid one."""
@@ -360,16 +462,14 @@ class KeysRevoked:
     ballots: int
 
 
-@router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
+@router.post(
+    "/v1/keys/revoke", operation_id="revoke_keys", responses=problems(403, 404), summary="Revoke every key of a name"
+)
 @on("commands")
 def revoke_keys(by: Operator, parts: Parts, ask: RevokeAsk) -> KeysRevoked:
     """Its standing ballots count no more, unless ``keep_votes``."""
     revoked, ballots = keys.revoke(parts.store, ask.name, by=by, keep_votes=ask.keep_votes)
     return KeysRevoked(revoked=revoked, ballots=ballots)
-
-
-_NAMED = 20
-"""Damaged things that /readyz names; the log has all."""
 
 
 def _damaged(store: Store) -> list[str]:
@@ -378,7 +478,9 @@ def _damaged(store: Store) -> list[str]:
         return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
 
 
-@router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
+@router.get(
+    "/livez", operation_id="get_livez", responses=problems(), response_class=Response, summary="Does the server answer?"
+)
 async def live() -> Response:
     """200 without content. Neither this nor `/readyz` needs a key; without a key `/readyz` has no content either."""
     return Response()
@@ -393,7 +495,7 @@ class Health:
     version: int
 
 
-@router.get("/healthz", responses=problems(), summary="Can the store be read?")
+@router.get("/healthz", operation_id="get_healthz", responses=problems(), summary="Can the store be read?")
 async def health(parts: Parts) -> Health:
     """200 with the newest version, 503 if the database does not answer."""
     return Health(status="ok", version=await parts.newest.put(None))
@@ -410,7 +512,7 @@ class Ready:
     quarantined: int
 
 
-@router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
+@router.get("/readyz", operation_id="get_readyz", responses=problems(), summary="Can ballots be taken in?")
 async def ready(parts: Parts) -> Ready:
     """200 if the database can be written now; 503 with its error if not, or if the server is stopping.
 
@@ -418,10 +520,14 @@ async def ready(parts: Parts) -> Ready:
     """
     version = await parts.check_ready()
     damaged = await parts.look_up(_damaged, parts.store)
-    return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
+    return Ready(
+        status="ready", version=version, quarantine=damaged[: OPERATOR_SIZES.damaged], quarantined=len(damaged)
+    )
 
 
-@router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
+@router.get(
+    "/metrics", operation_id="get_metrics", responses=problems(), response_class=Response, summary="Prometheus metrics"
+)
 async def metrics(parts: Parts) -> Response:
     """Counters, latencies, the newest version."""
     parts.metrics.version.set(await parts.newest.put(None))

@@ -21,6 +21,7 @@ from mapvote.shapes.packed_cloud import N_LEVELS
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
     Digest,
@@ -30,7 +31,6 @@ from mapvote_server.api.schemas import (
     VersionQuery,
     as_json,
     as_table,
-    problems,
     sends_bytes,
 )
 from mapvote_server.api.services import Parts, Reviewer, name_of
@@ -45,7 +45,11 @@ roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --role o
 _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
 <link rel="stylesheet" href="viewer/pages.css"></head>
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
-<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
+<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table>
+<h2>Errors</h2><p>Every error is a problem of RFC 9457 (<code>application/problem+json</code>): its <code>detail</code>
+says what is wrong and how to mend it. The type <code>about:blank</code> means that the status says all.</p>
+<h3 id=held>/docs#held</h3><p>The policy holds a version back, for the <code>reasons</code> of this error. An operator
+publishes it in spite of them with <code>override</code>.</p></body></html>"""
 _STYLE_LINK = b'<link rel="stylesheet" href="viewer/pages.css">'
 _PRELOADED = b'<link rel="modulepreload" href="viewer/%s">'
 _OF_A_FILE = "standalone.js", "bundle.js"
@@ -54,7 +58,7 @@ _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".
 router = APIRouter()
 
 
-@router.get("/v1/clouds/overview", summary="A whole version, coarse", **sends_bytes(404))
+@router.get("/v1/clouds/overview", operation_id="get_overview", summary="A whole version, coarse", **sends_bytes(404))
 @on("questions")
 def overview(request: Request, parts: Parts, version: VersionQuery | None = None) -> Response:
     """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
@@ -62,14 +66,24 @@ def overview(request: Request, parts: Parts, version: VersionQuery | None = None
     return packed(request, parts.clouds.overview(number), "private, no-cache")
 
 
-@router.get("/v1/clouds/changed", summary="Points added and deleted between two versions", **sends_bytes(404))
+@router.get(
+    "/v1/clouds/changed",
+    operation_id="get_changed_clouds",
+    summary="Points added and deleted between two versions",
+    **sends_bytes(404),
+)
 @on("questions")
 def changed(request: Request, parts: Parts, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
     return packed(request, parts.clouds.changed(old, new), _FOR_EVER)
 
 
-@router.get("/v1/clouds/{points}/{ground}/{level}", summary="One level of detail of a tile", **sends_bytes(404))
+@router.get(
+    "/v1/clouds/{points}/{ground}/{level}",
+    operation_id="get_cloud_level",
+    summary="One level of detail of a tile",
+    **sends_bytes(404),
+)
 @on("questions")
 def level_of(
     request: Request,
@@ -85,7 +99,7 @@ def level_of(
     return packed(request, parts.clouds.levels(hashes).part(level), _FOR_EVER)
 
 
-@router.get("/v1/evidence/{row}/{col}", summary="Votes cell by cell", **sends_bytes(403))
+@router.get("/v1/evidence/{row}/{col}", operation_id="get_evidence", summary="Votes cell by cell", **sends_bytes(403))
 @on("questions")
 def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
     """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
@@ -98,7 +112,13 @@ def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicl
     return packed(request, plane.tobytes(), "private, no-cache")
 
 
-@router.get("/v1/paths", response_model=Places, responses=problems(403) | AS_CSV, summary="Paths of the drives")
+@router.get(
+    "/v1/paths",
+    operation_id="list_paths",
+    response_model=Places,
+    responses=problems(403) | AS_CSV,
+    summary="Paths of the drives",
+)
 @on("questions")
 def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
     """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as

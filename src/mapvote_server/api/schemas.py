@@ -1,5 +1,4 @@
-"""Requests and answers of the API, as OpenAPI declares them to programs in other languages; and the one table from
-errors to status codes.
+"""Requests and answers of the API, as OpenAPI declares them to programs in other languages.
 
 Routes encode their answers themselves (:func:`as_json`). A test holds every answer to its model: it has the model's
 members and no others.
@@ -7,50 +6,22 @@ members and no others.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import msgspec
-from fastapi import Path, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi import Path, Query, Response
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
-from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import as_csv
-from mapvote_server.errors import (
-    BadRequest,
-    Conflict,
-    Forbidden,
-    Held,
-    NotFound,
-    TooLarge,
-    TooMany,
-    TooSlow,
-    Unauthorised,
-    Unavailable,
-)
+from mapvote_server.api.problems import problems
 from mapvote_server.questions.explain import FARTHEST_M
 from mapvote_server.store import keys
 from mapvote_server.store.policy import Policy, names_in
 from mapvote_server.work import count_rows
 
-STATUS: Mapping[type[MapvoteError], int] = {
-    BadRequest: 400,
-    Unauthorised: 401,
-    Forbidden: 403,
-    NotFound: 404,
-    Conflict: 409,
-    TooLarge: 413,
-    MapvoteError: 422,
-    TooSlow: 422,
-    TooMany: 429,
-    Unavailable: 503,
-}
-"""An entry also holds for the subclasses of its class."""
 LEAST, MOST = 1, (1 << 31) - 1
 """Range of a version's number."""
 MOST_SEQ = (1 << 53) - 1
@@ -161,13 +132,6 @@ class Answer(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Problem(Answer):
-    """An error, and how to mend it."""
-
-    detail: Any
-    reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
-
-
 def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **instead: Any) -> type[Answer]:
     """The model of an answer that the codec defines, with some members of other types."""
     members: dict[str, Any] = {}
@@ -185,11 +149,6 @@ ManifestAnswer = _answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[v
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
 AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
-
-
-def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    """For the OpenAPI document: the refusals that every route knows, and these."""
-    return {code: {"model": Problem} for code in (401, 422, 429, 503, *codes)}
 
 
 def sends_bytes(*codes: int) -> dict[str, Any]:
@@ -213,35 +172,3 @@ def as_table(rows: Sequence[Mapping[str, Any]]) -> Response:
     """Rows as CSV, counted."""
     count_rows(1 + len(rows))
     return Response(as_csv(rows), media_type="text/csv")
-
-
-def refuse(error: Exception) -> Response:
-    """The answer to a MapvoteError: {"detail": what to do about it}, and the reasons of a held version."""
-    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
-    content: dict[str, object] = {"detail": str(error)}
-    headers = {}
-    if isinstance(error, Held):
-        content["reasons"] = error.reasons
-    if status in (429, 503):
-        headers["Retry-After"] = str(math.ceil(error.after_s)) if isinstance(error, TooMany) else "1"
-    response = JSONResponse(content, status, headers)
-    if status == 401:  # two lines: browsers read one challenge a line, and ask for a password only for Basic
-        response.headers.append("WWW-Authenticate", 'Basic realm="mapvote: the key is the password", charset="UTF-8"')
-        response.headers.append("WWW-Authenticate", "Bearer")
-    return response
-
-
-async def unreadable(request: Request, error: Exception) -> Response:
-    """A body that is not even UTF-8: FastAPI answers 400, but every unusable body is 422 here.
-
-    Asynchronous, as FastAPI would run a plain function in a thread of its own pool.
-    """
-    return refuse(MapvoteError("the body is no JSON in UTF-8"))
-
-
-async def unusable(request: Request, error: Exception) -> Response:
-    """A parameter or a body that is not what OpenAPI declares: 422 with each place and what is wrong there, as text
-    that can be encoded whatever was sent."""
-    assert isinstance(error, RequestValidationError)
-    found = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
-    return refuse(MapvoteError(found[:1000].encode(errors="replace").decode()))

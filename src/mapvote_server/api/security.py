@@ -25,8 +25,8 @@ from mapvote.core.types import MapvoteError
 from mapvote_server.api import key_form
 from mapvote_server.api.connections import Caller, identify, step_aside
 from mapvote_server.api.lanes import asker
+from mapvote_server.api.problems import refuse
 from mapvote_server.api.proxies import Proxies
-from mapvote_server.api.schemas import refuse
 from mapvote_server.api.services import RateLimit, Services
 from mapvote_server.errors import Forbidden, TooMany, Unauthorised, Unavailable
 from mapvote_server.store import keys
@@ -271,10 +271,12 @@ class Watch:
             elif isinstance(error, Unauthorised) and key_form.asks_for_page(scope):
                 refused = key_form.form(str(error) if key_form.key_in_cookie(scope["headers"]) else "")
             else:
-                refused = Response(status_code=await self._status(scope["path"])) if probed else refuse(error)
+                path = scope["path"]
+                refused = Response(status_code=await self._status(path)) if probed else refuse(error, path)
             await refused(scope, receive, watched)
         except asyncio.CancelledError:  # the server stops and waits no longer
-            await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
+            stops = refuse(Unavailable("the server is stopping: ask again once it is back"), scope["path"])
+            await stops(scope, receive, watched)
         finally:
             seconds = time.perf_counter() - start
             method = scope["method"]

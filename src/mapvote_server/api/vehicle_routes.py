@@ -18,6 +18,7 @@ from mapvote.core.answers import answer
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
     AS_YOU_HAVE,
@@ -29,7 +30,6 @@ from mapvote_server.api.schemas import (
     VersionQuery,
     as_json,
     as_table,
-    problems,
 )
 from mapvote_server.api.services import Known, Parts, own, services
 from mapvote_server.questions.history import DatedVersion, dated_versions
@@ -42,6 +42,7 @@ router = APIRouter()
 
 @router.get(
     "/v1/map",
+    operation_id="get_map",
     response_model=ManifestAnswer,
     responses=problems(404) | AS_YOU_HAVE,
     summary="Manifest of the newest version",
@@ -59,7 +60,13 @@ class Versions:
     versions: list[DatedVersion]
 
 
-@router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
+@router.get(
+    "/v1/map/versions",
+    operation_id="list_versions",
+    response_model=Versions,
+    responses=problems() | AS_CSV,
+    summary="All versions",
+)
 @on("questions")
 def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by. Only reviewers and operators see the name of the
@@ -72,6 +79,7 @@ def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
 
 @router.get(
     "/v1/map/versions/{number}",
+    operation_id="get_version",
     response_model=ManifestAnswer,
     responses=problems(404) | AS_YOU_HAVE,
     summary="Manifest of one version",
@@ -83,6 +91,7 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
 
 @router.get(
     "/v1/tiles/{digest}",
+    operation_id="get_plane",
     responses=problems(404) | AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
     response_class=Response,
     summary="One plane of a tile",
@@ -114,7 +123,12 @@ class Withdrawn:
     withdrawn: int
 
 
-@router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Withdraw a ballot")
+@router.delete(
+    "/v1/ballots/{vehicle}/{drive}",
+    operation_id="withdraw_ballot",
+    responses=problems(403, 404, 429),
+    summary="Withdraw a ballot",
+)
 async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
     """Withdraw a ballot: later versions are as if it had never been cast."""
     by = own(request, vehicle)
@@ -122,7 +136,12 @@ async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
     return Withdrawn(withdrawn=await parts.commands.run(withdraw, parts.store, vehicle, drive, by=by))
 
 
-@router.delete("/v1/ballots/{vehicle}", responses=problems(403, 404, 429), summary="Withdraw a vehicle's ballots")
+@router.delete(
+    "/v1/ballots/{vehicle}",
+    operation_id="withdraw_vehicle",
+    responses=problems(403, 404, 429),
+    summary="Withdraw a vehicle's ballots",
+)
 async def unvote_all_drives(request: Request, vehicle: Name) -> Withdrawn:
     """Withdraw the ballots of all its drives."""
     by = own(request, vehicle)
@@ -201,6 +220,7 @@ router.add_api_route(
     route_class_override=BallotRoute,
     response_model=Receipt,
     responses=problems(403, 409, 413, 429) | {201: {"model": Receipt}},
+    operation_id="put_ballot",
     openapi_extra={"requestBody": {"required": True, "content": _BYTES}},
     summary="Vote",
 )

@@ -152,7 +152,7 @@ def _desk_of(store: Store, found: Round) -> Desk:
     left_out = [review for review, _ in reviews if review.given.verdict != "accepted"]
     budget = found.asked.settings.false_deletions
     lacking = None if found.changed else waiting_votes(store)
-    told = DeskAnswer(
+    content = DeskAnswer(
         version=version,
         held=[],
         doubts=list(doubts_of(store, found).told(found.asked.settings)),
@@ -162,7 +162,7 @@ def _desk_of(store: Store, found: Round) -> Desk:
         reviewed=list(map(_reviewed, left_out)),
         tiles={tile_key(index): _drawn(made) for index, made in edited.items()},
     )
-    return Desk(told, left_out, {one.id: one for one in objects}, edited, b"".join(cloud for _, cloud in looked))
+    return Desk(content, left_out, {one.id: one for one in objects}, edited, b"".join(cloud for _, cloud in looked))
 
 
 def _look_at(store: Store, version: int, fused: Fused) -> tuple[ChangedCells, bytes]:
@@ -186,18 +186,18 @@ def _pending(
     reviews: Sequence[tuple[Review, Mapping[TileIndex, Bool]]],
 ) -> Pending:
     """The changes, each with the verdict on its cells."""
-    found = to_geojson(
+    changes = to_geojson(
         objects, store.lattice, map_id=store.map_id, from_version=version, georeference=store.georeference
     )
     verdicts = [_verdict_on(one, reviews) for one in objects]
     return Pending(
         type="FeatureCollection",
-        frame=found.frame,
-        map_id=found.map_id,
-        georeference=found.georeference,
+        frame=changes.frame,
+        map_id=changes.map_id,
+        georeference=changes.georeference,
         from_version=version,
         to_version=None,
-        features=[_on_desk(one, verdict=given) for one, given in zip(found.features, verdicts, strict=True)],
+        features=[_on_desk(one, verdict=given) for one, given in zip(changes.features, verdicts, strict=True)],
     )
 
 

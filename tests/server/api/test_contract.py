@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from http import HTTPStatus
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from fastapi.testclient import TestClient
@@ -12,6 +15,7 @@ from sqlalchemy.exc import OperationalError
 from mapvote_server.api.app import create_app
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, _clear_errors
+from mapvote_server.store.store import Store
 from stores import NewStore
 
 
@@ -32,6 +36,48 @@ def test_the_document_says_how_a_key_is_sent_and_that_every_route_may_be_refused
         for method, operation in methods.items():
             assert {"401", "429"} <= set(operation["responses"]), (method, path)
             assert ({} in operation.get("security", ())) == (path in ("/livez", "/readyz")), (method, path)
+
+
+def test_every_operation_has_a_name_of_its_own_a_group_a_summary_and_one_shape_of_errors(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    operations = [operation for methods in document["paths"].values() for operation in methods.values()]
+    names = [operation["operationId"] for operation in operations]
+    assert len(set(names)) == len(names)
+    assert not [name for name in names if not re.fullmatch(r"[a-z]+(_[a-z]+)*", name)], "names for a client's code"
+    assert {tag for one in operations for tag in one["tags"]} == {tag["name"] for tag in document["tags"]}
+    assert all(operation["summary"] for operation in operations)
+    refusals = [a for one in operations for code, a in one["responses"].items() if code[0] in "45"]
+    assert {tuple(answer["content"]) for answer in refusals} == {("application/problem+json",)}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/nothing", 404),
+        ("GET", "/v1/map/versions/9", 404),
+        ("GET", "/v1/map/versions/x", 422),
+        ("POST", "/v1/map", 405),
+        ("GET", "/ogc/collections/x", 404),
+        ("GET", "/ogc?x=1", 400),
+    ],
+)
+def test_every_refusal_is_a_problem_of_rfc_9457(client: TestClient, method: str, path: str, status: int) -> None:
+    answer = client.request(method, path)
+    assert answer.headers["content-type"] == "application/problem+json"
+    told = answer.json()
+    assert (told["type"], told["status"], answer.status_code) == ("about:blank", status, status)
+    assert (told["title"], told["instance"]) == (HTTPStatus(status).phrase, path.partition("?")[0])
+    assert told["detail"]
+
+
+def test_an_error_of_the_server_itself_is_a_problem_too(new_store: NewStore) -> None:
+    store = new_store()
+    app = create_app(store, opened=True)
+    client = TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
+    with client, mock.patch.object(Store, "blob", side_effect=ZeroDivisionError):
+        answer = client.get(f"/v1/tiles/{'0' * 64}")
+    assert (answer.status_code, answer.json()["status"]) == (500, 500)
+    assert "ZeroDivisionError" not in answer.text
 
 
 @pytest.mark.parametrize(

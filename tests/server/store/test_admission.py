@@ -18,7 +18,7 @@ from mapvote.codec.ballot import Ballot, Planes, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote_server.api.schemas import refuse
+from mapvote_server.api.problems import refuse
 from mapvote_server.errors import TooMany
 from mapvote_server.questions.history import events_after, newest_event
 from mapvote_server.store.admission import Intake, Quota, Receipt
@@ -116,7 +116,7 @@ def test_so_many_drives_a_day_each_vehicle_for_itself_and_a_restart_forgets_noth
         (refused,) = again.write([drive("a", "d3")])
         assert isinstance(refused, TooMany)
         assert "try again tomorrow" in str(refused)
-        assert refuse(refused).headers["retry-after"] == "3600", "it is counted again once an hour"
+        assert refuse(refused, "/v1").headers["retry-after"] == "3600", "it is counted again once an hour"
         (repeated,) = again.write([drive("a", "d0")])
         assert isinstance(repeated, Receipt)
         assert repeated.result == "repeated"
