@@ -21,8 +21,8 @@ from mapvote.live.ballot_messages import (
     messages_of_ballot,
     path_message,
     states_grid,
-    write_mcap,
 )
+from mapvote.live.mcap import write_mcap
 
 GONE_WALL = [(10, c) for c in range(20, 30)]
 STANDS = [(40, c) for c in range(20, 30)]
@@ -118,7 +118,7 @@ def test_the_path_lies_on_the_ground() -> None:
 
 def test_an_mcap_file_holds_every_message_and_is_read_again(tmp_path: Path) -> None:
     messages = [map_cloud(ballot(), STREET), *messages_of_ballot(ballot(), STREET)]
-    write_mcap(tmp_path / "ballot.mcap", messages)
+    write_mcap(tmp_path / "ballot.mcap", [message.recorded for message in messages])
     assert [file.name for file in tmp_path.iterdir()] == ["ballot.mcap"]
     bag = Bag(tmp_path / "ballot.mcap")
     assert {topic: t.msgcount for topic, t in bag.reader.topics.items()} == dict.fromkeys(

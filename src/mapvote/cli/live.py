@@ -59,7 +59,8 @@ def show(
     from mapvote.codec.ballot import decode
     from mapvote.core.types import MapvoteError
     from mapvote.formats.reading import read_whole, reading
-    from mapvote.live.ballot_messages import map_cloud, messages_of_ballot, write_mcap
+    from mapvote.live.ballot_messages import map_cloud, messages_of_ballot
+    from mapvote.live.mcap import write_mcap
 
     with reading(ballot, "ballot"):
         shown = decode(read_whole(ballot))
@@ -69,7 +70,7 @@ def show(
                 f"{ballot}: voted on map {shown.map_id}, not on {point_map.map_id} of {map_source}; name its map"
             )
         messages = [map_cloud(shown, point_map), *messages_of_ballot(shown, point_map)]
-    write_mcap(mcap, messages)
+    write_mcap(mcap, [message.recorded for message in messages])
     print(f"{mcap}: {', '.join('/' + message.topic for message in messages)}")
 
 
@@ -166,6 +167,12 @@ def drive(
     nice: Annotated[
         int | None, typer.Option(min=-20, max=19, metavar="N", help="lower the priority by this, as nice(1) does")
     ] = None,
+    keep_doubt: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="keep ten seconds of clouds around each doubtful change here")
+    ] = None,
+    keep_doubt_mb: Annotated[
+        int, typer.Option(min=1, metavar="MB", help="size of that folder at most; the oldest clouds go first")
+    ] = 2000,
     config: Config = None,
 ) -> None:
     """Vote while driving, from ROS 2 topics. A ballot closes every 2 km, every 10 minutes and after 2 minutes at rest.
@@ -175,6 +182,7 @@ def drive(
     import logging
     import math
     import time
+    from dataclasses import replace
 
     from mapvote.config import load_settings
     from mapvote.core.extras import require
@@ -185,10 +193,11 @@ def drive(
     from mapvote.live.changes_topics import ChangesTopics
     from mapvote.live.choice import Voice, Wish, choose_topics
     from mapvote.live.dds import Network
+    from mapvote.live.doubt import DoubtKeeper
     from mapvote.live.messages import POSE_TOPIC
     from mapvote.live.names import ros_names, sim_time_of
     from mapvote.live.process import limit_process
-    from mapvote.live.service import Plan, run
+    from mapvote.live.service import Plan, Watcher, run
     from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
     from mapvote.live.subscriptions import Subscriptions
     from mapvote.vehicle import Cuts
@@ -248,7 +257,10 @@ def drive(
         with _view(board, vehicle) if watch else nullcontext():
             if not watch:
                 board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
-            live = run(plan, topics, maps, outbox, ended, [board, ros.poses, ChangesTopics(network, names)], voice)
+            watchers: list[Watcher] = [board, ros.poses, ChangesTopics(network, names)]
+            keeper = None if keep_doubt is None else DoubtKeeper(keep_doubt, 10**6 * keep_doubt_mb)
+            with nullcontext() if keeper is None else closing(keeper):
+                live = run(replace(plan, doubt=keeper), topics, maps, outbox, ended, watchers, voice)
         heartbeat.stopping()
     print(f"{vehicle}: {_result(live)}")
 

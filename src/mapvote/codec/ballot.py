@@ -75,6 +75,9 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     odds: bytes | None = None
     """(changed cells,) int8 in the order of the states: how sure the vehicle is of each; two-stage
     alone. None: it does not say."""
+    clouds: bool = False
+    """Whether the vehicle kept the clouds around a doubtful change on it, as DRIVE_ROW_COL.mcap: newer ones may have
+    displaced them since."""
 
 
 class Ballot(msgspec.Struct, frozen=True, kw_only=True):
@@ -228,6 +231,8 @@ class Planes:
     """Column words that rays passed through."""
     odds: Odds | None = None
     """How sure it is of the cells that it calls changed; None: it does not say."""
+    clouds: bool = False
+    """Whether the vehicle kept clouds of the tile."""
 
     @property
     def nbytes(self) -> int:
@@ -256,6 +261,7 @@ def unpack_planes(packed: BallotTile) -> Planes:
         fields=fields,
         free=None if packed.free is None else unpack_sparse(packed.free, "free"),
         odds=unpack_sureness(packed.odds, states),
+        clouds=packed.clouds,
     )
 
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +13,14 @@ from numpy.typing import NDArray
 
 from mapvote.codec.ballot import Ballot, BallotTile, Planes, unpack_path, unpack_planes
 from mapvote.core.columns import column_bits, flat_cells
-from mapvote.core.extras import require
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, I8, U8, CellState, MapvoteError
+from mapvote.core.types import F64, I8, U8, CellState
 from mapvote.core.voting import plurality
-from mapvote.live.messages import CLOUD, MAP_FRAME, POSE, blank_message, cloud_of, header_of, to_cdr, typestore
+from mapvote.live.mcap import Recorded
+from mapvote.live.messages import CLOUD, MAP_FRAME, POSE, blank_message, cloud_of, header_of, to_cdr
 
 
 class BallotTopic(StrEnum):
@@ -72,6 +69,11 @@ class Stamped(NamedTuple):
     topic: BallotTopic
     stamp_ns: int
     data: bytes
+
+    @property
+    def recorded(self) -> Recorded:
+        """The message for a file."""
+        return Recorded(f"/{self.topic}", self.topic.kind, self.stamp_ns, self.data)
 
     @classmethod
     def of(cls, topic: BallotTopic, ballot: Ballot, message: Any) -> Stamped:
@@ -225,22 +227,3 @@ def map_cloud(ballot: Ballot, point_map: PointMap, frame: str = MAP_FRAME) -> St
     points = np.concatenate([np.empty((0, 3)), *mapped]).astype(np.float32)
     columns = {axis: points[:, k] for k, axis in enumerate("xyz")}
     return Stamped.of(BallotTopic.MAP, ballot, cloud_of(columns, ballot.end_ns, frame))
-
-
-def write_mcap(path: Path, messages: Sequence[Stamped]) -> None:
-    """An MCAP file of messages. MapvoteError without rosbags (extra ``ros``), or if it cannot be written."""
-    rosbag2 = require("rosbags.rosbag2", "ros", str(path))
-    try:
-        with tempfile.TemporaryDirectory(dir=path.resolve().parent) as home:
-            bag = Path(home) / "bag"
-            with rosbag2.Writer(bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as out:
-                topics: dict[str, Any] = {}
-                for message in messages:
-                    if message.topic not in topics:
-                        name = f"/{message.topic}"
-                        topics[message.topic] = out.add_connection(name, message.topic.kind, typestore=typestore())
-                    out.write(topics[message.topic], message.stamp_ns, message.data)
-            (written,) = bag.glob("*.mcap")
-            os.replace(written, path)
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error

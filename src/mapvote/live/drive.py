@@ -26,6 +26,7 @@ from mapvote.doctor.localised import LocalisedDrive, written_if_localised
 from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.scans import NO_PRIOR, Looking, cheap_checks
 from mapvote.formats.drives.fixes import FIX_RULES, Fixes
+from mapvote.live.doubt import DoubtKeeper
 from mapvote.live.log_lines import Repeated
 from mapvote.live.outbox import Outbox
 from mapvote.live.priors import Priors, pose_in, turned_by
@@ -234,6 +235,8 @@ class LiveDrive:
         self.first = first
         """None once :meth:`first_findings` was asked."""
         self._checked = first is not None
+        self.doubt: DoubtKeeper | None = None
+        """Keeps the clouds around doubtful changes; None: none are kept."""
         self._held = list[tuple[str, Callable[[], Ballot], str | None]]()
         self.checked_now = False
         """Whether the first seconds are over and their findings were not asked for."""
@@ -306,6 +309,8 @@ class LiveDrive:
         self.vehicle = None
         self._place = None
         self._observed.clear()
+        if self.doubt is not None:
+            self.doubt.forget()
         self._priors.jump_to(self._last_ns + step_ns)
 
     def step(self, *, ended: bool = False) -> bool:
@@ -318,6 +323,8 @@ class LiveDrive:
             tile = min(self._touched, key=lambda index: self._touched[index])
             del self._touched[tile]
             kept = self.vehicle.ballot([tile])
+            if self.doubt is not None:
+                kept = self.doubt.marked(self.drive_id, kept, self.vehicle.point_map.lattice)
             self._outbox.keep(self.drive_id, kept)
             self.kept.append(kept)
         if not ready:
@@ -409,6 +416,8 @@ class LiveDrive:
             self.checked_now = self.first.add(scan, _sure_pose(prior), vehicle)
         self._observed.append((waiting.stamp_ns, waiting.sent_ns))
         self.counts.observed += 1
+        if self.doubt is not None:
+            self.doubt.add(waiting.stamp_ns, scan.points)
         vehicle.observe(scan, prior)
         self._count_votes(vehicle)
         if self._road.is_full(vehicle.report, vehicle.done):
@@ -444,6 +453,8 @@ class LiveDrive:
         for i in range(self._finished, vehicle.done):
             stamp_ns, sent_ns = self._observed.popleft()
             self._is_lost = i in lost
+            if self.doubt is not None:
+                self.doubt.placed(stamp_ns, None if self._is_lost else report.T_map_lidar[i])
             if self._is_lost:
                 self.counts.lost += 1
                 continue
@@ -475,6 +486,8 @@ class LiveDrive:
 
     def _written(self, stretch: ClosedStretch) -> Callable[[], Ballot]:
         """A function that writes the ballot of a closed stretch."""
+        if self.doubt is not None:
+            stretch = stretch._replace(written=self.doubt.flagging(stretch.drive_id, stretch.written))
         if not self._checked:
             return stretch.written
         localised = LocalisedDrive.of_report(stretch.report, prior_in_map=stretch.prior_in_map)

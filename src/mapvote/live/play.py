@@ -148,15 +148,15 @@ def odometry_message(stamp_ns: int, T_frame_base: F64, frame: str = MAP_FRAME) -
     return to_cdr(ODOMETRY, message)
 
 
-def frames_message(stamp_ns: int, T_base_child: Mapping[str, F64]) -> bytes:
-    """A TFMessage of frames on BASE_FRAME, by their names."""
+def frames_message(stamp_ns: int, T_parent_child: Mapping[str, F64], parent: str = BASE_FRAME) -> bytes:
+    """A TFMessage of frames on their ``parent``, by their names."""
     transforms = []
-    for child, T in T_base_child.items():
+    for child, T in T_parent_child.items():
         pose = pose_of(T)
         transform = blank_message("geometry_msgs/msg/Transform")
         transform.translation = pose.position
         transform.rotation = pose.orientation
-        header = header_of(stamp_ns, BASE_FRAME)
+        header = header_of(stamp_ns, parent)
         transforms.append(
             blank_message(
                 "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform

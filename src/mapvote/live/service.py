@@ -16,6 +16,7 @@ from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.frames import is_map_frame
 from mapvote.live.choice import Voice
+from mapvote.live.doubt import DoubtKeeper
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
 from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
@@ -63,6 +64,8 @@ class Plan:
     checked: bool = True
     """Whether the first seconds are checked, and an error among them ends the drive; and whether a ballot leaves only
     if the vehicle knew where it was."""
+    doubt: DoubtKeeper | None = None
+    """Keeps the clouds around doubtful changes."""
 
 
 Watcher = Callable[[LiveDrive, Subscriptions], None]
@@ -210,6 +213,7 @@ def _live_drive(plan: Plan, topics: Subscriptions, maps: Maps, outbox: Outbox) -
         first=FirstSeconds(topics.sensor_told) if plan.checked else None,
     )
     live.mount = topics.mount
+    live.doubt = plan.doubt
     return live
 
 

@@ -105,6 +105,9 @@ class CellVote:
     """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
     sure: float | None
     """Probability that the cell did change so, by its own evidence; None where it does not say."""
+    clouds: str
+    """The file in which the vehicle kept the clouds around a doubtful change on this tile; empty if it kept none. Newer
+    ones may have displaced it."""
     end: str | None
     """End of the drive, ISO 8601."""
     counts: bool
@@ -172,7 +175,7 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]], known)
     if not known:
         shown = pseudonyms(store, {vote.vehicle for vote in votes})
-        votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
+        votes = [replace(vote, vehicle=shown[vote.vehicle], drive="", clouds="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions and not falls[-1] else None
     by_version = [
         CellDecision(record.version, state, _edit_of(record, cell), fell)
@@ -259,13 +262,16 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], know
     for standing, reason in everyone:
         ballot = standing.ballot
         vote = said.get(ballot)
-        text: tuple[str, int | None, float | None] = UNREADABLE, None, None
+        text: tuple[str, int | None, float | None, str] = UNREADABLE, None, None, ""
         if vote is not None:
-            text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
+            row, col = now.tile.index
+            clouds = f"{standing.drive}_{row}_{col}.mcap" if vote.clouds else ""
+            text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell), clouds
         whose = (standing.vehicle, standing.drive, standing.version)
         end = utc(seen(standing.end_ns, known))
         versions = tuple(counted[ballot]), tuple(left_out[ballot])
-        cell_votes.append(CellVote(*whose, *text, end, not reason, reason, *versions))
+        state, marks, sure, clouds = text
+        cell_votes.append(CellVote(*whose, state, marks, sure, clouds, end, not reason, reason, *versions))
     return cell_votes
 
 

@@ -95,6 +95,7 @@ export async function showCell([x, y]) {
       v.marks > 0 && v.state === "unchanged_occupied"
         && element("div", {}, [`but ${v.marks} of its voxels ${v.marks > 1 ? "are" : "is"} gone`]),
       v.counted_in?.length > 0 && element("div", { className: "why" }, [`counted in ${versions(v.counted_in)}`]),
+      v.clouds && element("div", { className: "why" }, [`the vehicle kept its clouds of this place: ${v.clouds}`]),
       ...(v.left_out_of ?? []).slice(-2).map(({ version, why }) => element("div", { className: "why" }, [`not counted in version ${version}: ${why}`])),
       !v.counts && element("div", { className: "why" }, [`does not count now: ${v.why || "no reason given"}`]),
     ]);
