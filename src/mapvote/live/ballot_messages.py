@@ -19,7 +19,7 @@ from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I8, U8, CellState
 from mapvote.core.voting import plurality
-from mapvote.live.mcap import Recorded
+from mapvote.live.mcap import FileMessage
 from mapvote.live.messages import CLOUD, MAP_FRAME, POSE, blank_message, cloud_of, header_of, to_cdr
 
 
@@ -71,9 +71,9 @@ class Stamped(NamedTuple):
     data: bytes
 
     @property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> FileMessage:
         """The message for a file."""
-        return Recorded(f"/{self.topic}", self.topic.kind, self.stamp_ns, self.data)
+        return FileMessage(f"/{self.topic}", self.topic.kind, self.stamp_ns, self.data)
 
     @classmethod
     def of(cls, topic: BallotTopic, ballot: Ballot, message: Any) -> Stamped:

@@ -29,7 +29,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.live.log_lines import Repeated
-from mapvote.live.mcap import HIDDEN, Recorded, write_mcap
+from mapvote.live.mcap import HIDDEN, FileMessage, write_mcap
 from mapvote.live.messages import CLOUD, LIDAR_FRAME, MAP_FRAME, TF, cloud_of, to_cdr
 from mapvote.live.play import frames_message
 
@@ -211,7 +211,7 @@ def doubtful_place(tile: BallotTile, lattice: Lattice, rule: DoubtRule = DOUBT_R
     return np.array([window.x0 + col * CELL_SIZE, window.y0 + row * CELL_SIZE])
 
 
-def _messages(job: _Job, near_m: float) -> Iterator[Recorded]:
+def _messages(job: _Job, near_m: float) -> Iterator[FileMessage]:
     """Of each cloud its place, and its points near the change."""
     for cloud in job.clouds:
         points_map = transform(cloud.T_map_lidar, cloud.points)
@@ -221,5 +221,5 @@ def _messages(job: _Job, near_m: float) -> Iterator[Recorded]:
         columns = {axis: cloud.points[near, k] for k, axis in enumerate("xyz")}
         data = to_cdr(CLOUD, cloud_of(columns, cloud.stamp_ns, LIDAR_FRAME))
         way = frames_message(cloud.stamp_ns, {LIDAR_FRAME: cloud.T_map_lidar}, MAP_FRAME)
-        yield Recorded("/tf", TF, cloud.stamp_ns, way)
-        yield Recorded("/points", CLOUD, cloud.stamp_ns, data)
+        yield FileMessage("/tf", TF, cloud.stamp_ns, way)
+        yield FileMessage("/points", CLOUD, cloud.stamp_ns, data)

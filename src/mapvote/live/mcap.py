@@ -16,7 +16,7 @@ HIDDEN = ".mcap-"
 """Beginning of the folders in which files are written: one that a crash left behind may be deleted."""
 
 
-class Recorded(NamedTuple):
+class FileMessage(NamedTuple):
     """One message, serialised."""
 
     topic: str
@@ -26,7 +26,7 @@ class Recorded(NamedTuple):
     data: bytes
 
 
-def write_mcap(path: Path, messages: Iterable[Recorded]) -> None:
+def write_mcap(path: Path, messages: Iterable[FileMessage]) -> None:
     """An MCAP file of messages; it appears whole. MapvoteError without rosbags (extra ``ros``), or if it cannot be
     written."""
     rosbag2 = require("rosbags.rosbag2", "ros", str(path))
