@@ -340,7 +340,7 @@ DRIVES: list[tuple[str, str, Break | Files]] = [
     ("big-endian", "not finite|5 %|no usable", rows(lambda s: as_floats(s, ">f4"))),
     ("one scan cut off at a point", "cut off", one_scan(lambda s: s[: len(s) // 3])),
     ("one scan without 100 deg", "lacks|cut off", one_scan(lambda s: s[abs(azimuth(s) - 40) > 50])),
-    ("one scan empty", "no usable|empty|holds no|0 bytes", one_scan(lambda s: s[:0])),
+    ("one scan empty", "no usable|empty|holds? no|0 bytes", one_scan(lambda s: s[:0])),
     ("one scan full of NaN", "not finite", one_scan(lambda s: s * np.nan)),
     ("one file cut off in a point", "multiple of|cut off", Files(cut_in_a_point)),
     ("every second scan doubled", "same as the one before", order(lambda n: np.arange(n) // 2 * 2)),

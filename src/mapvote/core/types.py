@@ -219,6 +219,8 @@ class Drive:
     """Where on Earth the prior's frame lies, as a map carries it; empty if unknown."""
     sensor_told: str = ""
     """Where the sensor's model comes from, and how sure it is."""
+    left_out: tuple[str, ...] = ()
+    """Sentences on scans of the recording that are not among these."""
 
     def __post_init__(self) -> None:
         check_array(self.stamps_ns, "Drive.stamps_ns", (None,), np.int64)

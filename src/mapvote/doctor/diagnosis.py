@@ -108,6 +108,8 @@ def diagnose(
     findings = unopened + (check_bag(path, **options) if of_bag else [])
     T = None
     if drive is not None:
+        mend = "the drive is read without them; was the sensor off, or the disk full?"
+        findings += [Finding("warning", sentence, mend) for sentence in drive.left_out]
         lidars = check_lidars_of_bag(path, drive, options) if of_bag else []
         findings += lidars
         # Scans put together wrongly fit neither each other nor a prior.

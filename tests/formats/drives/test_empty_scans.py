@@ -63,6 +63,9 @@ def test_scans_without_points_are_left_out_and_named(
         drive = open_drive(LAYOUTS[layout](tmp_path / "drive", empty), prior="/odom" if layout == "bag" else None)
     kept = [i for i in range(N) if i not in empty]
     assert f"{len(empty)} of {N} scans hold no point and are left out" in caplog.text
+    assert [sentence.partition(":")[0] for sentence in drive.left_out] == [
+        f"{len(empty)} of {N} scans hold no point and are left out"
+    ]
     assert drive.T_map_lidar_prior is not None
     assert drive.T_map_lidar_prior[:, 0, 3].round(6).tolist() == kept
     assert ((drive.stamps_ns - drive.stamps_ns[0]) // 10**8).tolist() == [i - kept[0] for i in kept]

@@ -77,12 +77,15 @@ class BadPoints:
             log.warning(message, self.where, self.points, self.what, len(self.seen))
 
 
-def tell_without_points(source: str, scans: int, names: Sequence[str]) -> None:
-    """A message on scans without a point, by their ``names``, that are left out. MapvoteError if all ``scans`` are."""
+def tell_without_points(source: str, scans: int, names: Sequence[str]) -> str:
+    """Log that scans without a point, by their ``names``, are left out; returns the sentence. MapvoteError if all
+    ``scans`` are."""
     if len(names) == scans:
         raise MapvoteError(f"{source}: none of its {scans} scans holds a point; record it again")
     listed = ", ".join(names[:3]) + (", .." if len(names) > 3 else "")
-    log.warning("%s: %d of %d scans hold no point and are left out: %s", source, len(names), scans, listed)
+    sentence = f"{len(names)} of {scans} scans hold no point and are left out: {listed}"
+    log.warning("%s: %s", source, sentence)
+    return sentence
 
 
 @dataclass(slots=True)

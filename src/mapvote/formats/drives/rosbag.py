@@ -39,7 +39,8 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     topics = _choose_topics(bag, options.topic)
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other, options.mounts) for other in topics[1:])]
     own = _mount_in(options.mounts, topics[0], str(path))
-    sweeps = _sweeps(bag, topics)
+    left_out: list[str] = []
+    sweeps = _sweeps(bag, topics, left_out)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
     poses = choose_poses(bag, options, topics[0], own)
     prior = prior_of_bag(bag, options, stamps_ns, poses)
@@ -77,7 +78,7 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         T_base_lidar=poses.T_base_lidar,
         prior_sigmas=prior.sigmas,
     )
-    return replace(drive, prior_in_map=poses.in_map)
+    return replace(drive, prior_in_map=poses.in_map, left_out=tuple(left_out))
 
 
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
@@ -119,11 +120,12 @@ class _Message:
     """The packets of a revolution, of which this is the first; () if it came whole."""
 
 
-def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
-    """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution."""
-    messages = [
-        message for k, topic in enumerate(topics) for message in _revolutions(bag, topic, _messages_of(bag, topic, k))
-    ]
+def _sweeps(bag: Bag, topics: list[str], left_out: list[str]) -> list[list[_Message]]:
+    """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution. Sentences on
+    scans without a point are added to ``left_out``."""
+    messages: list[_Message] = []
+    for k, topic in enumerate(topics):
+        messages += _revolutions(bag, topic, _messages_of(bag, topic, k, left_out))
     if not messages:
         raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; {mend_of(bag.path)}")
     if len(topics) == 1:
@@ -174,7 +176,7 @@ def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Messag
     return out
 
 
-def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
+def _messages_of(bag: Bag, topic: str, k: int, left_out: list[str]) -> list[_Message]:
     """The messages of the ``k``-th topic by their stamps; what is left out is counted and reported."""
     headers, received, sizes = stamps_of(bag, topic).T
     order = in_order_of_stamps(headers, received)
@@ -184,7 +186,8 @@ def _messages_of(bag: Bag, topic: str, k: int) -> list[_Message]:
     every = [(_Message(stamp_ns, k, int(received[i]), int(headers[i])), int(sizes[i])) for stamp_ns, i in rows]
     empty = {message.stamp_ns for message, size in every if _is_empty(bag, topic, message, size)}
     if empty:
-        tell_without_points(f"{bag.path} {topic}", len(every), [f"{ns / 1e9:.3f} s" for ns in sorted(empty)])
+        stamps = [f"{ns / 1e9:.3f} s" for ns in sorted(empty)]
+        left_out.append(tell_without_points(f"{bag.path} {topic}", len(every), stamps))
     return [message for message, _ in every if message.stamp_ns not in empty]
 
 

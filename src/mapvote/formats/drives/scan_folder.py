@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -119,8 +119,8 @@ def _tell_unread(files: Sequence[Path]) -> None:
             log.warning(problem, room, len(others), suffix, taken)
 
 
-def _with_points(path: Path, folder: ScanFolder) -> I64:
-    """(m,) the numbers of the files that hold points, or that cannot be read. The others are named in a message.
+def _with_points(path: Path, folder: ScanFolder) -> tuple[I64, tuple[str, ...]]:
+    """((m,) the numbers of the files that hold points, or that cannot be read; a sentence on the others).
 
     A driver that starts before its sensor, and a recorder that is stopped, leave files without a point.
     MapvoteError if no file holds one.
@@ -135,10 +135,10 @@ def _with_points(path: Path, folder: ScanFolder) -> I64:
         return False
 
     empty = np.array([is_empty(file) for file in folder.files], dtype=np.bool_)
-    if empty.any():
-        names = [folder.files[i].name for i in np.flatnonzero(empty)]
-        tell_without_points(str(path), len(folder.files), names)
-    return np.flatnonzero(~empty)
+    if not empty.any():
+        return np.arange(len(folder.files)), ()
+    names = [folder.files[i].name for i in np.flatnonzero(empty)]
+    return np.flatnonzero(~empty), (tell_without_points(str(path), len(folder.files), names),)
 
 
 def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> Drive:
@@ -147,7 +147,7 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
     _tell_unread(folder.files)
     own = folder.prior, folder.prior_name, folder.T_base_lidar
     prior = prior_of(path, options, folder.files, folder.stamps_ns, *own)
-    used = _with_points(path, folder)
+    used, left_out = _with_points(path, folder)
     stamps_ns = folder.stamps_ns[used]
     reader = PointReader(str(path), options.time_rules, step_of(folder.stamps_ns), folder.zero_is_no_return)
 
@@ -155,7 +155,7 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
         file = folder.files[used[i]]
         return reader.scan(str(file), i, int(stamps_ns[i]), folder.read_table(file), sensor)
 
-    return make_drive(
+    drive = make_drive(
         path,
         options,
         stamps_ns=stamps_ns,
@@ -165,6 +165,7 @@ def open_scan_folder(path: Path, options: DriveOptions, folder: ScanFolder) -> D
         T_base_lidar=folder.T_base_lidar,
         prior_sigmas=None if prior.sigmas is None else prior.sigmas[used],
     )
+    return replace(drive, left_out=left_out)
 
 
 SMALL_FILE_BYTES = 4_096
