@@ -25,6 +25,7 @@ from mapvote.doctor.maps import check_cloud, check_map, classified_ground, tile_
 from mapvote_server.api.app import URL, in_process
 from mapvote_server.gate import gate_by
 from mapvote_server.questions.history import overview
+from mapvote_server.questions.origins import with_origins
 from mapvote_server.store.integrity import check
 from mapvote_server.store.keys import listed
 from mapvote_server.store.store import Store, url_of
@@ -56,10 +57,12 @@ def api_of(name: str, settings: Settings | None = None, executor: Executor | Non
 
 
 @contextmanager
-def map_of_store(name: str, version: int | None = None) -> Iterator[PointMap]:
-    """The newest map of a STORE, or one version of it; its tiles are read while this is open."""
+def map_of_store(name: str, version: int | None = None, *, origins: bool = False) -> Iterator[PointMap]:
+    """The newest map of a STORE, or one version of it; its tiles are read while this is open. ``origins``: with the
+    fields of :func:`mapvote_server.questions.origins.with_origins`."""
     with opened_store(name) as store:
-        yield store.point_map(version)
+        point_map = store.point_map(version)
+        yield with_origins(store, point_map) if origins else point_map
 
 
 def findings_of(name: str) -> list[Finding]:

@@ -49,7 +49,7 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
             if parent is not None:
                 changes = all_changes(server, f"from={parent}&to={number}&lonlat=true")
                 (item.parent / CHANGES).write_text(json.dumps(changes, indent=1) + "\n")
-            with map_at(source, key_file, number) as point_map:
+            with map_at(source, key_file, number, origins=True) as point_map:
                 _write(folder, point_map, dict(about) | {"parent": parent}, has_changes=parent is not None)
         write_catalog(folder, map_id, numbers)
     print(f"{folder / 'catalog.json'}: {len(numbers)} versions")

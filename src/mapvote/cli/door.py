@@ -99,8 +99,9 @@ class Stores(Protocol):
     ) -> AbstractContextManager[Connection]:
         """The HTTP API of a STORE within this process."""
 
-    def map_of_store(self, name: str, version: int | None) -> AbstractContextManager[PointMap]:
-        """The newest map of a STORE, or one version of it; its tiles are read while this is open."""
+    def map_of_store(self, name: str, version: int | None, *, origins: bool) -> AbstractContextManager[PointMap]:
+        """The newest map of a STORE, or one version of it; its tiles are read while this is open. ``origins``: with the
+        version and the votes behind each point."""
 
     def findings_of(self, name: str) -> list[Finding]:
         """Everything that is wrong with a STORE."""
@@ -133,11 +134,13 @@ def map_at(
     region: Region | None = None,
     *,
     or_kept: bool = False,
+    origins: bool = False,
 ) -> Iterator[PointMap]:
     """The newest map of a store or a server, or one version of it; or a map in any file format.
 
     Tiles of a map larger than memory are read while this is open. ``region``: only the tiles of a server's map that
-    touch it. ``or_kept``: if the server does not answer, the map that was fetched last, with a warning.
+    touch it. ``or_kept``: if the server does not answer, the map that was fetched last, with a warning. ``origins``: a
+    store's points have the version and the votes behind them as fields.
     """
     from mapvote.client import Unreachable
 
@@ -155,7 +158,7 @@ def map_at(
     if region is not None:
         raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")
     if is_store(name):
-        with stores().map_of_store(name, version) as newest:
+        with stores().map_of_store(name, version, origins=origins) as newest:
             yield newest
         return
     if version is not None:

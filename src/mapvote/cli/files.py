@@ -288,7 +288,7 @@ def export(
         raise MapvoteError("export: --since writes Autoware tiles of a store or a server: give a folder, not a file")
     with ExitStack() as open_maps:
         with waiting(f"reading {source}"):
-            point_map = open_maps.enter_context(map_at(source, key_file, version))
+            point_map = open_maps.enter_context(map_at(source, key_file, version, origins=not live))
             older = None if since is None else open_maps.enter_context(map_at(source, key_file, since))
         if live:
             _lay(point_map, out, older, projector)

@@ -1,0 +1,73 @@
+"""Parts of a file by the header Range (RFC 9110, section 14)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import BinaryIO
+
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+
+from mapvote_server.api.etags import has_already
+
+_PIECE_BYTES = 1 << 18
+_RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+
+
+class NotInFile(ValueError):
+    """A range that begins behind the end."""
+
+
+def part_of(text: str | None, size: int) -> range | None:
+    """The bytes that a Range asks for of a file of ``size`` bytes; None for the whole file: without the header, and of
+    what is no single range of bytes, which a server may ignore.
+
+    NotInFile if the file has none of the bytes.
+    """
+    found = _RANGE.fullmatch(text.replace(" ", "").lower()) if text is not None else None
+    if found is None or found[1] == found[2] == "":
+        return None
+    if not found[1]:
+        asked = range(max(0, size - int(found[2])), size)
+    else:
+        last = int(found[2]) if found[2] else size - 1
+        if last < int(found[1]) and found[2]:
+            return None
+        asked = range(int(found[1]), min(last + 1, size))
+    if not asked:
+        raise NotInFile
+    return asked
+
+
+def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_type: str) -> Response:
+    """The answer to GET or HEAD for an open file, which is closed at its end: 200, 206, 304 or 416."""
+    headers = {"ETag": tag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
+    if has_already(request, tag):
+        file.close()
+        return Response(status_code=304, headers=headers)
+    fresh = request.headers.get("if-range", tag) == tag
+    try:
+        part = part_of(request.headers.get("range"), size) if fresh and request.method == "GET" else None
+    except NotInFile:
+        file.close()
+        return Response(status_code=416, headers=headers | {"Content-Range": f"bytes */{size}"})
+    sent = range(size) if part is None else part
+    headers["Content-Length"] = str(len(sent))
+    if part is not None:
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    status = 200 if part is None else 206
+    if request.method == "HEAD":
+        file.close()
+        return Response(status_code=status, headers=headers, media_type=media_type)
+    return StreamingResponse(_pieces(file, sent), status, headers, media_type)
+
+
+def _pieces(file: BinaryIO, sent: range) -> Iterator[bytes]:
+    with file:
+        file.seek(sent.start)
+        left = len(sent)
+        while left:
+            piece = file.read(min(left, _PIECE_BYTES))
+            left -= len(piece)
+            yield piece
