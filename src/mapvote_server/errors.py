@@ -37,6 +37,10 @@ class TooLarge(MapvoteError):
     """Beyond a limit on size."""
 
 
+class NotInFile(MapvoteError):
+    """A range of bytes that begins behind the end of a file."""
+
+
 class TooMany(MapvoteError):
     """Beyond what a key or a vehicle may send; try again in ``after_s``."""
 

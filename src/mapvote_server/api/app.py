@@ -17,6 +17,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote_server.api import (
     change_routes,
+    cloud_routes,
     desk_routes,
     event_routes,
     ogc_routes,
@@ -35,7 +36,16 @@ from mapvote_server.store.publish import Gate
 from mapvote_server.store.store import Store
 
 _EVERY_S = 2.0
-ROUTES = vehicle_routes, operator_routes, change_routes, desk_routes, event_routes, page_routes, ogc_routes
+ROUTES = (
+    vehicle_routes,
+    operator_routes,
+    change_routes,
+    cloud_routes,
+    desk_routes,
+    event_routes,
+    page_routes,
+    ogc_routes,
+)
 
 
 def create_app(

@@ -10,13 +10,8 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
 from mapvote_server.api.etags import has_already
-
-_PIECE_BYTES = 1 << 18
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
-
-
-class NotInFile(ValueError):
-    """A range that begins behind the end."""
+from mapvote_server.api.schemas import refuse
+from mapvote_server.errors import NotInFile
 
 
 def part_of(text: str | None, size: int) -> range | None:
@@ -25,7 +20,7 @@ def part_of(text: str | None, size: int) -> range | None:
 
     NotInFile if the file has none of the bytes.
     """
-    found = _RANGE.fullmatch(text.replace(" ", "").lower()) if text is not None else None
+    found = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", (text or "").replace(" ", "").lower())
     if found is None or found[1] == found[2] == "":
         return None
     if not found[1]:
@@ -36,7 +31,7 @@ def part_of(text: str | None, size: int) -> range | None:
             return None
         asked = range(int(found[1]), min(last + 1, size))
     if not asked:
-        raise NotInFile
+        raise NotInFile(f"the file has {size} bytes, none of {text}")
     return asked
 
 
@@ -49,9 +44,11 @@ def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_typ
     fresh = request.headers.get("if-range", tag) == tag
     try:
         part = part_of(request.headers.get("range"), size) if fresh and request.method == "GET" else None
-    except NotInFile:
+    except NotInFile as error:
         file.close()
-        return Response(status_code=416, headers=headers | {"Content-Range": f"bytes */{size}"})
+        refused = refuse(error)
+        refused.headers["Content-Range"] = f"bytes */{size}"
+        return refused
     sent = range(size) if part is None else part
     headers["Content-Length"] = str(len(sent))
     if part is not None:
@@ -68,6 +65,6 @@ def _pieces(file: BinaryIO, sent: range) -> Iterator[bytes]:
         file.seek(sent.start)
         left = len(sent)
         while left:
-            piece = file.read(min(left, _PIECE_BYTES))
+            piece = file.read(min(left, 1 << 18))
             left -= len(piece)
             yield piece

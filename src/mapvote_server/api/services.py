@@ -26,6 +26,7 @@ from mapvote.core.types import MapvoteError
 from mapvote_server.api.lanes import Budget, Lane
 from mapvote_server.api.probe import Probe
 from mapvote_server.errors import Conflict, Forbidden, NotFound, TooLarge, TooMany, Unavailable
+from mapvote_server.questions.cloud_files import CloudFiles
 from mapvote_server.questions.clouds import Clouds
 from mapvote_server.questions.history import Feed
 from mapvote_server.store import keys
@@ -347,6 +348,8 @@ class Services:
         question_s = most.question_s if limited else None
         self.questions = Lane("questions", 2, each=1, budget=self.budget, limit_s=question_s)
         """Answers that people read."""
+        self.files = Lane("files", 1, each=1, budget=self.budget)
+        """Files of whole versions: each is made once, however long that takes."""
         self.commands = Lane("commands", 2, each=1)
         """Short changes: keys, policy, votes taken back."""
         self.rounds = Lane("rounds", 4, each=2)
@@ -369,6 +372,7 @@ class Services:
         self.manifests = Manifests(store)
         self.publishing = Publishing()
         self.clouds = Clouds(store)
+        self.cloud_files = CloudFiles(store)
         self.feed = Feed(store)
         self.metrics = Metrics()
         self.limit = RateLimit(most.ballots_per_minute, max(1.0, SERVICE_SIZES.burst * most.ballots_per_minute))
@@ -398,10 +402,11 @@ class Services:
     async def close(self) -> None:
         """Wait until every accepted ballot is written."""
         await self.writer.close()
-        for part in (self.vehicle, self.questions, self.commands, self.rounds, self._probe):
+        for part in (self.vehicle, self.questions, self.files, self.commands, self.rounds, self._probe):
             part.close()
         for pool in (self._fuse, self._writing, self.lookups):
             pool.shutdown(cancel_futures=True)
+        self.cloud_files.close()
 
 
 def services(request: Request) -> Services:

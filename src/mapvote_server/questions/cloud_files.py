@@ -24,7 +24,7 @@ class CloudFileSizes:
     """Limits of the COPC files of a server."""
 
     points: int = 20_000_000
-    """Points of the largest version of which the server makes a file: more take longer than one question may."""
+    """Points of the largest version of which the server makes a file: a minute of CPU."""
     kept_bytes: int = 2_000_000_000
     """Disk for files that are kept, bytes; the least recently used leave it first."""
 
@@ -54,24 +54,27 @@ class CloudFiles:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._made: OrderedDict[int, CloudFile] = OrderedDict()
 
-    def open(self, number: int) -> tuple[CloudFile, BinaryIO]:
+    def ready(self, number: int) -> tuple[CloudFile, BinaryIO] | None:
         """(the file of a version, the same opened for reading: it can be read to the end, also if it is dropped
-        meanwhile); made if there is none yet.
-
-        NotFound if there is no such version. MapvoteError if it is too large or empty. TooSlow if it takes too long.
-        """
+        meanwhile); None if it must be made. NotFound if there is no such version."""
         with self._store.database.reading() as connection:
             version_of(connection, number)
-        opened = self._opened(number)
-        if opened is not None:
-            return opened
+        with self._lock:
+            found = self._made.get(number)
+            if found is None:
+                return None
+            self._made.move_to_end(number)
+            return found, found.path.open("rb")
+
+    def open(self, number: int) -> tuple[CloudFile, BinaryIO]:
+        """As :meth:`ready`; made if there is none yet. MapvoteError if the version is too large, or empty."""
         with self._making:  # of several requests, one makes it
-            opened = self._opened(number)
-            if opened is None:
+            found = self.ready(number)
+            if found is None:
                 self._keep(number, self._make(number))
-                opened = self._opened(number)
-        assert opened is not None
-        return opened
+                found = self.ready(number)
+        assert found is not None
+        return found
 
     def close(self) -> None:
         """Delete all files."""
@@ -79,14 +82,6 @@ class CloudFiles:
             self._made.clear()
             if self._folder is not None:
                 self._folder.cleanup()
-
-    def _opened(self, number: int) -> tuple[CloudFile, BinaryIO] | None:
-        with self._lock:
-            found = self._made.get(number)
-            if found is None:
-                return None
-            self._made.move_to_end(number)
-            return found, found.path.open("rb")
 
     def _make(self, number: int) -> CloudFile:
         point_map = self._store.point_map(number)

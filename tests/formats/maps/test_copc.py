@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_map
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud, CloudPieces
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.copc import OCTREE, write_copc
 from mapvote.formats.maps.las import write_las
 
@@ -106,37 +105,6 @@ def test_every_node_holds_points_of_its_cube_and_one_a_voxel_unless_it_is_the_la
         if any(tuple(int(v) for v in child) in keys for child in children):
             voxels = np.unique(np.floor(xyz / (side / 2**OCTREE.voxel_levels) + 1e-9), axis=0)
             assert len(voxels) >= 0.99 * node.point_count  # all but what lies on a voxel's border, to the step
-
-
-class Counted(io.BytesIO):
-    """A file that counts the bytes that are read, as ranges of a server would be."""
-
-    n = 0
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        content = super().read(size)
-        self.n += len(content)
-        return content
-
-    def readinto(self, buffer: Any, /) -> int:
-        size = super().readinto(buffer)
-        self.n += size
-        return size
-
-
-@pytest.mark.slow
-def test_a_view_of_200_m_of_a_map_of_10_km_reads_3_percent_of_the_file(tmp_path: Path) -> None:
-    pieces = [street(150_000, 500.0, seed) + np.array([500.0 * seed, 0, 0]) for seed in range(20)]
-    frame = MapFrame()
-    cloud = CloudPieces.gathered(lambda: (Cloud(piece, frame=frame) for piece in pieces), frame)
-    write_copc(tmp_path / "long.copc.laz", cloud)
-    content = (tmp_path / "long.copc.laz").read_bytes()
-    stream = Counted(content)
-    reader = laspy.CopcReader(stream)
-    view = laspy.copc.Bounds(mins=np.array([4_000.0, -50.0]), maxs=np.array([4_200.0, 50.0]))
-    points = reader.query(bounds=view, resolution=0.1)
-    assert stream.n <= 0.03 * len(content)
-    assert len(points) > 30_000
 
 
 def test_export_writes_a_map_as_copc_and_import_reads_it(tmp_path: Path) -> None:
