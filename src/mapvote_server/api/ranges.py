@@ -14,7 +14,7 @@ from mapvote_server.api.schemas import refuse
 from mapvote_server.errors import NotInFile
 
 
-def part_of(text: str | None, size: int) -> range | None:
+def asked_bytes(text: str | None, size: int) -> range | None:
     """The bytes that a Range asks for of a file of ``size`` bytes; None for the whole file: without the header, and of
     what is no single range of bytes, which a server may ignore.
 
@@ -43,7 +43,7 @@ def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_typ
         return Response(status_code=304, headers=headers)
     fresh = request.headers.get("if-range", tag) == tag
     try:
-        part = part_of(request.headers.get("range"), size) if fresh and request.method == "GET" else None
+        part = asked_bytes(request.headers.get("range"), size) if fresh and request.method == "GET" else None
     except NotInFile as error:
         file.close()
         refused = refuse(error)

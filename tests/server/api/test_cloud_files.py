@@ -19,7 +19,7 @@ from hand_made import make_map, make_tile, two_walls
 from mapvote.core.grid import Lattice
 from mapvote.core.types import MapvoteError
 from mapvote_server.api.app import create_app
-from mapvote_server.api.ranges import part_of
+from mapvote_server.api.ranges import asked_bytes
 from mapvote_server.errors import NotInFile
 from mapvote_server.questions.cloud_files import CLOUD_FILE_SIZES, CloudFiles
 from mapvote_server.store.publish import publish
@@ -124,7 +124,7 @@ def test_any_range_is_what_python_slices(size: int, first: int, last: int) -> No
         (f"bytes=-{last}", content[max(0, size - last) :] if last else b""),
     ):
         try:
-            part = part_of(text, size)
+            part = asked_bytes(text, size)
         except NotInFile:
             assert wanted == b""
         else:
