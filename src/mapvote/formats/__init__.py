@@ -33,7 +33,7 @@ from mapvote.formats.geo.frame import (
 )
 from mapvote.formats.geo.units import Convert, settle_out
 from mapvote.formats.maps.cloud import READ_SIZES, Cloud, CloudPieces, ReadSizes
-from mapvote.formats.maps.field_names import ORIGINS, kept_fields
+from mapvote.formats.maps.field_names import kept_fields
 from mapvote.formats.maps.laz_subprocess import LasClass
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map
 from mapvote.formats.maps.marked_points import DROPPED, MarkedPoints, without_marked
@@ -241,7 +241,7 @@ def _pieces(
     def pieces() -> Iterator[Cloud]:
         for index in sorted(point_map.tiles):
             tile = point_map.tiles[index]
-            names = (*kept_fields(), *ORIGINS)
+            names = (*kept_fields(), "source_version", "votes")  # the last two a store adds
             fields: dict[str, NDArray[Any]] = {n: tile.fields[n] for n in names if n in tile.fields}
             if classes and "classification" not in fields:
                 on_ground = tile.has_ground & ~tile.columns[1]

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, Request, Response
 
 from mapvote_server.api.ranges import answer_part
 from mapvote_server.api.schemas import AS_YOU_HAVE, Number, problems
 from mapvote_server.api.services import Parts, Services
+from mapvote_server.questions.cloud_files import CloudFile
 
-COPC = "application/vnd.laszip+copc"
-_IN_PARTS: dict[int | str, dict[str, Any]] = {
-    200: {"content": {COPC: {}}},
-    206: {"description": "the bytes that Range names", "content": {COPC: {}}},
-}
 router = APIRouter()
 
 
 @router.get(
     "/v1/map/versions/{number}/cloud.copc.laz",
-    responses=problems(404, 416) | AS_YOU_HAVE | _IN_PARTS,
+    responses=problems(404, 416)
+    | AS_YOU_HAVE
+    | {
+        200: {"content": {CloudFile.media_type: {}}},
+        206: {"description": "the bytes that Range names", "content": {CloudFile.media_type: {}}},
+    },
     response_class=Response,
     summary="A version as COPC, by ranges of bytes",
 )
@@ -42,4 +41,4 @@ async def _cloud(request: Request, parts: Services, number: int) -> Response:
     if found is None:
         found = await parts.files.run(parts.cloud_files.open, number)
     made, file = found
-    return answer_part(request, file, made.size, f'"{made.digest}"', COPC)
+    return answer_part(request, file, made.size, f'"{made.digest}"', made.media_type)

@@ -8,7 +8,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO
+from typing import BinaryIO, ClassVar
 
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
@@ -36,6 +36,7 @@ CLOUD_FILE_SIZES = CloudFileSizes()
 class CloudFile:
     """The file of one version."""
 
+    media_type: ClassVar[str] = "application/vnd.laszip+copc"
     path: Path
     size: int
     """Bytes."""

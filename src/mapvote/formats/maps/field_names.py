@@ -23,8 +23,6 @@ KEPT = (
 )
 """Fields of points that a map keeps, by LAS's names; :func:`kept_fields` has the attributes of other distributions too.
 ``las_flags`` holds the bits of ``laz_subprocess.FLAGS``."""
-ORIGINS = ("source_version", "votes")
-"""Fields that a store adds to the points that it exports (docs/formats.md)."""
 COLOURS = ("red", "green", "blue")
 
 _SPELLINGS: Mapping[str, tuple[str, ...]] = {
