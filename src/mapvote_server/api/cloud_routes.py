@@ -37,8 +37,8 @@ async def cloud_head(request: Request, parts: Parts, number: Number) -> Response
 
 
 async def _cloud(request: Request, parts: Services, number: int) -> Response:
-    found = await parts.questions.run(parts.cloud_files.ready, number)
-    if found is None:
-        found = await parts.files.run(parts.cloud_files.open, number)
-    made, file = found
+    opened = await parts.questions.run(parts.cloud_files.ready, number)
+    if opened is None:
+        opened = await parts.files.run(parts.cloud_files.open, number)
+    made, file = opened
     return answer_part(request, file, made.size, f'"{made.digest}"', made.media_type)

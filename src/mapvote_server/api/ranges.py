@@ -20,19 +20,19 @@ def asked_bytes(text: str | None, size: int) -> range | None:
 
     NotInFile if the file has none of the bytes.
     """
-    found = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", (text or "").replace(" ", "").lower())
-    if found is None or found[1] == found[2] == "":
+    match = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", (text or "").replace(" ", "").lower())
+    if match is None or match[1] == match[2] == "":
         return None
-    if not found[1]:
-        asked = range(max(0, size - int(found[2])), size)
+    if not match[1]:
+        part = range(max(0, size - int(match[2])), size)
     else:
-        last = int(found[2]) if found[2] else size - 1
-        if last < int(found[1]) and found[2]:
+        last = int(match[2]) if match[2] else size - 1
+        if last < int(match[1]) and match[2]:
             return None
-        asked = range(int(found[1]), min(last + 1, size))
-    if not asked:
+        part = range(int(match[1]), min(last + 1, size))
+    if not part:
         raise NotInFile(f"the file has {size} bytes, none of {text}")
-    return asked
+    return part
 
 
 def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_type: str) -> Response:

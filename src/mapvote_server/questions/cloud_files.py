@@ -61,21 +61,21 @@ class CloudFiles:
         with self._store.database.reading() as connection:
             version_of(connection, number)
         with self._lock:
-            found = self._made.get(number)
-            if found is None:
+            made = self._made.get(number)
+            if made is None:
                 return None
             self._made.move_to_end(number)
-            return found, found.path.open("rb")
+            return made, made.path.open("rb")
 
     def open(self, number: int) -> tuple[CloudFile, BinaryIO]:
         """As :meth:`ready`; made if there is none yet. MapvoteError if the version is too large, or empty."""
         with self._making:  # of several requests, one makes it
-            found = self.ready(number)
-            if found is None:
+            opened = self.ready(number)
+            if opened is None:
                 self._keep(number, self._make(number))
-                found = self.ready(number)
-        assert found is not None
-        return found
+                opened = self.ready(number)
+        assert opened is not None
+        return opened
 
     def close(self) -> None:
         """Delete all files."""

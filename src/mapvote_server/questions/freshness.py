@@ -78,12 +78,12 @@ class _Seen:
         t = schema.ballot_tiles.c
         passed = sa.select(t.row, t.col, sa.func.count(sa.distinct(b.vehicle)), sa.func.max(b.end_ns))
         passed = passed.join(schema.ballots, t.ballot == b.seq).where(b.gone_seq.is_(None)).group_by(t.row, t.col)
-        found: dict[TileIndex, tuple[int, int | None]] = dict.fromkeys(tiles_of(connection, newest), (0, None))
-        found |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(passed)}
+        passes: dict[TileIndex, tuple[int, int | None]] = dict.fromkeys(tiles_of(connection, newest), (0, None))
+        passes |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(passed)}
         for rows in self._rows.values():
-            for index in [index for index in rows if found.get(index) != self._tiles.get(index)]:
+            for index in [index for index in rows if passes.get(index) != self._tiles.get(index)]:
                 del rows[index]
-        self._tiles = dict(sorted(found.items()))
+        self._tiles = dict(sorted(passes.items()))
 
     def _put(self, connection: sa.Connection, newest: int, touched: Iterable[TileIndex]) -> None:
         count = len(self._tiles)

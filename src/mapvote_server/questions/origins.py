@@ -74,12 +74,12 @@ def _sources(connection: sa.Connection, tile: Tile, number: int) -> I64:
     """(n,) the version from which on the map has each point without a break."""
     t = schema.version_tiles
     rows = sa.select(t.c.version, t.c.points).where(t.c.row == tile.index[0], t.c.col == tile.index[1])
-    found = connection.execute(rows.where(t.c.version <= number).order_by(t.c.version.desc())).all()
+    history = connection.execute(rows.where(t.c.version <= number).order_by(t.c.version.desc())).all()
     oldest = oldest_kept(connection)
     source = np.zeros(len(tile.points), dtype=np.int64)
     older = np.arange(len(source))
-    last = found[0]
-    for before in found[1:]:
+    last = history[0]
+    for before in history[1:]:
         if last.version <= oldest or not len(older):
             break
         if last.points != before.points:

@@ -57,8 +57,8 @@ class RoundFile:
 
     def read(self, start: int, size: int) -> Bulk:
         """Parts that were written there."""
-        found: Bulk = pickle.loads(zstd.decompress(os.pread(self._file.fileno(), size, start)))
-        return found
+        bulk: Bulk = pickle.loads(zstd.decompress(os.pread(self._file.fileno(), size, start)))
+        return bulk
 
 
 @dataclass(frozen=True, slots=True)
