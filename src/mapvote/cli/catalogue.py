@@ -32,7 +32,8 @@ def export_stac(source: str, folder: Path, key_file: Path | None, version: int |
             write_catalog(folder, point_map.map_id, [1])
         return
     with api_at(source, key_file) as server:
-        versions = server.ask_json("GET", "/v1/map/versions")["versions"]
+        oldest = server.ask_json("GET", "/v1/info")["oldest_version"]
+        versions = [v for v in server.ask_json("GET", "/v1/map/versions")["versions"] if v["number"] >= oldest]
         numbers = [v["number"] for v in versions if version in (None, v["number"])]
         if not numbers:
             raise MapvoteError(

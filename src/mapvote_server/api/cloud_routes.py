@@ -1,12 +1,16 @@
-"""Routes of whole versions for viewers and catalogues: COPC files by ranges of bytes."""
+"""Routes of whole versions: COPC files by ranges of bytes, and the STAC catalogue that names them."""
 
 from __future__ import annotations
 
+import msgspec
 from fastapi import APIRouter, Request, Response
 
+from mapvote_server.api.lanes import on
 from mapvote_server.api.ranges import answer_part
 from mapvote_server.api.schemas import AS_YOU_HAVE, Number, problems
 from mapvote_server.api.services import Parts, Services
+from mapvote_server.errors import NotFound
+from mapvote_server.questions.catalogue import catalogue_at, item_at
 from mapvote_server.questions.cloud_files import CloudFile
 
 router = APIRouter()
@@ -42,3 +46,31 @@ async def _cloud(request: Request, parts: Services, number: int) -> Response:
         opened = await parts.files.run(parts.cloud_files.open, number)
     made, file = opened
     return answer_part(request, file, made.size, f'"{made.digest}"', made.media_type)
+
+
+@router.get("/stac", responses=problems(), response_class=Response, summary="All versions as a STAC catalogue")
+@router.get("/stac/catalog.json", include_in_schema=False)
+@on("questions")
+def catalogue(request: Request, parts: Parts) -> Response:
+    """STAC 1.1: a link to the item of each version that is kept."""
+    return Response(msgspec.json.encode(catalogue_at(parts.store, _address(request))), media_type="application/json")
+
+
+@router.get(
+    "/stac/v{number}/v{same}.json",
+    responses=problems(404),
+    response_class=Response,
+    summary="A version as a STAC item",
+)
+@on("questions")
+def stac_item_of(request: Request, parts: Parts, number: Number, same: Number) -> Response:
+    """The item that `mapvote export STORE FOLDER --stac` writes (extensions pointcloud and projection), with addresses
+    of this server: the points as COPC, the changes as GeoJSON, the item that it is derived from."""
+    if number != same:
+        raise NotFound(f"the item of version {number} is v{number}/v{number}.json")
+    item = item_at(parts.store, number, _address(request))
+    return Response(msgspec.json.encode(item), media_type="application/geo+json")
+
+
+def _address(request: Request) -> str:
+    return f"{str(request.base_url).rstrip('/')}/stac/catalog.json"
