@@ -6,8 +6,9 @@ import msgspec
 from fastapi import APIRouter, Request, Response
 
 from mapvote_server.api.lanes import on
+from mapvote_server.api.problems import problems
 from mapvote_server.api.ranges import answer_part
-from mapvote_server.api.schemas import AS_YOU_HAVE, Number, problems
+from mapvote_server.api.schemas import AS_YOU_HAVE, Number
 from mapvote_server.api.services import Parts, Services
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.catalogue import catalogue_at, item_at

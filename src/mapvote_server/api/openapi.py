@@ -22,7 +22,7 @@ SCHEMES: dict[str, dict[str, Any]] = {
 }
 KEYLESS = "/livez", "/readyz"
 GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "map": ("Versions of the map, and the planes of its tiles", ("map", "tiles", "clouds")),
+    "map": ("Versions of the map, and the planes of its tiles", ("map", "tiles", "clouds", "stac")),
     "ballots": ("Votes of vehicles", ("ballots",)),
     "changes": ("What was built and demolished, and the votes for it", ("changes", "cells", "evidence")),
     "coverage": ("Where vehicles have been, and where one should drive next", ("coverage", "paths", "vehicles")),

@@ -10,7 +10,7 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
 from mapvote_server.api.etags import has_already
-from mapvote_server.api.schemas import refuse
+from mapvote_server.api.problems import refuse
 from mapvote_server.errors import NotInFile
 
 
@@ -46,7 +46,7 @@ def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_typ
         part = asked_bytes(request.headers.get("range"), size) if fresh and request.method == "GET" else None
     except NotInFile as error:
         file.close()
-        refused = refuse(error)
+        refused = refuse(error, request.url.path)
         refused.headers["Content-Range"] = f"bytes */{size}"
         return refused
     sent = range(size) if part is None else part
