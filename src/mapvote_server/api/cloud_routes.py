@@ -19,6 +19,7 @@ router = APIRouter()
 
 @router.get(
     "/v1/map/versions/{number}/cloud.copc.laz",
+    operation_id="get_cloud_file",
     responses=problems(404, 416)
     | AS_YOU_HAVE
     | {
@@ -49,7 +50,13 @@ async def _cloud(request: Request, parts: Services, number: int) -> Response:
     return answer_part(request, file, made.size, f'"{made.digest}"', made.media_type)
 
 
-@router.get("/stac", responses=problems(), response_class=Response, summary="All versions as a STAC catalogue")
+@router.get(
+    "/stac",
+    operation_id="get_stac_catalogue",
+    responses=problems(),
+    response_class=Response,
+    summary="All versions as a STAC catalogue",
+)
 @router.get("/stac/catalog.json", include_in_schema=False)
 @on("questions")
 def catalogue(request: Request, parts: Parts) -> Response:
@@ -59,6 +66,7 @@ def catalogue(request: Request, parts: Parts) -> Response:
 
 @router.get(
     "/stac/v{number}/v{same}.json",
+    operation_id="get_stac_item",
     responses=problems(404),
     response_class=Response,
     summary="A version as a STAC item",
