@@ -130,14 +130,14 @@ def evaluate(
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     from mapvote.config import cache_folder, load_with_sources
-    from mapvote_lab.evaluation.cases import DEFAULT_CASES, PUBLISHED, as_paper, choose_cases
+    from mapvote_lab.evaluation.cases import PUBLISHED, as_paper, choose_cases
     from mapvote_lab.evaluation.evaluate import evaluate as run
     from mapvote_lab.evaluation.scene import Scene
     from mapvote_lab.evaluation.tables import tables
 
     settings, sources = load_with_sources(config)
     settings = as_paper(settings, scenario, sources, reading)
-    cases, with_yardsticks = choose_cases(settings, case or DEFAULT_CASES)
+    cases, with_yardsticks = choose_cases(settings, case)
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
         overrides["temporary_cars"] = cars
@@ -171,10 +171,10 @@ def _show(sheets: Sequence[Sheet], result: Struct | Mapping[str, Any], json: Pat
 
 def _evaluate_court(folder: Path, case: str | None, json: Path | None, settings: Settings) -> None:
     """The court's three sessions, as cast scans by ``case`` and as clouds."""
-    from mapvote_lab.evaluation.cases import DEFAULT_CASES, choose_cases
+    from mapvote_lab.evaluation.cases import choose_cases
     from mapvote_lab.evaluation.court import Court, court_table, evaluate_court
 
-    cases, _ = choose_cases(settings, case or DEFAULT_CASES)
+    cases, _ = choose_cases(settings, case)
     with stages() as report:
         scores = evaluate_court(Court.read(folder), settings, cases, report)
     _show([court_table(scores)], {"scores": scores}, json)

@@ -318,7 +318,6 @@ def unpack_sureness(odds: bytes | None, states: U8 | None) -> Odds | None:
 PLACES = 32
 """Places along a voxel's side that a point may have."""
 _POINT_BYTES = 9
-_TOP_M = 1e5
 
 
 def pack_points(points: F32) -> bytes:
@@ -392,7 +391,7 @@ def _all_inside(points: F32, side: np.float32) -> bool:
         x = points[i, 0]
         y = points[i, 1]
         z = points[i, 2]
-        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= 1e5
     return sound
 
 

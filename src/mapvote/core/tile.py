@@ -18,13 +18,6 @@ from mapvote.core.types import F32, F64, I32, I64, U32, U64, Bool, check_array, 
 
 PLANES = 4
 """Planes of a tile's memory."""
-_FOLLOWS_FROM: dict[str, set[str]] = {
-    "cells": {"points"},
-    "base": {"ground_z"},
-    "columns": {"points", "ground_z"},
-    "obstacle_words": {"points", "ground_z"},
-}
-"""Values that a tile computes once, and the planes that they follow from."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +152,15 @@ class Tile:
 
     def but(self, **planes: Any) -> Tile:
         """The tile with other ``planes``; what was worked out of those that stay goes along."""
+        # The planes that each computed value follows from.
+        sources = {
+            "cells": {"points"},
+            "base": {"ground_z"},
+            "columns": {"points", "ground_z"},
+            "obstacle_words": {"points", "ground_z"},
+        }
         other = object.__new__(Tile)
-        stays = (name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys())
+        stays = (name for name in self.__dict__ if not sources.get(name, set()) & planes.keys())
         other.__dict__.update({name: self.__dict__[name] for name in stays}, **planes)
         other.__post_init__()
         return other

@@ -36,10 +36,12 @@ from mapvote.codec.ballot import PLACES
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
+from mapvote.core.record import record
 from mapvote.core.types import I64, U8, U64, Bool, CellState, read_only
 from mapvote.fusion.tile_vote import Vote
 
 
+@record()
 @dataclass(frozen=True, slots=True)
 class CopyRule:
     """The numbers by which drives are compared."""

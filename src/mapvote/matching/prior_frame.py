@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.geometry import exp, inverse, log, rotation_angle
+from mapvote.core.record import record
 from mapvote.core.types import F64, PosePrior
 
 
+@record(votes=True)
 @dataclass(frozen=True, slots=True)
 class FrameLearning:
     """How the frame of a prior is learnt."""

@@ -23,7 +23,6 @@ SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
 """Voxel side of each level; one more level takes what is left."""
 N_LEVELS = len(SPACINGS_M) + 1
 SIDE_M = TILE_CELLS * CELL_SIZE
-ABOVE_OFFSET_M = 10.0
 _STEPS = 65535
 
 
@@ -151,7 +150,7 @@ def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) 
         out[i, 0] = min(max(round(x * (_STEPS / SIDE_M)), 0), _STEPS)
         out[i, 1] = min(max(round(y * (_STEPS / SIDE_M)), 0), _STEPS)
         out[i, 2] = round((z - z0) / step)
-        out[i, 3] = min(max(round((z - ground + ABOVE_OFFSET_M) * 100), 0), _STEPS)
+        out[i, 3] = min(max(round((z - ground + 10.0) * 100), 0), _STEPS)  # centimetres from 10 m below the ground
     return out
 
 

@@ -81,15 +81,13 @@ def rule_cases(settings: Settings) -> dict[str, Case]:
     return cases
 
 
-DEFAULT_CASES = "1,2,3,4,5,surfaces"
-
-
-def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
+def choose_cases(settings: Settings, wanted: str | None = None) -> tuple[list[Case], bool]:
     """Cases by comma-separated names (1 to 5, "1 column" and its like, a rule's name, yardsticks, or "all"
     that there is), and whether the yardsticks are wanted.
 
     MapvoteError names one that there is not, or says that no vote is left.
     """
+    wanted = wanted or "1,2,3,4,5,surfaces"
     every = {**paper_cases(settings), **rule_cases(settings)}
     names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
     for name in names:

@@ -325,9 +325,6 @@ TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
 """Label of each cell by each truth, over the window of the truth: 0 unchanged, 1 changed-occupied, 2 changed-empty, 255
 unscored; ``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
 
-SIDE_BY_SIDE = ("strict", "provenance", "could be known")
-"""Those that differ in what they ask for: the readings of the paper are scored by each."""
-
 
 @dataclass(frozen=True, slots=True)
 class CaseOutcome:

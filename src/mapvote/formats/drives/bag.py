@@ -24,8 +24,6 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 LIVOX = "livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"
 """Clouds of Livox's drivers: decoded points, each with its time."""
 CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
-PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
-"""Parts of the names of messages in which drivers record what came over the wire."""
 TF = "tf2_msgs/msg/TFMessage"
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.bag import CLOUD, CLOUDS, PACKETS, Bag, frame_id, stamps_of, static_frames
+from mapvote.formats.drives.bag import CLOUD, CLOUDS, Bag, frame_id, stamps_of, static_frames
 from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
@@ -84,8 +84,12 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
 def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
     topics = bag.topics(*CLOUDS)
     listed = ", ".join(f"{name} ({n})" for name, n in topics.items())
+    # Parts of the names of messages in which drivers record what came over the wire.
+    words = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan")
     packets = sorted(
-        n for n, t in bag.reader.topics.items() if t.msgtype and any(word in t.msgtype for word in PACKETS)
+        name
+        for name, topic in bag.reader.topics.items()
+        if topic.msgtype and any(word in topic.msgtype for word in words)
     )
     if not topics and packets:
         raise MapvoteError(f"{bag.path}: raw packets only ({', '.join(packets)}): decode with your driver first")

@@ -51,7 +51,6 @@ class GeoKey(IntEnum):
 
 
 _USER_DEFINED = 32767
-_MODEL_GEOGRAPHIC = 2
 
 
 def frame_of_keys(source: str, keys: Mapping[int, int]) -> MapFrame:
@@ -60,7 +59,7 @@ def frame_of_keys(source: str, keys: Mapping[int, int]) -> MapFrame:
     MapvoteError if a code is none that pyproj knows.
     """
     code = keys.get(GeoKey.PROJECTED) or 0
-    if code in (0, _USER_DEFINED) and keys.get(GeoKey.MODEL) == _MODEL_GEOGRAPHIC:
+    if code in (0, _USER_DEFINED) and keys.get(GeoKey.MODEL) == 2:  # longitude and latitude
         code = keys.get(GeoKey.GEODETIC) or 0
     if code == _USER_DEFINED or (keys.get(GeoKey.PROJECTED) == _USER_DEFINED):
         raise MapvoteError(
