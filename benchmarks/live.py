@@ -102,8 +102,8 @@ class Server:
             return database.execute("select drive, start_ns, end_ns from ballots order by start_ns").fetchall()
 
 
-def kills(drive: str, map_path: str, n: int, longest_s: float) -> None:
-    """Kill a live drive n times, each up to ``longest_s`` after its start, and count what is missing and what came
+def kills(drive: str, map_path: str, n: int, within_s: tuple[float, float]) -> None:
+    """Kill a live drive n times, each ``within_s`` seconds after its start, and count what is missing and what came
     twice. Exit code 1 if a ballot is, or more than 30 s of road."""
     home, chance = Path(tempfile.mkdtemp()), random.Random(4)
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home / "cache"), "PYTHONUNBUFFERED": "1"}
@@ -127,7 +127,7 @@ def kills(drive: str, map_path: str, n: int, longest_s: float) -> None:
             began_ns, away = last_stamp(shown), k % 2 == 1 and k < n
             if away:
                 server.stop()
-            time.sleep(chance.uniform(2.0, longest_s) if k < n else 20.0)
+            time.sleep(chance.uniform(*within_s) if k < n else 20.0)
             if k < n:
                 process.kill()
                 killed_ns.append((began_ns, last_stamp(shown)))
@@ -281,11 +281,12 @@ def main() -> None:
     parser.add_argument("--sensor", default="hdl32e")
     parser.add_argument("--core", default="", help="that the process which drives is held to")
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--longest", type=float, default=25.0, help="seconds before a kill")
+    parser.add_argument("--shortest", type=float, default=2.0, help="seconds before a kill at least")
+    parser.add_argument("--longest", type=float, default=25.0, help="seconds before a kill at most")
     o = parser.parse_args()
     runs = {
         "drive": lambda: play_and_drive(*o.paths, o.rate, o.sensor, o.core),
-        "kills": lambda: kills(*o.paths, o.kills, o.longest),
+        "kills": lambda: kills(*o.paths, o.kills, (o.shortest, o.longest)),
         "priors": lambda: priors(*o.paths),
         "packets": lambda: packets(*o.paths),
         "laps": lambda: laps(o.domain, o.paths[0], Path(o.paths[1])),
