@@ -1,4 +1,4 @@
-"""Through how many files a scan, a ballot, a tile, the desk, a map and a diagnosis walk.
+"""Through how many files a scan, a tile, a ballot, the desk, a cell, a map, a diagnosis and an evaluation walk.
 
     python benchmarks/walks.py [--show tile]
 
@@ -11,6 +11,7 @@ call counted; *places*: pairs of a calling and a called function between which t
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import threading
@@ -33,7 +34,7 @@ from fusion import said
 from fusion import street as two_facades
 from hand_made import make_ballot, unpack_all
 from mapvote.codec.ballot import encode, pack_path
-from mapvote.config import FuseSettings
+from mapvote.config import FuseSettings, Settings
 from mapvote.core.point_map import map_from_points
 from mapvote.core.rule import SURFACES
 from mapvote.core.types import CellState
@@ -42,6 +43,9 @@ from mapvote.formats.drives.scan_folder import DriveWriter
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.survey.build import build_map
 from mapvote.vehicle import Vehicle
+from mapvote_lab.evaluation.cases import choose_cases
+from mapvote_lab.evaluation.evaluate import evaluate
+from mapvote_lab.evaluation.scene import Scene
 from mapvote_server.api.app import URL, in_process
 from mapvote_server.store.policy import Policy
 from mapvote_server.store.store import Store
@@ -153,6 +157,11 @@ def desk(walk: Walk) -> None:
     ask(walk, lambda client, third: client.get("/v1/desk"))
 
 
+def cell(walk: Walk) -> None:
+    """The votes on a cell are explained."""
+    ask(walk, lambda client, third: client.get("/v1/cell", params={"x": 30.0, "y": 3.0}))
+
+
 def build(walk: Walk) -> None:
     """A map of a drive of 20 scans."""
     poses = path(20)
@@ -175,7 +184,17 @@ def diagnosis(walk: Walk) -> None:
             diagnose(Path(folder) / "d", None, map_from_points(street(0)))
 
 
-WALKS = (scan, tile, ballot, desk, build, diagnosis)
+def evaluation(walk: Walk) -> None:
+    """The corner is simulated, mapped, driven, voted on and scored, in one process."""
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Scene("corner", 3, Settings(), Path(folder), {"rate_hz": 4.0, "sensor": "vlp16"})
+        cases, _ = choose_cases(scene.settings, "1,3,5,surfaces")
+        os.cpu_count = lambda: 1
+        with counted(walk):
+            evaluate(scene, cases)
+
+
+WALKS = (scan, tile, ballot, desk, cell, build, diagnosis, evaluation)
 
 
 def main() -> None:

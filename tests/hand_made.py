@@ -99,9 +99,9 @@ class Say:
             tile=tile,
             states=None if self.states is None else pack_plane(self.states, 1),
             tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0), 1),
-            gone=None if self.gone is None else pack_words(self.gone),
+            gone=None if self.gone is None else pack_words(Words.of(self.gone)),
             new_points=None if self.new_points is None else pack_points(self.new_points),
-            free=None if self.free is None else pack_words(self.free),
+            free=None if self.free is None else pack_words(Words.of(self.free)),
             fields=compress(pack_fields(self.fields), 1) if self.fields else None,
             odds=None if self.odds is None else pack_odds(self.odds),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -12,15 +12,13 @@ import numpy as np
 from mapvote.codec.ballot import (
     Ballot,
     BallotTile,
+    Odds,
     changed_cells_of,
     in_steps,
-    pack_odds,
     pack_path,
-    pack_points,
+    pack_planes,
     tile_key,
 )
-from mapvote.codec.fields import pack_fields
-from mapvote.codec.planes import compress, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
@@ -30,13 +28,13 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U64, CellState, Drive, MapvoteError, PosePrior, Scan
-from mapvote.core.voting import to_wire
+from mapvote.core.voting import one_hot, to_wire
 from mapvote.formats.drives.upright import upright
 from mapvote.matching.localiser import Localise, Localiser
 from mapvote.matching.prior_frame import PriorFrame
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.rules.voter import NewPoints, TileVotes, make_voter, points_in
+from mapvote.rules.voter import Counted, NewPoints, make_voter, points_in
 
 
 class ClosedStretch(NamedTuple):
@@ -241,7 +239,7 @@ def write_ballot(
     point_map: PointMap,
     settings: Settings,
     report: DriveReport,
-    votes_of_tiles: Iterable[tuple[TileIndex, TileVotes]],
+    counted: Iterable[tuple[TileIndex, Counted]],
     new_points: NewPoints,
 ) -> Ballot:
     """The ballot of one voter, counted under ``settings``. Raises MapvoteError if no scan has voted."""
@@ -256,7 +254,7 @@ def write_ballot(
     points = new_points.by_tile()
     two_stage = settings.voting.two_stage
     names = new_points.names
-    tiles = [_ballot_tile(point_map, tile, votes, points(tile), names, two_stage) for tile, votes in votes_of_tiles]
+    tiles = [_ballot_tile(point_map, tile, count, points(tile), names, two_stage) for tile, count in counted]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,
@@ -280,30 +278,26 @@ def write_ballot(
 
 
 def _ballot_tile(
-    point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64, names: Sequence[str], two_stage: bool
+    point_map: PointMap, tile: TileIndex, count: Counted, points: F64, names: Sequence[str], two_stage: bool
 ) -> BallotTile:
     """One-stage, the server decides: then every cell that got a vote for changed-occupied may need its points."""
+    planes = count.planes
+    states = planes.states
+    assert states is not None
+    # The new points, and their attributes that were measured.
     built = CellState.CHANGED_OCCUPIED
-    came = votes.states == built if two_stage else votes.tally[..., built] > 0
-    kept, sent = offered(point_map, tile, np.where(came, votes.new, np.uint64(0)), points, names)
+    came = states == built if two_stage or planes.tally is None else planes.tally[..., built] > 0
+    new_points, sent = offered(point_map, tile, np.where(came, count.new, np.uint64(0)), points, names)
     measured = {name: values for name, values in sent.items() if (values != point_field(name).unmeasured).any()}
+    planes = replace(planes, new_points=new_points, fields=measured)
+    if not two_stage:
+        tally = to_wire(one_hot(states)) if planes.tally is None else planes.tally
+        return pack_planes(tile, replace(planes, states=None, tally=tally))
+    # The vehicle's confidence in each change.
     odds = None
-    if two_stage and votes.looked is not None:
-        from mapvote.rules.surfaces import depths_m, log_odds  # brings scipy, as surfaces do
-
-        changes = votes.states.reshape(-1)[changed_cells_of(votes.states)]
-        depth_m = depths_m(votes.states, point_map.tiles.get(tile), kept)
-        odds = pack_odds(in_steps(log_odds(changes, votes.looked, depth_m)))
-    return BallotTile(
-        tile=tile,
-        states=pack_plane(votes.states) if two_stage else None,
-        tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
-        gone=None if votes.gone is None else pack_words(votes.gone),
-        new_points=pack_points(kept) if len(kept) else None,
-        fields=compress(pack_fields(measured)) if measured else None,
-        free=None if votes.free is None else pack_words(votes.free),
-        odds=odds,
-    )
+    if count.log_odds is not None:
+        odds = Odds(changed_cells_of(states), in_steps(count.log_odds(new_points)))
+    return pack_planes(tile, replace(planes, tally=None, odds=odds))
 
 
 def offered(

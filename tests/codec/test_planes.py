@@ -90,7 +90,7 @@ def test_packed_or_not_they_are_the_plane(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     plane = np.where(rng.random(SHAPE) < share, rng.integers(1, 2**63, SHAPE), 0).astype(np.uint64)
     inside = rng.random(SHAPE) < 0.5
-    for words in (Words.of(plane), unpack_sparse(pack_words(plane), "gone")):
+    for words in (Words.of(plane), unpack_sparse(pack_words(Words.of(plane)), "gone")):
         assert words.words.all()
         assert np.array_equal(at_least([words], 1), plane)
         for some in (words.within(inside), words.where(Words.whole(inside))):
@@ -111,8 +111,8 @@ def test_at_least_counts_bits(words: list[int], k: int) -> None:
         *(pack_plane(np.zeros(size, np.uint8)) for size in (8, 11, 256 * 256 * 10 + 10)),
         b"",
         b"no zstd frame",
-        pack_words(words_plane({CELL: 7}))[:-1],
-        pack_words(words_plane({CELL: 7})) + b"x",
+        pack_words(Words.of(words_plane({CELL: 7})))[:-1],
+        pack_words(Words.of(words_plane({CELL: 7}))) + b"x",
         compress(bytes([3, 0, 0, 0]) + bytes([1, 1]) + bytes(14), 1),  # a cell twice
         compress(bytes([255, 1, 255, 0]) + bytes([1, 1]) + bytes(14), 1),  # beyond the tile
         compress(bytes([3, 0]) + bytes(8), 1),  # an empty word

@@ -9,7 +9,7 @@ import pytest
 
 from hand_made import make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import Ballot, BallotTile, pack_path, pack_points
-from mapvote.codec.planes import pack_plane, pack_words
+from mapvote.codec.planes import Words, pack_plane, pack_words
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F32, CellState
 from mapvote.formats.drives.bag import Bag
@@ -48,7 +48,7 @@ def ballot(gone: bool = True, one_stage: bool = False) -> Ballot:
         tile=(0, 0),
         states=None if one_stage else pack_plane(STATES),
         tally=pack_plane(tally) if one_stage else None,
-        gone=pack_words(words) if gone else None,
+        gone=pack_words(Words.of(words)) if gone else None,
         new_points=pack_points(NEW),
     )
     path = pack_path([np.array([1.0, 2.0]), np.array([30.0, 2.0])], Lattice())

@@ -231,15 +231,19 @@ def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     assert list(votes) == [(-1, 0), (-1, 1), (0, 0), (0, 1)], "and where it saw nothing it says so"
     left, right = votes[0, 0], votes[0, 1]
     twice = 2 * round(float(vote_weight(8)) * VOTE_UNIT)
-    assert left.tally[10, 250].tolist() == [twice, 0, 0, 0, 0]
-    assert right.tally[10, 2].tolist() == [0, 0, twice, 0, 0]
-    assert left.states[10, 250] == CellState.UNCHANGED_OCCUPIED
-    assert right.states[10, 2] == CellState.CHANGED_OCCUPIED
+    assert left.planes.tally is not None
+    assert right.planes.tally is not None
+    assert left.planes.states is not None
+    assert right.planes.states is not None
+    assert left.planes.tally[10, 250].tolist() == [twice, 0, 0, 0, 0]
+    assert right.planes.tally[10, 2].tolist() == [0, 0, twice, 0, 0]
+    assert left.planes.states[10, 250] == CellState.UNCHANGED_OCCUPIED
+    assert right.planes.states[10, 2] == CellState.CHANGED_OCCUPIED
     assert np.argwhere(right.new).tolist() == [[10, 2]], "its points are new whatever their height"
     assert right.new[10, 2] == ~np.uint64(0)
     assert not left.new.any()
     assert np.count_nonzero(may_be_new) == 1
-    assert (left.gone, left.free) == (None, None), "the paper's vote is of whole cells"
+    assert (left.planes.gone, left.planes.free) == (None, None), "the paper's vote is of whole cells"
 
 
 def test_scans_vote_only_in_a_square_around_the_vehicle() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hand_made import Cell, make_map, make_tile, one_scan, states_plane, wall
+from hand_made import Cell, at_least, make_map, make_tile, one_scan, states_plane, wall
 from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState
 from mapvote.rules.evidence import SURFACE_RULE
 from mapvote.rules.surfaces import CHANGE_ODDS, N_FEATURES, SurfaceVoter, blocks, depths_m, log_odds, looks
-from mapvote.rules.voter import TileVotes
+from mapvote.rules.voter import Counted
 
 ROW, COLUMNS = 100, range(100, 112)
 HEIGHTS = [0.75, 1.05, 1.35, 1.65]
@@ -47,26 +47,43 @@ def standing_at(y: float, heights: list[float] = HEIGHTS) -> F64:
 AWAY = standing_at(OLD_Y + 9)
 
 
+@dataclass(frozen=True)
+class Dense:
+    """The votes on a tile, each plane (256, 256)."""
+
+    states: U8
+    gone: U64
+    new: U64
+    free: U64
+
+
+def dense(counted: Counted) -> Dense:
+    planes = counted.planes
+    assert planes.states is not None
+    assert planes.gone is not None
+    assert planes.free is not None
+    return Dense(planes.states, at_least([planes.gone], 1), counted.new, at_least([planes.free], 1))
+
+
 def after(
     point_map: PointMap,
     points: F64 = AWAY,
     scans: int = 8,
     passed: Callable[[int, U64], object] = lambda scan, words: None,
-) -> TileVotes:
+) -> Dense:
     """Votes of a drive that saw ``points`` in so many scans; ``passed`` takes away of what the rays passed."""
     voter = SurfaceVoter(VotingSettings(), point_map)
     for scan in range(scans):
         seen = one_scan(point_map, points)
         passed(scan, seen.view.passed)
         voter.observe(seen)
-    return dict(voter.each())[0, 0]
+    return dense(dict(voter.each())[0, 0])
 
 
 def test_a_wall_set_back_by_half_a_metre_is_a_deleted_wall_and_a_new_one() -> None:
     votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y + 0.6))
     assert all(votes.states[cell] == CE for cell in WALL)
     assert all(votes.states[ROW + 2, c] == CO for c in COLUMNS)
-    assert votes.gone is not None
     assert votes.gone[POLE] == votes.new[ROW + 2, 105] == np.uint64(0b111100)
     assert not votes.new[votes.states != CO].any()
 
@@ -126,7 +143,6 @@ def test_free_space_is_sent_for_columns_that_the_map_does_not_know_and_never_for
     tile, known = town((WALL, HEIGHTS)).tiles[0, 0], np.zeros((TILE_CELLS, TILE_CELLS), np.uint64)
     known[:, :105] = 0b10
     free = after(make_map({(0, 0): replace(tile, free=known)}), standing_at(OLD_Y)).free
-    assert free is not None
     assert [bool(free[ROW + 5, c]) for c in (100, 110)] == [False, True]
     assert not (free & tile.obstacle_words).any()
     assert free[ROW, 110], "beside and above the wall"
@@ -164,7 +180,6 @@ def test_a_roof_is_gone_with_the_wall_below_it_if_rays_passed_through_its_place(
 def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:
     votes = after(town((WALL, HEIGHTS)), standing_at(OLD_Y, HEIGHTS[:2]))  # the upper half of the wall went
     assert all(votes.states[cell] == UO for cell in WALL)
-    assert votes.gone is not None
     assert votes.gone[POLE] == np.uint64(0b100000), "the voxel on what stands may be its upper edge"
 
 
@@ -177,7 +192,6 @@ def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_be
     point_map = town((WALL, storeys), ([(ROW + 1, c) for c in COLUMNS], storeys))
     votes = after(point_map, standing_at(OLD_Y, [0.75, 1.05]), passed=passed)
     assert all(votes.states[cell] == UO for cell in WALL)
-    assert votes.gone is not None
     assert not any(votes.gone[cell] >> np.uint64(7) for cell in WALL)
 
 
@@ -196,7 +210,7 @@ def test_a_car_that_drove_by_far_off_is_not_new_and_one_that_parked_is() -> None
             seen = one_scan(point_map, standing_at(OLD_Y - 3.0) if scan < scans_there else AWAY)
             seen.view.passed[:] &= np.uint64(0x5555555555555555)  # every other voxel
             voter.observe(seen)
-        found.append(bool((dict(voter.each())[0, 0].states == CO).any()))
+        found.append(bool((dense(dict(voter.each())[0, 0]).states == CO).any()))
     assert found == [False, True]
 
 

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.fields import unpack_fields
-from mapvote.codec.planes import Words, compress, pack_plane, unpack_bytes, unpack_plane, unpack_sparse
+from mapvote.codec.fields import pack_fields, unpack_fields
+from mapvote.codec.planes import Words, compress, pack_plane, pack_words, unpack_bytes, unpack_plane, unpack_sparse
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.points import Fields, Values, point_field
@@ -249,8 +249,23 @@ class Planes:
         return np.asarray(self.tally.any(axis=-1))
 
 
+def pack_planes(tile: TileIndex, planes: Planes) -> BallotTile:
+    """The votes on one tile as a ballot holds them; planes without content are left out."""
+    new_points = planes.new_points
+    return BallotTile(
+        tile=tile,
+        states=None if planes.states is None else pack_plane(planes.states),
+        tally=None if planes.tally is None else pack_plane(np.moveaxis(planes.tally, -1, 0)),
+        gone=None if planes.gone is None else pack_words(planes.gone),
+        new_points=None if new_points is None or not len(new_points) else pack_points(new_points),
+        fields=compress(pack_fields(planes.fields)) if planes.fields else None,
+        free=None if planes.free is None else pack_words(planes.free),
+        odds=None if planes.odds is None else pack_odds(planes.odds.steps),
+    )
+
+
 def unpack_planes(packed: BallotTile) -> Planes:
-    """The votes on one tile of a ballot; MapvoteError if a plane is damaged or impossible."""
+    """The inverse of :func:`pack_planes`; MapvoteError if a plane is damaged or impossible."""
     new_points, fields = unpack_offer(packed.new_points, packed.fields)
     states = None if packed.states is None else unpack_states(packed.states)
     return Planes(

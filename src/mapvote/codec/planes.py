@@ -148,10 +148,9 @@ class Words(NamedTuple):
         return Words(self.cells[keep], self.words[keep])
 
 
-def pack_words(plane: U64) -> bytes:
-    """A (256, 256) plane."""
-    sparse = Words.of(plane)
-    return compress(_by_byte(np.diff(sparse.cells, prepend=0), _WAY) + _by_byte(sparse.words, _WORD))
+def pack_words(words: Words) -> bytes:
+    """Words of a tile as one zstd frame."""
+    return compress(_by_byte(np.diff(words.cells, prepend=0), _WAY) + _by_byte(words.words, _WORD))
 
 
 def unpack_sparse(data: bytes, part: str) -> Words:

@@ -16,7 +16,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from mapvote.codec.ballot import Ballot
+from mapvote.codec.ballot import Ballot, Planes
+from mapvote.codec.planes import Words
 from mapvote.compare.cloud_changes import BAND, CellComparison, CloudChange, compare_cells, differences
 from mapvote.compare.register import Registered, register_maps
 from mapvote.config import Settings
@@ -28,11 +29,10 @@ from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, CellState, MapvoteError
-from mapvote.core.voting import one_hot
 from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
 from mapvote.perception.frontend import DriveReport
 from mapvote.perception.raycast import CLEARANCE_M
-from mapvote.rules.voter import NewPoints, TileVotes
+from mapvote.rules.voter import Counted, NewPoints
 from mapvote.vehicle import write_ballot
 
 
@@ -116,7 +116,7 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
 
 def _votes(
     lattice: Lattice, compared: CellComparison, session_free: U64, changes: list[CloudChange], registered: Registered
-) -> Iterator[tuple[TileIndex, TileVotes]]:
+) -> Iterator[tuple[TileIndex, Counted]]:
     """Tile by tile; ``session_free`` (rows, cols): column words of the session's free space over the window of the
     comparison. Only where a part of the session lies that one motion registers to the map."""
     own = compared.a
@@ -146,18 +146,14 @@ def _votes(
     for tile in compared.window.tiles():
         cut = lattice.tile(tile).slices_in(compared.window)
         if (states[cut] != NO_VOTE).any():
-            yield tile, _tile_votes(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
+            yield tile, _counted(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
 
 
-def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
+def _counted(states: U8, gone: U64, new: U64, free: U64 | None) -> Counted:
     states = np.ascontiguousarray(states)
-    return TileVotes(
-        tally=one_hot(states),
-        states=states,
-        gone=np.where(states == CellState.CHANGED_EMPTY, gone, np.uint64(0)),
-        new=np.ascontiguousarray(new),
-        free=None if free is None else np.ascontiguousarray(free),
-    )
+    deleted = Words.of(np.where(states == CellState.CHANGED_EMPTY, gone, np.uint64(0)))
+    planes = Planes(states=states, gone=deleted, free=None if free is None else Words.of(free))
+    return Counted(planes, np.ascontiguousarray(new))
 
 
 def _hanging_together(words: U64) -> U64:

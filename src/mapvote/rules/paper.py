@@ -18,6 +18,7 @@ from typing import get_args
 import numpy as np
 from pydantic import ValidationError
 
+from mapvote.codec.ballot import Planes
 from mapvote.config import PaperSettings, Settings, VotingSettings, wanted_of
 from mapvote.core.columns import EVERY_BIT, below_top, span_of
 from mapvote.core.grid import CELL_SIZE, Grid, TileIndex, window_around
@@ -26,10 +27,10 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError, Reference
-from mapvote.core.voting import VOTE_UNIT, plurality, weight_table
+from mapvote.core.voting import VOTE_UNIT, plurality, to_wire, weight_table
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
-from mapvote.rules.voter import Tally, TileVotes
+from mapvote.rules.voter import Counted, Tally
 
 
 @record(votes=True)
@@ -243,12 +244,12 @@ class PaperVoter:
         self._tally.cast(seen.view.grid, states, weights)
         return np.where(states == CellState.CHANGED_OCCUPIED, EVERY_BIT, np.uint64(0))
 
-    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, Counted]]:
         """Every tile with a vote, in ascending order; ``only``: of these tiles."""
         for tile, tally in sorted(self._tally.tiles.items()):
             if (only is None or tile in only) and tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
-                yield tile, TileVotes(tally, plurality(tally), None, new, None)
+                yield tile, Counted(Planes(states=plurality(tally), tally=to_wire(tally)), new)
 
 
 def readings_of(base: PaperSettings, only: str | None = None) -> dict[str, PaperSettings]:

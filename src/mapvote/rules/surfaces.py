@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 from scipy import ndimage
 
-from mapvote.codec.ballot import changed_cells_of
+from mapvote.codec.ballot import Planes, changed_cells_of
+from mapvote.codec.planes import Words
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice, TileIndex
@@ -28,7 +29,6 @@ from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.sensors import Sensor
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.core.voting import one_hot
 from mapvote.perception.frontend import Observation
 from mapvote.rules.evidence import (
     NO_VOXELS,
@@ -42,7 +42,7 @@ from mapvote.rules.evidence import (
     weigh_voxels,
 )
 from mapvote.rules.packed_tiles import PackedTiles
-from mapvote.rules.voter import TileVotes
+from mapvote.rules.voter import Counted
 
 
 @record(votes=True)
@@ -108,14 +108,14 @@ class SurfaceVoter:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
         return count_scan(self.evidence, seen, self.rule)
 
-    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, Counted]]:
         """Every tile with evidence, block by block; ``only``: of these tiles."""
         counted = self.evidence
         wanted = counted if only is None else counted.keys() & set(only)
         for tiles, window in blocks(self.point_map.lattice, wanted, self.judged):
             yield from self._judge(tiles, window)
 
-    def _judge(self, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, TileVotes]]:
+    def _judge(self, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, Counted]]:
         # The evidence of all tiles of the window, weighed by the map.
         here = reference_window(self.point_map, window)
         known_free = here.free if here.free is not None else above_ground_points(self.point_map, window)
@@ -138,17 +138,12 @@ class SurfaceVoter:
             if (states[cut] != NO_VOTE).any():
                 own = np.ascontiguousarray(states[cut])
                 upwards = None if here.free is None else here.free[cut]
-                yield (
-                    tile,
-                    TileVotes(
-                        tally=one_hot(own),
-                        states=own,
-                        gone=np.ascontiguousarray(gone[cut]),
-                        new=_with_the_unknown(new[cut], weighed.beyond[cut], upwards),
-                        free=np.where(mapped_free[cut] != 0, NO_VOXELS, free[tile] & ~here.occupied[cut]),
-                        looked=looks(states, amount, height_m, cut, self.odds),
-                    ),
-                )
+                passed = np.where(mapped_free[cut] != 0, NO_VOXELS, free[tile] & ~here.occupied[cut])
+                own_planes = Planes(states=own, gone=Words.of(gone[cut]), free=Words.of(passed))
+                looked = looks(states, amount, height_m, cut, self.odds)
+                new_here = _with_the_unknown(new[cut], weighed.beyond[cut], upwards)
+                mapped = self.point_map.tiles.get(tile)
+                yield tile, Counted(own_planes, new_here, partial(_log_odds_of, own, looked, mapped, self.odds))
 
     def _cut(self, tile: TileIndex, window: Grid) -> tuple[slice, slice]:
         return self.point_map.lattice.tile(tile).slices_in(window)
@@ -234,6 +229,12 @@ def _deepest_m(points: F32) -> F64:
     flat = (cell[:, 1] * TILE_CELLS + cell[:, 0]).astype(np.int64)
     np.maximum.at(deep, flat, CELL_SIZE * np.minimum(within, 1.0 - within).min(axis=1))
     return deep
+
+
+def _log_odds_of(states: U8, looked: F64, mapped: Tile | None, odds: ChangeOdds, new_points: F32) -> F64:
+    """(m,) :func:`log_odds` of the cells that ``states`` (256, 256) call changed, ascending."""
+    changes = states.reshape(-1)[changed_cells_of(states)]
+    return log_odds(changes, looked, depths_m(states, mapped, new_points), odds)
 
 
 def log_odds(states: U8, looked: F64, depth_m: F64, odds: ChangeOdds = CHANGE_ODDS) -> F64:

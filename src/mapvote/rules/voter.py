@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from mapvote.codec.ballot import Planes
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
@@ -28,24 +29,17 @@ from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.rules.packed_tiles import Shelf, Slot
 
 
-@dataclass(frozen=True, slots=True)
-class TileVotes:
-    """The votes of one drive on one tile."""
+class Counted(NamedTuple):
+    """The votes of one drive on one tile, before its new points are chosen."""
 
-    tally: I32
-    """(256, 256, 5) votes in VOTE_UNITs."""
-    states: U8
-    """(256, 256) decided by this vehicle alone."""
-    gone: U64 | None
-    """(256, 256) words of the map voxels that are gone: of changed-empty cells, and of cells that stand. None: all of
-    changed-empty cells."""
+    planes: Planes
+    """``states`` that this vehicle decided alone. ``tally``: None for one vote for each cell's state. ``free``: voxels
+    that the map did not know to be free. No new points and no odds yet."""
     new: U64
-    """(256, 256) words of the voxels whose points are new in changed-occupied cells."""
-    free: U64 | None
-    """(256, 256) words of the voxels that rays showed to be free and the map did not know to be; None: the rule has
-    none."""
-    looked: F64 | None = None
-    """(m, k) features of each changed cell, ascending (rules/surfaces.py); None: the rule has none."""
+    """(256, 256) words of the voxels whose points are new; used in cells with a vote for changed-occupied."""
+    log_odds: Callable[[F32], F64] | None = None
+    """The log-odds (m,), nats, of each changed cell, ascending, from the new points (n, 3) of the tile, metres from its
+    corner; None: the rule has none."""
 
 
 class Voter(Protocol):
@@ -54,7 +48,7 @@ class Voter(Protocol):
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
 
-    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, Counted]]:
         """The votes of the scans so far, for every tile with votes, in any order: one by one, so that no drive is too
         long for memory. ``only``: of these tiles. The call changes nothing."""
 
