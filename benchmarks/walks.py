@@ -159,7 +159,7 @@ def desk(walk: Walk) -> None:
 
 def cell(walk: Walk) -> None:
     """The votes on a cell are explained."""
-    ask(walk, lambda client, third: client.get("/v1/cell", params={"x": 30.0, "y": 3.0}))
+    ask(walk, lambda client, third: client.get("/v1/cells", params={"x": 30.0, "y": 3.0}))
 
 
 def build(walk: Walk) -> None:

@@ -115,11 +115,6 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         return len(self._points)
 
 
-def in_memory_if_small(tiles: LazyTiles) -> Mapping[TileIndex, Tile]:
-    """All tiles made at once, unless there are too many points for that."""
-    return dict(tiles) if tiles.n_points <= tiles.kept_points else tiles
-
-
 def made_in_turn(
     load: Callable[[TileIndex], Tile], indices: Iterable[TileIndex], kept_points: int = MAP_SIZES.kept_points
 ) -> Mapping[TileIndex, Tile]:

@@ -8,7 +8,7 @@ test: an object that appeared and disappeared leaves it bit for bit as at first,
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any
@@ -493,9 +493,10 @@ def _method(ballot: Ballot) -> str:
     return f"{ballot.method}, {ballot.stage}, settings {ballot.settings_hash[:8]}"
 
 
-def _votes_on(index: TileIndex, ballots: Mapping[str, Ballot]) -> Iterator[Vote]:
-    for digest, ballot in ballots.items():
-        for tile in ballot.tiles:
-            if tile.tile == index:
-                vote = Vote(ballot.vehicle, ballot.end_ns, digest, ballot.version)
-                yield vote.with_planes(unpack_planes(tile))
+def _votes_on(index: TileIndex, ballots: Mapping[str, Ballot]) -> list[Vote]:
+    return [
+        Vote(ballot.vehicle, ballot.end_ns, digest, ballot.version).with_planes(unpack_planes(tile))
+        for digest, ballot in ballots.items()
+        for tile in ballot.tiles
+        if tile.tile == index
+    ]

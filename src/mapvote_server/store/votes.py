@@ -333,7 +333,7 @@ def read_votes(
     damaged = [ballot_name(ballot, *index) for ballot, row in rows_of.items() if not is_sound(_T, row)]
     if damaged:
         raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
-    unpacked = remembered.get(row.sum for row in rows_of.values())
+    unpacked = remembered.get([row.sum for row in rows_of.values()])
     for ballot, row in rows_of.items():
         if row.sum not in unpacked:
             unpacked[row.sum] = unpack_planes(decode_tile(row.votes))

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from mapvote.codec.manifest import Manifest, TileHashes, digests_of, shown
 from mapvote.codec.planes import FRAME_HEAD, pack_plane, unpack_bytes
 from mapvote.codec.tile_planes import check_plane, pack_tile, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.point_map import LazyTiles, PointMap, in_memory_if_small
+from mapvote.core.point_map import LazyTiles, PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
@@ -126,8 +126,12 @@ def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
     for index, hashes in named.items():
         with _whole(path, index):
             n_points[index] = points_in_plane(first_bytes(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
-    tiles = in_memory_if_small(LazyTiles(load, n_points, sizes.kept_points))
-    for index, hashes in named.items() if isinstance(tiles, LazyTiles) else ():
+    # A small map is read at once. Of a large one only the planes' frames are checked.
+    small = sum(n_points.values()) <= sizes.kept_points
+    tiles: Mapping[TileIndex, Tile] = LazyTiles(load, n_points, sizes.kept_points)
+    if small:
+        tiles = {index: load(index) for index in named}
+    for index, hashes in named.items() if not small else ():
         with _whole(path, index):
             for name, frame in _planes(path, hashes).items():
                 check_plane(frame, hashes.planes()[name])
