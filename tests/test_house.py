@@ -57,6 +57,22 @@ VAGUE_NAMES = {"asked", "found", "known", "mine", "now", "some", "told", "what",
 """Names of locals and arguments that do not say what they hold, and that cannot be searched."""
 MOST_VAGUE_NAMES = 351
 """It may only fall."""
+BALLOT_TYPES = {"Ballot", "BallotTile", "Planes", "Vote", "Receipt"}
+"""A ballot on the wire, its tile there, that tile's planes unpacked, the vote on a tile and why it counts, and the
+answer to who sent it."""
+OF_NO_BALLOT = {
+    "CellVote",  # an answer of the API: a vote's text on one cell
+    "CloudPlanes",  # of a cloud
+    "Decision",  # of all votes
+    "EditVotes",  # counts, cell by cell
+    "SessionVote",  # a session, and the ballot made of it
+}
+"""Classes that have the name or the fields of a ballot's types, and are none."""
+VOTED = {
+    *("states", "tally", "gone", "new_points", "odds", "spoken", "unrestricted"),
+    *("ballot", "digest", "end_ns", "first_seq", "cast_by", "base", "why", "spent", "reviewed", "alike"),
+}
+"""Fields by which a class repeats a ballot, where it has three."""
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 
@@ -367,6 +383,14 @@ def vague_names(tree: ast.AST) -> Iterator[str]:
             yield name
 
 
+def is_of_a_ballot(node: ast.ClassDef) -> bool:
+    """Whether a class tells a ballot, or a part of one: by its name, its base or its fields."""
+    fields = {s.target.id for s in node.body if isinstance(s, ast.AnnAssign) and isinstance(s.target, ast.Name)}
+    bases = {ast.unparse(base) for base in node.bases}
+    named = re.search("(Ballot|BallotTile|Votes?|Planes|Receipt)$", node.name)
+    return bool(named or bases & BALLOT_TYPES or len(fields & VOTED) >= 3)
+
+
 def packs(node: ast.Assign) -> bool:
     return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
 
@@ -408,6 +432,18 @@ MASK = 1 | 2
 OTHER_M = OTHER.side_m
 """
     assert loose_constants(ast.parse(told)) == ["_ROWS", "_NAME", "(_A, _B)", "MASK", "OTHER_M"]
+
+
+def test_a_ballot_has_five_types() -> None:
+    """On the vehicle, on the wire and in the server; the laboratory measures, and has its own."""
+    product = [source for source in SOURCES if "mapvote_lab" not in source.parts]
+    classes = [node for source in product for node in ast.walk(parsed(source)) if isinstance(node, ast.ClassDef)]
+    assert {node.name for node in classes if is_of_a_ballot(node)} == BALLOT_TYPES | OF_NO_BALLOT
+    more = "class A:\n  why: str\n  spent: str\n  alike: int\nclass B(Planes): ...\nclass AVote: ...\nclass C: ..."
+    assert [is_of_a_ballot(node) for node in ast.parse(more).body if isinstance(node, ast.ClassDef)] == [
+        *[True] * 3,
+        False,
+    ]
 
 
 def test_names_say_what_they_hold() -> None:

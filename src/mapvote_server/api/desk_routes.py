@@ -76,7 +76,7 @@ async def pending_clouds(by: Reviewer, parts: Parts, request: Request) -> Respon
 async def _look(parts: Services) -> Desk:
     """The desk as of now; its tiles are proposed to the clouds."""
     looked_at = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
-    parts.clouds.propose((made.hashes, made.make) for made in looked_at.edited.values())
+    parts.clouds.propose([(made.hashes, made.make) for made in looked_at.edited.values()])
     return looked_at
 
 
