@@ -107,20 +107,34 @@ def test_positions_four_per_cent_too_small_are_named_on_a_street_and_undecided_o
         assert "that may be chance" in unsure or int(unsure.split("show from ")[1].split("%")[0]) > 4, unsure
 
 
-@pytest.mark.parametrize(("rows", "severity"), [(2, "warning"), (5, "error")])
-def test_a_prior_that_is_late_is_named_with_its_seconds_where_speed_and_heading_change(
-    rows: int, severity: str
-) -> None:
+def late_by(rows: int) -> tuple[F64, F64]:
+    """(poses of a drive whose speed and heading change, its prior so many rows late)."""
     T = [np.eye(4)]
     for i in range(200):
         step_m, turn = 0.7 + 0.4 * np.sin(i / 8), 0.03 * np.sin(i / 15)
         T.append(T[-1] @ geometry.from_xyz_rpy(step_m, 0, 0, yaw=turn))
-    prior = np.stack([*T[:1] * rows, *T[:-rows]])
-    time = measure_time(prior, runs_of(np.stack(T)), np.arange(len(T)) * 100_000_000)
-    (found,) = check_small(evidence(np.stack(T), 0.05), prior, time)
-    assert (found.severity, found.what[:26]) == (severity, f"the prior is 0.{rows}0 s late (")
+    return np.stack(T), np.stack([*T[:1] * rows, *T[:-rows]])
+
+
+@pytest.mark.parametrize(("rows", "severity"), [(2, "warning"), (5, "error")])
+def test_a_prior_that_is_late_is_named_with_its_seconds_where_speed_and_heading_change(
+    rows: int, severity: str
+) -> None:
+    T, prior = late_by(rows)
+    time = measure_time(prior, runs_of(T), np.arange(len(T)) * 100_000_000)
+    (finding,) = check_small(evidence(T, 0.05), prior, time)
+    assert (finding.severity, finding.what[:26]) == (severity, f"the prior is 0.{rows}0 s late (")
     alone = f"the prior is 0.{rows}0 s late (+-0.00): so 0.00 m remain"
-    assert compared(prior, np.stack(T), sigma_m=0.05)[0].what.startswith(alone)
+    assert compared(prior, T, sigma_m=0.05)[0].what.startswith(alone)
+
+
+def test_a_prior_that_is_a_tenth_of_a_second_late_is_not_reported() -> None:
+    """Less than PriorCheck.least_time_s: priors err so much by themselves, although the scans show it."""
+    T, prior = late_by(1)
+    time = measure_time(prior, runs_of(T), np.arange(len(T)) * 100_000_000)
+    assert time is not None
+    assert time.value == pytest.approx(0.1, abs=0.01)
+    assert not any("late" in finding.what for finding in check_small(evidence(T, 0.05), prior, time))
 
 
 def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:

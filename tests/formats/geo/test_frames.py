@@ -111,6 +111,15 @@ def test_degrees_are_refused_with_the_command_that_projects_them() -> None:
     assert frame.crs == "EPSG:32654"
 
 
+def test_metres_from_the_centre_of_the_earth_are_refused_and_others_that_far_are_not() -> None:
+    lon, lat = np.radians(np.random.default_rng(0).uniform([139.65, 35.67], [139.651, 35.671], (200, 2))).T
+    geocentric = 6.371e6 * np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    with pytest.raises(MapvoteError, match=r"6371 km .*--from-crs EPSG:4978 --crs EPSG:n"):
+        settle("f.ply", MapFrame(), None, geocentric)
+    for far in (1.01 * geocentric, 0.99 * geocentric, geocentric * [1.0, 1.0, 0.0]):
+        assert settle("f.ply", MapFrame(), None, far)[0].is_local
+
+
 def test_heights_are_named_where_the_file_names_them() -> None:
     one = np.zeros((1, 3))
     assert settle("f", MapFrame("EPSG:32654+3855"), None, one)[0].heights == "EGM2008 height"
