@@ -137,6 +137,15 @@ def test_a_prior_that_is_a_tenth_of_a_second_late_is_not_reported() -> None:
     assert not any("late" in finding.what for finding in check_small(evidence(T, 0.05), prior, time))
 
 
+def test_readings_that_a_map_shall_decide_among_place_the_scans_differently() -> None:
+    T = along(100.0, curved=True)
+    prior = inverses(T)
+    readings = compared(prior, T)[0].readings
+    placed = [reading.poses(prior) for reading in readings]
+    assert len(placed) > 0
+    assert not any(np.allclose(a, b, atol=1e-6) for k, a in enumerate(placed) for b in placed[k + 1 :])
+
+
 def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:
     for curved in (False, True):
         T = along(120.0, curved)
