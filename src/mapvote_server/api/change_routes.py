@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from mapvote.shapes.geojson import Changes, feature_rows
+from mapvote.shapes.geojson import Changes, Places, feature_rows
 from mapvote_server.api.etags import has_already, tag_of
 from mapvote_server.api.lanes import on
 from mapvote_server.api.problems import problems
@@ -22,6 +22,8 @@ from mapvote_server.api.schemas import (
 )
 from mapvote_server.api.services import Known, Parts
 from mapvote_server.questions.changes import Comparison, changes_between, compare_versions, page_between
+from mapvote_server.questions.lanelets import lanelets_near
+from mapvote_server.store.store import Store
 
 router = APIRouter()
 
@@ -69,6 +71,35 @@ def changes(request: Request, parts: Parts, known: Known, asked: Annotated[Chang
         headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
     answer.headers.update(headers)
     return answer
+
+
+class LaneletsAsked(Between):
+    """Two versions, and the distance from their differences."""
+
+    within: float = Field(default=2.0, ge=0.0, le=100.0, description="metres, seen from above")
+
+
+@router.post(
+    "/v1/changes/lanelets",
+    operation_id="list_affected_lanelets",
+    response_model=Places,
+    responses=problems(404, 413),
+    openapi_extra={"requestBody": {"required": True, "content": {"application/xml": {"schema": {"type": "string"}}}}},
+    summary="Parts of a lanelet2 map near changes",
+)
+async def lanelets(request: Request, parts: Parts, known: Known, asked: Annotated[LaneletsAsked, Query()]) -> Response:
+    """The body is a lanelet2 map (OSM). Its lanelets, areas, stop lines and signs near what changed between two
+    versions, as GeoJSON in map metres: what an editor has to look at. The map is not kept."""
+    key = request.state.key
+    sender = "open" if key is None else key.name
+    osm = await parts.uploads.read(sender, request.stream(), request.headers.get("content-length"))
+    return await parts.questions.run(_lanelets, parts.store, known, asked, osm)
+
+
+def _lanelets(store: Store, known: bool, asked: LaneletsAsked, osm: bytes) -> Response:
+    newest = store.current() if asked.new is None else asked.new
+    listed = changes_between(store, asked.old, newest, asked.min_cells, known=known)
+    return as_json(lanelets_near(listed, osm, asked.within))
 
 
 @router.get(

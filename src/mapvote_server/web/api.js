@@ -33,6 +33,8 @@ async function reason(answer) {
 export const manifest = async () => (await ask("map")).json();
 export const versions = async () => (await ask("map/versions")).json();
 export const changes = async (from, to) => (await ask("changes", { from, to })).json();
+export const lanelets = async (from, to, body) =>
+  (await ask("changes/lanelets", { from, to }, { method: "POST", headers: { "Content-Type": "application/xml" }, body })).json();
 export const coverage = async () => (await ask("coverage")).json();
 export const vehicles = async () => (await ask("vehicles")).json();
 export const overview = async (version) => (await ask("clouds/overview", version ? { version } : {})).arrayBuffer();

@@ -4,6 +4,7 @@ import * as api from "./api.js";
 import { showTiles } from "./coverage.js";
 import { closeDetails, drawable, follow, showCell, showChange } from "./details.js";
 import { choose, confirm, goBack, showDesk } from "./desk.js";
+import { listenForLanelets, showLanelets } from "./lanelets.js";
 import { showList } from "./list.js";
 import { Stage } from "./stage.js";
 import { listen } from "./live.js";
@@ -189,6 +190,7 @@ async function showRange(mine = askRange()) {
   const usual = Number(to) === state.manifest.version && Number(from) === Math.max(state.versions[0].number, to - 1);
   address.write({ from: usual ? null : from, to: usual ? null : to });
   showList(found, nothing(from, to), { from, to });
+  showLanelets();
   await shown;
 }
 
@@ -265,7 +267,8 @@ function step(by) {
   next.focus();
   next.click();
 }
-$("from").onchange = $("to").onchange = showRange;
+$("from").onchange = $("to").onchange = () => showRange();
+listenForLanelets();
 for (const radio of document.getElementsByName("shade"))
   radio.onchange = () => ((state.shade = radio.value), address.write({ shade: radio.value === "seen" ? null : radio.value }), showTiles());
 const shade = document.querySelector(`[name=shade][value="${CSS.escape(address.read().shade ?? "")}"]`);

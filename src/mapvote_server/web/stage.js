@@ -90,8 +90,10 @@ export class Stage {
     this.flat.setRaster(hash, points);
   }
 
-  // {colour, line}: lines of [x, y, z] or, on the ground, of [x, y], map metres.
-  setPaths(paths) {
+  // {colour, line}: lines of [x, y, z] or, on the ground, of [x, y], map metres, in the place of those of this layer.
+  setPaths(layer, lines) {
+    this.layers = { ...this.layers, [layer]: lines };
+    const paths = Object.values(this.layers).flat();
     this.flat.setPaths(paths);
     const risen = (line) => line.map(([x, y, z]) => [x, y, z ?? this.groundAt([x, y, x, y])]);
     this.cloud?.setLines(paths.map(({ colour, line }) => ({ colour, line: risen(line) })));

@@ -64,7 +64,7 @@ async function showLayer(name) {
   $(`${name}-text`).textContent = asked ? layer.text(layer.features) : "";
   const next = LAYERS.next.features.flatMap((f) => [f.geometry.coordinates, head(f.geometry.coordinates)]);
   const paths = LAYERS.paths.features.flatMap((f) => unbroken(f.geometry.coordinates));
-  state.view.setPaths([...next.map((line) => ({ colour: "next", line })), ...paths.map((line) => ({ colour: "path", line }))]);
+  state.view.setPaths("drives", [...next.map((line) => ({ colour: "next", line })), ...paths.map((line) => ({ colour: "path", line }))]);
 }
 
 // Once the server has told that it tells: as the address says, and up to date with each new ballot.

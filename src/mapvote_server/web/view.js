@@ -24,7 +24,7 @@ export class View {
   readColours() {
     const style = getComputedStyle(document.documentElement);
     const of = (name) => style.getPropertyValue(name).trim();
-    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point"), path: of("--path"), next: of("--next") };
+    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point"), path: of("--path"), next: of("--next"), lanelet: of("--lanelet") };
     this.rasters.clear();
     this.draw();
   }
@@ -39,7 +39,7 @@ export class View {
     this.draw();
   }
 
-  setPaths(paths) {  // {colour: "path" or "next", line: of [x, y, ..]}
+  setPaths(paths) {  // {colour: "path", "next" or "lanelet", line: of [x, y, ..]}
     this.paths = paths;
     this.draw();
   }
@@ -134,7 +134,7 @@ export class View {
     for (const tile of this.tiles) this.paintTile(g, tile);
     for (const { colour, line } of this.paths) {
       g.strokeStyle = this.colours[colour];
-      g.lineWidth = colour === "next" ? 4 : 2;
+      g.lineWidth = colour === "path" ? 2 : 4;
       g.beginPath();
       for (const at of line) g.lineTo(...this.toScreen(at));
       g.stroke();

@@ -151,6 +151,49 @@ def test_a_link_opens_the_same_change_again(browser: Chromium, url: str) -> None
     assert "0.09 m² (1 cells)" in browser.text("#details")
 
 
+def lanelet2(*lanes: tuple[float, float]) -> str:
+    """A lanelet2 map of lanes along x from 5 to 30 m, each from one y to another, in local metres."""
+    nodes: list[str] = []
+    ways: list[str] = []
+    relations: list[str] = []
+    for lane, sides in enumerate(lanes, 1):
+        for side, y in zip(("left", "right"), sides, strict=True):
+            name = f"{lane}{len(ways)}"
+            for end, x in enumerate((5.0, 30.0)):
+                tags = f"<tag k='local_x' v='{x}'/><tag k='local_y' v='{y}'/>"
+                nodes.append(f"<node id='{name}{end}' lat='' lon=''>{tags}</node>")
+            ways.append(f"<way id='{name}'><nd ref='{name}0'/><nd ref='{name}1'/><tag k='type' v='line_thin'/></way>")
+            relations.append(f"<member type='way' ref='{name}' role='{side}'/>")
+        lines = "".join(relations[-2:])
+        relations[-2:] = [
+            f"<relation id='9{lane}'>{lines}<tag k='type' v='lanelet'/><tag k='subtype' v='road'/></relation>"
+        ]
+    return f"<osm>{''.join([*nodes, *ways, *relations])}</osm>"
+
+
+def test_lanelets_of_a_file_that_is_dropped_are_those_near_the_changes(browser: Chromium, url: str) -> None:
+    open_page(browser, url)
+    colour = """(() => { const c = document.querySelector('#map'), g = c.getContext('2d');
+        const d = g.getImageData(0, 0, c.width, c.height).data; let n = 0;
+        for (let i = 0; i < d.length; i += 4) n += d[i] === 11 && d[i + 1] === 122 && d[i + 2] === 86;
+        return n; })()"""
+    assert browser.run(colour) == 0
+    drop = """(text => { const moved = new DataTransfer();
+        moved.items.add(new File([text], 'lanelet2_map.osm'));
+        const event = new DragEvent('drop', { dataTransfer: moved, bubbles: true, cancelable: true });
+        document.body.dispatchEvent(event); })"""
+    browser.run(f"{drop}({lanelet2((20.0, 16.5), (70.0, 66.5))!r})")
+    browser.wait("document.querySelector('#lanelets-text').innerText.includes('1 part within 2 m')")
+    assert browser.text("#lanelets-near") == "lanelet 91 (road) 0 m from demolished"
+    browser.run("document.querySelector('#lanelets-near button').click()")
+    browser.wait(f"{colour} > 50")
+    browser.run("(s => (s.value = '2', s.dispatchEvent(new Event('change'))))(document.querySelector('#from'))")
+    browser.wait("document.querySelector('#lanelets-text').innerText.includes('0 parts')")
+    assert browser.errors == []
+    browser.run(f"{drop}('<osm/>')")
+    browser.wait("document.querySelector('#lanelets-text').innerText.includes('holds no lanelet')")
+
+
 def test_an_equal_or_empty_range_says_so(browser: Chromium, url: str) -> None:
     open_page(browser, url)
     browser.run("(s => (s.value = '2', s.onchange()))(document.querySelector('#from'))")

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from xml.etree import ElementTree
 
 import numpy as np
@@ -47,8 +47,9 @@ class LaneletMap:
     tree: ElementTree.ElementTree[ElementTree.Element]
 
 
-def read_lanelets(file: Path, frame: MapFrame) -> LaneletMap:
-    """The parts of a lanelet2 file, in the metres of ``frame``.
+def read_lanelets(file: Path, frame: MapFrame, content: BinaryIO | None = None) -> LaneletMap:
+    """The parts of a lanelet2 file, in the metres of ``frame``. ``content``: what the file holds, if it is not on this
+    machine.
 
     By latitude and longitude if the frame knows its place on Earth, else by ``local_x`` and ``local_y``. A way that
     only bounds lanelets is no part of its own. Parts without a shape are counted in a warning that names the first.
@@ -56,7 +57,9 @@ def read_lanelets(file: Path, frame: MapFrame) -> LaneletMap:
     MapvoteError if the file is no lanelet2 map, or its nodes lack these coordinates.
     """
     with reading(file, "lanelet2 map (OSM XML)"):
-        tree = ElementTree.parse(file, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
+        tree = ElementTree.parse(
+            content or file, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+        )
     root = tree.getroot()
     if root.tag != "osm":
         raise MapvoteError(f"{file}: no lanelet2 map: its first element is <{root.tag[:40]}>, not <osm>")
