@@ -87,19 +87,19 @@ class LaneletsAsked(Between):
     openapi_extra={"requestBody": {"required": True, "content": {"application/xml": {"schema": {"type": "string"}}}}},
     summary="Parts of a lanelet2 map near changes",
 )
-async def lanelets(request: Request, parts: Parts, known: Known, asked: Annotated[LaneletsAsked, Query()]) -> Response:
+async def lanelets(request: Request, parts: Parts, names: Known, choice: Annotated[LaneletsAsked, Query()]) -> Response:
     """The body is a lanelet2 map (OSM). Its lanelets, areas, stop lines and signs near what changed between two
     versions, as GeoJSON in map metres: what an editor has to look at. The map is not kept."""
     key = request.state.key
     sender = "open" if key is None else key.name
     osm = await parts.uploads.read(sender, request.stream(), request.headers.get("content-length"))
-    return await parts.questions.run(_lanelets, parts.store, known, asked, osm)
+    return await parts.questions.run(_lanelets, parts.store, names, choice, osm)
 
 
-def _lanelets(store: Store, known: bool, asked: LaneletsAsked, osm: bytes) -> Response:
-    newest = store.current() if asked.new is None else asked.new
-    listed = changes_between(store, asked.old, newest, asked.min_cells, known=known)
-    return as_json(lanelets_near(listed, osm, asked.within))
+def _lanelets(store: Store, names: bool, choice: LaneletsAsked, osm: bytes) -> Response:
+    newest = store.current() if choice.new is None else choice.new
+    listed = changes_between(store, choice.old, newest, choice.min_cells, known=names)
+    return as_json(lanelets_near(listed, osm, choice.within))
 
 
 @router.get(
