@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hand_made import make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import Ballot, BallotTile, pack_path, pack_points
 from mapvote.codec.planes import Words, pack_plane, pack_words
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.types import F32, CellState
+from mapvote.core.types import F32, CellState, MapvoteError
 from mapvote.formats.drives.bag import Bag
 from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.live.ballot_messages import (
@@ -23,6 +24,7 @@ from mapvote.live.ballot_messages import (
     states_grid,
 )
 from mapvote.live.mcap import write_mcap
+from mapvote.live.rerun_file import write_rrd
 
 GONE_WALL = [(10, c) for c in range(20, 30)]
 STANDS = [(40, c) for c in range(20, 30)]
@@ -127,3 +129,18 @@ def test_an_mcap_file_holds_every_message_and_is_read_again(tmp_path: Path) -> N
     (_, message), *_ = bag.messages("/mapvote/map")
     assert message.width == STREET.n_points
     assert message.header.frame_id == "map"
+
+
+def test_a_recording_for_rerun_is_written_or_the_extra_is_named(tmp_path: Path) -> None:
+    messages = [map_cloud(ballot(), STREET), *messages_of_ballot(ballot(), STREET)]
+    file = tmp_path / "ballot.rrd"
+    if importlib.util.find_spec("rerun") is None:
+        with pytest.raises(MapvoteError, match=r"pip install 'mapvote\[rerun\]'"):
+            write_rrd(file, messages)
+        return
+    write_rrd(file, messages)
+    data = file.read_bytes()
+    assert data.startswith(b"RRF2")
+    assert all(f"mapvote/{name}".encode() in data for name in ("map", "changes", "path"))
+    with pytest.raises(MapvoteError, match="cannot be written"):
+        write_rrd(tmp_path / "nowhere" / "x.rrd", messages)

@@ -49,10 +49,13 @@ def topics(
 def show(
     ballot: Annotated[Path, typer.Argument(metavar="BALLOT", help="a ballot")],
     map_source: Annotated[str, typer.Option("--map", metavar="MAP|STORE|URL", help="the map that it was voted on")],
-    mcap: Annotated[Path, typer.Option("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove or RViz")],
+    mcap: Annotated[
+        Path | None, typer.Option("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove or RViz")
+    ] = None,
+    rrd: Annotated[Path | None, typer.Option("--rrd", metavar="FILE", help="write a recording for Rerun")] = None,
     key_file: KeyFile = None,
 ) -> None:
-    """Show a ballot on its map in Foxglove or RViz: points that come and go, states of cells, the road driven.
+    """Show a ballot on its map in Foxglove, RViz or Rerun: points that come and go, states of cells, the road driven.
 
     mapvote show car_1.ballot --map my_map --mcap car_1.mcap
     """
@@ -61,7 +64,10 @@ def show(
     from mapvote.formats.reading import read_whole, reading
     from mapvote.live.ballot_messages import map_cloud, messages_of_ballot
     from mapvote.live.mcap import write_mcap
+    from mapvote.live.rerun_file import write_rrd
 
+    if mcap is None and rrd is None:
+        raise MapvoteError("show: give --mcap FILE, --rrd FILE, or both")
     with reading(ballot, "ballot"):
         shown = decode(read_whole(ballot))
     with map_at(map_source, key_file) as point_map:
@@ -70,8 +76,13 @@ def show(
                 f"{ballot}: voted on map {shown.map_id}, not on {point_map.map_id} of {map_source}; name its map"
             )
         messages = [map_cloud(shown, point_map), *messages_of_ballot(shown, point_map)]
-    write_mcap(mcap, [message.recorded for message in messages])
-    print(f"{mcap}: {', '.join('/' + message.topic for message in messages)}")
+    topics = ", ".join(f"/{message.topic}" for message in messages)
+    if mcap is not None:
+        write_mcap(mcap, [message.recorded for message in messages])
+        print(f"{mcap}: {topics}")
+    if rrd is not None:
+        write_rrd(rrd, messages)
+        print(f"{rrd}: {topics}, without the grid of states")
 
 
 def play(
