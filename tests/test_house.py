@@ -212,7 +212,7 @@ def test_no_module_imports_itself_through_others() -> None:
     assert circles(imports(SOURCES, SRC)) == []
 
 
-def test_what_is_too_crowded_or_circular_is_found() -> None:
+def test_crowded_functions_and_circular_imports_are_found() -> None:
     """The checks above can fail."""
     given = "(a, b, c, d, /, e, f, *, g, h, **i): ..."
     many, kernel = ast.parse(f"def f{given}\n@numba.njit(cache=True)\ndef k{given}\n").body

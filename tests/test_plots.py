@@ -39,7 +39,7 @@ def test_the_picture_is_the_same_each_time_and_shows_the_map(tmp_path: Path, dia
 
 
 @pytest.mark.slow
-def test_what_is_not_known_is_said(tmp_path: Path, diagnosis: Diagnosis) -> None:
+def test_an_unknown_value_is_named(tmp_path: Path, diagnosis: Diagnosis) -> None:
     unmended = replace(diagnosis, T_mended=None)
     for less in (
         unmended,

@@ -25,7 +25,7 @@ class Terminal(io.StringIO):
     [(Terminal("y\n"), None, 1), (Terminal("\n"), None, 0), (Terminal(), True, 1), (io.StringIO(), None, 0)],
     ids=["they are to count", "no answer", "said beforehand", "nobody there"],
 )
-def test_who_revokes_a_key_is_asked_what_becomes_of_the_votes(
+def test_revoking_a_key_asks_what_becomes_of_its_votes(
     new_store: NewStore,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

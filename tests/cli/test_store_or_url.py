@@ -183,6 +183,6 @@ def test_a_copy_of_a_running_store_without_its_wal_says_so(new_store: NewStore, 
         (["vote", ".", "--map", "http://localhost:1", "--out", "b", "--region", "9,9,0,0"], "lower left corner first"),
     ],
 )
-def test_what_only_the_machine_of_the_store_can_do_is_said(words: list[str], why: str) -> None:
+def test_a_verb_that_needs_the_machine_of_the_store_says_so(words: list[str], why: str) -> None:
     with pytest.raises(MapvoteError, match=why):
         typed(*words)

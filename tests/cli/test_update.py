@@ -25,9 +25,7 @@ def round_of_two(tmp_path: Path) -> list[str]:
     return [str(tmp_path / name) for name in ("map", "a.ballot", "b.ballot")]
 
 
-def test_what_is_beyond_the_budget_stays_and_is_told_with_where_to_drive_by(
-    round_of_two: list[str], tmp_path: Path
-) -> None:
+def test_a_deletion_beyond_the_budget_waits_and_says_where_to_drive_by(round_of_two: list[str], tmp_path: Path) -> None:
     said = typed("update", *round_of_two, "--out", tmp_path / "new", "--false-deletions", "0.01")
     assert "6 deleted" in said
     assert "1 cell keeps its points: that something there still stands is likelier than 0.01. Drive by:" in said

@@ -148,7 +148,7 @@ def take_down_a_wall(store: Store, tile: tuple[int, int] = (0, 3)) -> None:
     assert publish(store).published
 
 
-def test_of_the_list_of_tiles_only_what_changed_is_asked_for(served: Served) -> None:
+def test_only_changed_rows_of_the_list_of_tiles_are_fetched(served: Served) -> None:
     store, counted, client = served
     first = client().fetch()
     whole = next(size for path, _, size in counted.asked if path == "/v1")

@@ -57,7 +57,7 @@ def unsaid(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("pack", [zstd.compress, unsaid])
-def test_what_is_unpacked_into_a_plane_is_what_was_packed(pack: Callable[[bytes], bytes]) -> None:
+def test_a_plane_unpacks_to_what_was_packed(pack: Callable[[bytes], bytes]) -> None:
     data = np.random.default_rng(1).integers(0, 6, SIZE, dtype=np.uint8).tobytes()
     plane = unpack_plane(pack(data), "<u1", (SIZE,), "plane")
     assert plane.tobytes() == unpack_bytes(pack(data), SIZE, "plane") == data
@@ -220,7 +220,7 @@ def test_log_odds_keep_their_sign_and_lose_half_a_step_at_most(nats: list[float]
     ],
     ids=["a cell too few", "a cell too many", "a value that nobody says", "a bomb", "no frame"],
 )
-def test_what_no_vehicle_says_is_one_clear_error(data: bytes, says: str) -> None:
+def test_a_ballot_that_no_vehicle_sends_is_one_clear_error(data: bytes, says: str) -> None:
     sent = saying({(3, 3): CellState.CHANGED_EMPTY, (3, 4): CellState.CHANGED_OCCUPIED}, None)
     tile = msgspec.structs.replace(sent.tiles[0], odds=data)
     with pytest.raises(MapvoteError, match=f"ballot: odds .*{says}"):
@@ -267,7 +267,7 @@ def test_tiles_that_differ_in_their_memory_alone_are_equal_and_not_unequal() -> 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 1e-4, 0.1, 1.0]))
 @settings(max_examples=8, deadline=None)
-def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: int, share: float) -> None:
+def test_the_memory_of_a_tile_comes_back_for_few_cells_and_for_all(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     planes = np.where(rng.random((PLANES, *SHAPE)) < share, rng.integers(1, 2**32, (PLANES, *SHAPE)), 0)
     digest, packed = pack_memory(Memory.of(planes.astype(np.uint32)))

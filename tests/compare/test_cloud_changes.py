@@ -65,12 +65,12 @@ def knowing_free(point_map: PointMap, word: int) -> PointMap:
 
 
 @pytest.mark.parametrize(("free", "kinds"), [(0x1FF, {"gone"}), (1 << 40, {"not seen"})])
-def test_where_a_map_knows_free_space_that_decides_and_its_ground_does_not(free: int, kinds: set[str]) -> None:
+def test_free_space_that_a_map_knows_decides_and_its_ground_does_not(free: int, kinds: set[str]) -> None:
     before, after = map_from_points(made_court()), map_from_points(made_court(CARS[1:], seed=2))
     assert set(at(differences(compare_cells(before, knowing_free(after, free))), -17.8, -16.1)) == kinds
 
 
-def test_what_the_maps_own_rays_passed_below_hangs_or_moved_and_is_no_change() -> None:
+def test_an_object_below_which_the_maps_own_rays_passed_is_no_change() -> None:
     rng = np.random.default_rng(5)
     low, high = (-18.0, -16.0, 2.2), (-15.0, -14.5, 2.6)
     hanging = rng.uniform(low, high, (600, 3)) - [0.0, 0.0, 0.25]

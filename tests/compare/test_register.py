@@ -60,7 +60,7 @@ def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_b
 
 
 @pytest.mark.slow
-def test_what_a_turn_of_half_a_degree_at_the_path_explains_is_no_bend() -> None:
+def test_a_difference_that_half_a_degree_at_the_path_explains_is_no_bend() -> None:
     straight, cloud = drifted()
     for from_path_m, is_bent in ((10.0, True), (150.0, False)):
         path = np.array([[0.0, -from_path_m, 2.0]])

@@ -43,7 +43,7 @@ def test_reals_that_fill_no_scale_are_on_their_own() -> None:
     assert shares(U * 2.0).max() > 0.9
 
 
-def test_what_is_no_brightness_is_dark_and_counted() -> None:
+def test_a_value_that_is_no_brightness_is_dark_and_counted() -> None:
     values = np.array([np.nan, np.inf, -np.inf, -2.5, 0.5, 1.0])
     counted = Brightness.of(values)
     assert (counted.n, counted.undefined, counted.negative) == (3, 3, 1)

@@ -87,7 +87,7 @@ TANGENTS = st.lists(st.tuples(*[NUMBER] * 6), min_size=0, max_size=5).map(lambda
 
 @settings(max_examples=60, deadline=None)
 @given(TANGENTS)
-def test_of_each_of_many_motions_the_same_is_said_as_of_one(xi: F64) -> None:
+def test_functions_of_many_motions_agree_with_those_of_one(xi: F64) -> None:
     T = geometry.exps(xi)
     assert T.shape == (len(xi), 4, 4)
     for k, x in enumerate(xi):

@@ -165,14 +165,14 @@ def test_across_a_gap_ground_may_rise_and_fall_as_far_as_a_slope_and_noise_allow
     assert not continues or found == np.float32(z)
 
 
-def test_of_24_cells_around_those_count_that_hold_a_point_at_a_like_height_and_the_cell_itself_never() -> None:
+def test_cells_around_count_if_they_hold_a_point_at_a_like_height_and_the_cell_itself_never() -> None:
     cells = np.array([r * TILE_CELLS + c for r in range(8, 13) for c in range(8, 13)])
     heights, middle = np.linspace(-0.05, 0.05, 25).astype(np.float32), 10 * TILE_CELLS + 10
     for held, count in ((cells == middle, 0), (cells == middle + TILE_CELLS, 1), (cells > 0, 24)):
         assert _like(middle, 0.0, 0.0, np.inf, 0.0, starts(cells[held]), heights[held], ONE_TILE) == count
 
 
-def test_where_nothing_was_measured_the_gap_widens_by_two_from_cell_to_cell_and_by_three_across_a_corner() -> None:
+def test_the_gap_widens_by_two_from_cell_to_cell_and_by_three_across_a_corner() -> None:
     ground, gap = nothing_known()
     ground[120 * TILE_CELLS + 90], gap[120 * TILE_CELLS + 90] = 7.0, SEED
     grow(np.zeros(CELLS + 1, np.int32), np.empty(0, np.float32), ONE_TILE, ground, gap)
@@ -192,7 +192,7 @@ def test_tiles_know_those_around_them() -> None:
     ]
 
 
-def test_of_a_bridge_and_the_street_below_the_map_keeps_what_was_driven_and_where_both_were_the_lower() -> None:
+def test_the_map_keeps_the_driven_level_of_a_bridge_and_its_street_and_the_lower_if_both_were() -> None:
     """A street along x at 0 m and, from x = 12 to 18, a bridge across it at 6 m; the street goes on below."""
     clouds = at(spread(6, 60_000), 0.0), at(spread(7, 12_000, (12, 18)), 6.0)
     below, across = driven((0, 30), 15.0), driven((0, 30), 15.0, 6.0)[:, [1, 0, 2]]
@@ -265,7 +265,7 @@ def test_which_way_is_north_does_not_matter(turn: Callable[[F32], F32]) -> None:
 
 
 @pytest.mark.parametrize("cells", [206, 207, 200])
-def test_where_a_tile_ends_does_not_matter(cells: int) -> None:
+def test_the_border_of_a_tile_does_not_matter(cells: int) -> None:
     """With a corner of four tiles in the midst."""
     points, road = sloping(9)
     far = Lattice(-CELL_SIZE * cells, -CELL_SIZE * cells)
@@ -282,7 +282,7 @@ def test_heights_are_sorted_within_their_cells_as_pairs_are(points: list[tuple[i
     np.testing.assert_array_equal(_sorted_by_cell(cells, z), z[np.lexsort((z, cells))])
 
 
-def test_of_points_that_lie_close_the_ground_takes_the_one_that_continues_it() -> None:
+def test_the_ground_takes_the_point_among_close_ones_that_continues_it() -> None:
     lower = at(spread(9, 6_000, y=(12, 30)), 9.95)  # worn tarmac, mixed pixels: five centimetres below
     ground = ground_of(at(spread(8, 60_000), 10.0), lower, road=driven((0, 30), 5.0, 10.0))
     assert np.mean(np.abs(ground - 10.0) > 0.01) < 0.01, "but where no other point lies"

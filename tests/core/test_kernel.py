@@ -80,7 +80,7 @@ def test_without_a_change_the_kept_kernel_is_loaded(package: Path) -> None:
         pytest.param("records", "free: int\n    hit", "hit: int\n    free", 23, id="the order of a record's fields"),
     ],
 )
-def test_what_a_kernel_takes_from_another_file_changes(
+def test_a_constant_that_a_kernel_takes_from_another_file_changes(
     package: Path, file: str, old: str, new: str, expected: int
 ) -> None:
     """numba looks at the kernel's own file alone."""
@@ -137,7 +137,7 @@ def test_the_last_resort_is_a_folder_of_the_user_that_nobody_else_may_write_to(
 
 
 @pytest.mark.parametrize("said", ["/kernels", ""])
-def test_what_the_user_says_stays_and_numba_finds_its_own_place_where_there_is_one(
+def test_a_cache_folder_of_the_user_stays_and_numba_uses_its_own_if_there_is_one(
     nowhere: Path, monkeypatch: pytest.MonkeyPatch, said: str
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", said)

@@ -76,7 +76,7 @@ def test_arrays_that_cannot_be_are_refused_in_one_line(give: Callable[[], object
     assert "\n" not in str(refused.value)
 
 
-def test_what_lies_under_points_is_that_of_their_tiles_and_nothing_beyond_the_map() -> None:
+def test_ground_under_points_is_that_of_their_tiles_and_nothing_beyond_the_map() -> None:
     rng = np.random.default_rng(1)
     ground = {(0, c): rng.normal(0.0, 1.0, (256, 256)).astype(np.float32) for c in (0, 1)}
     point_map = make_map({index: Tile(Lattice().tile(index), POINTS, z) for index, z in ground.items()})
@@ -125,7 +125,7 @@ def test_the_name_of_a_map_follows_its_points() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_what_an_edited_tile_takes_along_is_what_it_would_work_out_afresh(seed: int, known: bool) -> None:
+def test_values_that_an_edited_tile_takes_along_equal_computed_ones(seed: int, known: bool) -> None:
     rng = np.random.default_rng(seed)
     tile = make_tile(rng.uniform((0.0, 0.0, -1.0), (76.7, 76.7, 20.0), (200, 3)).astype(np.float32))
     if known:

@@ -44,7 +44,7 @@ def test_a_reference_prepared_on_the_way_is_the_one_laid_out_at_once(point_map: 
         assert_same(outer, reference_window(point_map, outer.grid))
 
 
-def test_what_was_prepared_in_vain_does_no_harm(point_map: PointMap) -> None:
+def test_an_unused_preparation_does_no_harm(point_map: PointMap) -> None:
     local = LocalMap(point_map, 20.0)
     there, back, elsewhere = along(np.array([70.0, 80.0])), along(np.array([60.0])), along(np.array([250.0]))
     for position in (*there, *back, *there, *elsewhere):

@@ -79,12 +79,12 @@ def winner(votes: list[int], abstain: bool) -> int:
 
 
 @given(few_votes)
-def test_where_undetermined_competes_a_plain_majority_decides(votes: list[int]) -> None:
+def test_a_plain_majority_decides_if_undetermined_competes(votes: list[int]) -> None:
     assert int(plurality(np.array(votes, dtype=np.int32))) == winner(votes, abstain=False)
 
 
 @given(few_votes, st.integers(1, 4))
-def test_where_it_abstains_a_change_needs_more_than_half_of_the_others_and_a_quorum(
+def test_a_change_needs_more_than_half_of_the_others_and_a_quorum_if_undetermined_abstains(
     votes: list[int], quorum: int
 ) -> None:
     expected = winner(votes, abstain=True)

@@ -56,7 +56,7 @@ def test_no_scan_is_read_only_to_be_looked_at_but_a_few_at_first() -> None:
 
 
 @pytest.mark.parametrize("read", [N, 0])
-def test_what_is_said_at_the_end_is_what_a_look_at_every_scan_says_read_or_not(read: int) -> None:
+def test_warnings_at_the_end_are_those_of_a_look_at_every_scan_read_or_not(read: int) -> None:
     spoilt = Recording(cut=range(UNSAMPLED, UNSAMPLED + 3))
     watched = looked_at(spoilt.drive())
     for i in range(read):
@@ -78,7 +78,7 @@ def test_a_file_torn_in_the_middle_stops_whoever_reads_it_and_is_told_at_the_end
         watched.warnings()
 
 
-def test_what_is_wrong_with_many_scans_stops_before_the_work_begins() -> None:
+def test_a_fault_of_many_scans_stops_before_the_work_begins() -> None:
     with pytest.raises(MapvoteError, match=r"000000.bin: 7 bytes"):
         looked_at(Recording(torn=0).drive())
     with pytest.raises(MapvoteError, match=r"scan 4 holds 1000 points, those around it 3000: cut off\?.*29 such scans"):

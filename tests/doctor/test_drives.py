@@ -75,7 +75,7 @@ STRAIGHT = ["inverse poses", "rows in reverse order", "points facing backwards",
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", STRAIGHT)
-def test_what_a_straight_drive_leaves_open_its_map_decides(tmp_path: Path, kind: str) -> None:
+def test_a_map_decides_what_a_straight_drive_leaves_open(tmp_path: Path, kind: str) -> None:
     """The map lies about the middle of the drive: a prior that is read otherwise lays scans elsewhere."""
     T = np.array([geometry.from_xyz_rpy(0.8 * (k - N // 3), 3.0, 1.8) for k in range(N)])
     (named,), change = kinds_of("drives")[kind]
@@ -127,7 +127,7 @@ def test_a_prior_that_turns_a_sensor_over_which_stands_upright_is_named(tmp_path
     assert "the prior tilts the sensor by 180 deg, but the points show no road below it" in what
 
 
-def test_what_else_is_wrong_with_a_sensor_upside_down_is_named(tmp_path: Path, sound: Recording) -> None:
+def test_further_faults_of_a_sensor_upside_down_are_named(tmp_path: Path, sound: Recording) -> None:
     r = mounted(sound, (180, 0, 0))
     r.T[:, :3, 3] /= 0.3048
     r.write(tmp_path / "d")
@@ -168,7 +168,7 @@ SOME_KINDS = [
     "kind", [kind if kind in FAST else pytest.param(kind, marks=pytest.mark.slow) for kind in SOME_KINDS]
 )
 @pytest.mark.filterwarnings("ignore:invalid value encountered in cast")  # numbers of another type
-def test_what_is_wrong_with_a_drive_is_named_one_fault_and_two(tmp_path: Path, sound: Recording, kind: str) -> None:
+def test_faults_of_a_drive_are_named_one_and_two(tmp_path: Path, sound: Recording, kind: str) -> None:
     rights, change = kinds_of("drives")[kind]
     found = diagnose(broken(sound, change, tmp_path / "drive")).findings
     assert verdict(rights, found) == LESS.get(kind, "right"), found
@@ -179,7 +179,7 @@ def test_what_is_wrong_with_a_drive_is_named_one_fault_and_two(tmp_path: Path, s
     [k if k.startswith(("nano", "times of points that are a c")) else pytest.param(k, marks=pytest.mark.slow)
      for k in TIME_MENDS],
 )  # fmt: skip
-def test_what_the_doctor_says_of_times_of_points_mends_them(tmp_path: Path, sound: Recording, kind: str) -> None:
+def test_advice_on_times_of_points_mends_them(tmp_path: Path, sound: Recording, kind: str) -> None:
     _, change = kinds_of("drives")[kind]
     folder = broken(sound, change, tmp_path / "drive")
     (key, value), *_ = TIME_MENDS[kind].items()
@@ -208,7 +208,7 @@ QUICK = "shifted by 0.5 m", "pitched by 3 deg + scaled by 1.03", "mirrored, y ne
 
 
 @pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in ON_MAP])
-def test_what_is_wrong_with_a_map_shows_by_a_drive_and_is_measured(sound: Recording, kind: str) -> None:
+def test_faults_of_a_map_show_by_a_drive_and_are_measured(sound: Recording, kind: str) -> None:
     rights, change = kinds_of("maps")[kind]
     found, point_map = examine_points("map", Cloud(change(sound_street())))
     assert point_map is not None
@@ -250,7 +250,7 @@ def test_a_healthy_drive_through_another_street_raises_no_alarm(weave_m: float, 
     assert serious(examine_drive(drive_along(T, 1, prior, sigma_m=max(sigma_m, 0.05)))[0]) == []
 
 
-def test_of_a_healthy_drive_without_a_prior_only_that_is_noted() -> None:
+def test_a_healthy_drive_without_a_prior_gets_that_note_only() -> None:
     assert serious(examine_drive(drive_along(path(24), 2))[0]) == [NO_PRIOR.what]
 
 
@@ -270,7 +270,7 @@ def test_healthy_simulated_drives_and_those_of_kitti_raise_no_alarm(tmp_path: Pa
         pytest.param(0.3048, "converted as if they were feet", marks=pytest.mark.slow),
     ],
 )
-def test_of_a_map_that_is_not_in_metres_the_unit_is_named(sound: Recording, numbers: float, name: str) -> None:
+def test_the_unit_of_a_map_that_is_not_in_metres_is_named(sound: Recording, numbers: float, name: str) -> None:
     points = sound_street()
     points = points[(np.abs(points[:, :2] - [8.0, 5.0]) < 30.0).all(axis=1)]
     tiles = {}

@@ -47,7 +47,7 @@ BY_ITSELF = [
 
 
 @pytest.mark.parametrize("kind", BY_ITSELF)
-def test_what_is_wrong_with_a_map_is_named_without_a_drive_one_fault_and_two(points: F64, kind: str) -> None:
+def test_faults_of_a_map_are_named_without_a_drive_one_and_two(points: F64, kind: str) -> None:
     rights, change = kinds_of("maps")[kind]
     found = examine_points("map", Cloud(change(points)))[0]
     assert verdict(rights, found) == "right", found
@@ -70,7 +70,7 @@ def test_what_is_wrong_with_a_map_is_named_without_a_drive_one_fault_and_two(poi
         (lambda p: np.concatenate([p, moved(x=260.0, z=2.6)(p)]), "warning: .*missing between others"),
     ],
 )
-def test_what_is_wrong_with_points_and_with_the_map_of_them_is_measured(points: F64, change: Change, name: str) -> None:
+def test_faults_of_points_and_of_their_map_are_measured(points: F64, change: Change, name: str) -> None:
     changed = change(points)
     found = [*check_cloud(in_memory(changed)), *check_map(map_from_points(changed))]
     assert any(re.search(name, f"{f.severity}: {f.what}") for f in found), found

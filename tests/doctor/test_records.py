@@ -67,7 +67,7 @@ def test_topics_rates_and_the_mount_are_told(tmp_path: Path) -> None:
         ({"tick_ns": 0}, "warning: /points has 5 stamps that an earlier message has too"),
     ],
 )
-def test_what_is_wrong_with_a_bag_is_named(tmp_path: Path, how: dict[str, Any], name: str) -> None:
+def test_faults_of_a_bag_are_named(tmp_path: Path, how: dict[str, Any], name: str) -> None:
     assert name in told_of_bag(tmp_path / "b", **how)
 
 
@@ -96,7 +96,7 @@ def test_a_sound_ballot_is_not_blamed() -> None:
         ({"fill": GONE}, "judges changed"),
     ],
 )
-def test_what_is_wrong_with_a_ballot_is_named(said: dict[str, Any], name: str) -> None:
+def test_faults_of_a_ballot_are_named(said: dict[str, Any], name: str) -> None:
     assert any(name in what for what in told(**said)), told(**said)
 
 

@@ -180,7 +180,7 @@ def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_
         (20, 15, "the prior's headings are off by 35.0 deg"),
     ],
 )
-def test_of_scans_and_headings_the_side_that_is_turned_is_named_and_of_both_the_prior(
+def test_the_side_that_is_turned_scans_or_headings_is_named_and_the_prior_if_both_are(
     scans_deg: float, prior_deg: float, name: str
 ) -> None:
     T, (C, D) = along(150.0, curved=True), (yawed(deg) for deg in (scans_deg, prior_deg))
@@ -196,7 +196,7 @@ def test_of_scans_and_headings_the_side_that_is_turned_is_named_and_of_both_the_
         (0.6, "between scans 155 and 185 the prior is 20.1 m off the scans' motion, elsewhere 0.0 m (2 of 6 places)"),
     ],
 )
-def test_where_a_prior_stands_still_for_the_rest_of_the_drive_is_named(share: float, name: str) -> None:
+def test_a_prior_that_stands_still_for_the_rest_of_the_drive_is_named_with_its_scan(share: float, name: str) -> None:
     T = along(150.0, curved=True)
     held = np.minimum(np.arange(len(T)), int(share * len(T)))
     assert [f.what for f in compared(T[held], T) if f.severity == "error"] == [name]
@@ -211,7 +211,7 @@ def test_a_prior_that_scatters_by_more_than_it_states_is_told_so() -> None:
         assert any(f"prior_sigma_m says {sigma_m}" in f.what for f in found) == told, found
 
 
-def test_of_two_faults_at_once_both_are_named_and_mended() -> None:
+def test_two_faults_at_once_are_both_named_and_mended() -> None:
     T = along(150.0, curved=True)
     inverse, and_then = compared(inverses(smaller(T, 1.5)), T)
     assert inverse.what == "two faults at once: the prior holds inverse poses (T_lidar_map)"

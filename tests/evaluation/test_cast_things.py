@@ -56,7 +56,7 @@ def test_rays_end_on_a_new_pole_and_all_others_stay() -> None:
     np.testing.assert_array_equal(*seen([Thing("house", box(25.0, 30.0, -5.0, 5.0, 0.0, 6.0))]))  # behind the return
 
 
-def test_what_stands_behind_another_thing_is_not_met_in_whatever_order_they_were_put_there() -> None:
+def test_an_object_behind_another_is_not_hit_in_whatever_order_they_were_placed() -> None:
     near, far = box(9.9, 10.1, -3.0, 3.0, 0.0, 4.0), box(14.9, 15.1, -1.0, 1.0, 0.0, 1.0)
     for first in (0, 1):
         things = [Thing("wall", near), Thing("cabinet", far)]
@@ -64,7 +64,7 @@ def test_what_stands_behind_another_thing_is_not_met_in_whatever_order_they_were
         assert [len(np.concatenate(thing.met)) > 0 for thing in things] == [True, False]
 
 
-def test_where_a_wall_is_taken_away_rays_go_on_or_return_nothing() -> None:
+def test_rays_through_a_removed_wall_go_on_or_return_nothing() -> None:
     gone = from_xyz_rpy(WALL_X, 0.0, 3.0), np.array([0.2, 3.0, 2.9])
     behind = box(30.0, 31.0, -50.0, 50.0, 0.0, 2.5)
     thing = Thing("wall", np.zeros((0, 3, 3)), gone, behind)
@@ -119,6 +119,6 @@ def test_walls_move_to_and_from_the_road_by_half_a_metre() -> None:
         assert abs(away - (0.5 if wall.kind == "wall set back" else -0.5)) < 0.05
 
 
-def test_what_has_a_cars_size_can_be_taken_away() -> None:
+def test_objects_of_a_cars_size_can_be_removed() -> None:
     (car,) = street().gone_cars(5)
     np.testing.assert_allclose(car.centre, [30.0, 5.0], atol=0.3)

@@ -149,7 +149,7 @@ def test_an_invention_is_three_cells_off_the_truth_of_its_kind_and_of_what_is_no
     assert score_objects(states, truth, []).false_m2 == false
 
 
-def test_what_stands_nearer_than_what_went_is_no_stale_point() -> None:
+def test_a_point_nearer_than_the_removed_object_is_not_stale() -> None:
     """A removed sample within reach makes a point stale, unless something that stands is as near."""
     samples = {"kept": [[0.0, 0, 0]], "added": [[10.0, 0, 0]], "removed": [[0.2, 0, 0], [10.2, 0, 0], [20.0, 0, 0]]}
     kept, added, removed = (np.array(samples[name]) for name in ("kept", "added", "removed"))

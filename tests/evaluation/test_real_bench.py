@@ -61,7 +61,7 @@ def changed(kind: str, state: CellState, found: int) -> Changed:
     return cast("Changed", (run, [Asked(kind, state, cells(5, 2, 1, 4), 7.0)]))
 
 
-def test_what_was_found_in_rain_stands_beside_what_was_found_dry() -> None:
+def test_objects_found_in_rain_stand_beside_those_found_dry() -> None:
     dry = changed("wall built", CellState.CHANGED_OCCUPIED, 4)
     wet, gone = changed("wall built", CellState.CHANGED_OCCUPIED, 1), changed("wall gone", CellState.CHANGED_EMPTY, 2)
     runs: dict[str, Any] = {ChangedRun.BUILT: dry, ChangedRun.BUILT_IN_RAIN: wet, ChangedRun.DEMOLISHED: gone}

@@ -98,7 +98,7 @@ def first_map() -> Reference:
     return Reference(GRID, zero, zero.astype(np.int32), words, counts, zero, zero, None)
 
 
-def test_what_no_scan_and_no_map_holds_cannot_be_known(truth: Truth, first_map: Reference) -> None:
+def test_a_cell_that_no_scan_and_no_map_holds_cannot_be_known(truth: Truth, first_map: Reference) -> None:
     known = TRUTHS["could be known"](truth, first_map)
     assert known.tolist() == [[0, Label.UNSCORED, 1, 2, Label.UNSCORED, Label.UNSCORED]]
     assert truth.provenance.tolist() == PROVENANCE, "the truth it is taken from stays as it is"

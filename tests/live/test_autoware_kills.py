@@ -93,7 +93,7 @@ def test_without_a_server_a_fresh_folder_offers_no_service_and_a_folder_of_befor
 
 
 @pytest.mark.slow
-def test_of_many_starts_and_kills_none_empties_a_client(tmp_path: Path, store: Store, domain: int) -> None:
+def test_no_start_or_kill_empties_a_client(tmp_path: Path, store: Store, domain: int) -> None:
     """Every fifth start has a fresh folder, every third no server, every seventh a new version on the way. Half are
     killed as soon as they serve or within 2 s, the others at any moment of their start. `STARTS=50 pytest -m slow`
     makes so many."""

@@ -90,7 +90,7 @@ LIVOX = "diagnostic_msgs/msg/DiagnosticArray"
         ([("/points", CLOUD)], Wish(), ["no nav_msgs/msg/Odometry or other pose", "begins without it"]),
     ],
 )
-def test_what_is_missing_is_said_soon_and_again_with_what_to_type(
+def test_a_missing_topic_is_named_soon_and_again_with_the_option_to_type(
     domain: int, sent: list[tuple[str, str]], wish: Wish, said: list[str]
 ) -> None:
     sender = Sender(domain, *sent)
@@ -268,7 +268,7 @@ def frame_message(ns: int, parent: str, child: str, T: Any) -> bytes:
     return to_cdr(TF, blank_message(TF, transforms=[stamped]))
 
 
-def test_of_moving_frames_the_body_that_carries_the_lidar_is_followed_in_the_frame_at_the_top(domain: int) -> None:
+def test_the_body_that_carries_the_lidar_is_followed_in_the_top_frame(domain: int) -> None:
     mount = from_xyz_rpy(1.0, 0.0, 1.8, 0.0, 0.0, 0.1)
     T_map_odom = from_xyz_rpy(100.0, 50.0, 0.0, 0.0, 0.0, 0.6)
     T_odom_base = from_xyz_rpy(3.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -151,7 +151,7 @@ def test_a_vehicle_with_satellite_fixes_and_an_imu_alone_votes_with_every_scan_l
 
 
 @pytest.mark.slow
-def test_of_kills_with_and_without_a_server_no_ballot_is_lost_or_comes_twice(tmp_path: Path) -> None:
+def test_no_ballot_is_lost_or_comes_twice_after_kills_with_and_without_a_server(tmp_path: Path) -> None:
     record(tmp_path / "bag")
     write_map(map_from_points(street(1)), tmp_path / "map")
     bench = Path(__file__).parents[2] / "benchmarks/live.py"

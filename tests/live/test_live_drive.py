@@ -68,7 +68,7 @@ class Live:
         return self.live.counts
 
 
-def test_of_scans_that_come_twice_as_fast_as_they_are_voted_on_every_other_one_is_left_out_evenly() -> None:
+def test_every_other_scan_is_left_out_evenly_if_they_come_twice_as_fast_as_votes() -> None:
     thinning, waiting, admitted = Thinning(), 0.0, []
     for i in range(2000):
         thinning.cost(0.2)
@@ -173,7 +173,7 @@ def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_o
     assert counts.localised > 2 * SCANS
 
 
-def test_what_a_kill_leaves_in_the_journal_is_what_the_vehicle_had_said_of_each_tile(
+def test_the_journal_after_a_kill_holds_the_last_state_of_each_tile(
     tmp_path: Path,
 ) -> None:
     live = Live(tmp_path, OutboxSizes(journal_s=0.0))
@@ -209,7 +209,7 @@ def test_a_scan_that_cannot_be_read_and_one_an_hour_off_are_two_scans_less_and_t
     assert live.live.latencies_s
 
 
-def test_of_scans_that_wait_each_finds_its_pose_in_odometry_of_500_hz(tmp_path: Path) -> None:
+def test_each_waiting_scan_finds_its_pose_in_odometry_of_500_hz(tmp_path: Path) -> None:
     live, period_ns = Live(tmp_path), 2_000_000
     first_ns = 1_700_000_000 * 10**9 + live.scans[0].stamp_ns
     live.live.on_pose(first_ns - period_ns, live.poses[0])
@@ -245,7 +245,7 @@ def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) 
     assert counts.localised == SCANS
 
 
-def test_what_a_tile_has_worked_out_is_let_go_300_m_away_and_its_points_stay_where_they_are() -> None:
+def test_computed_values_of_a_tile_are_dropped_300_m_away_and_its_points_stay() -> None:
     given = make_map({(0, c): make_tile(wall([(10, 10)], [0.05]), 0.0, (0, c)) for c in range(12)})
     maps = OneMap(given)
     tile, tiles = (0, 0), maps.current().tiles

@@ -68,7 +68,7 @@ def driven(tmp_path: Path) -> Any:
     return SimpleNamespace(live=live, board=board, sent=network.sent)
 
 
-def test_what_is_published_is_what_ros_2_reads_and_says_how_it_goes(driven: Any) -> None:
+def test_published_messages_are_read_by_ros_2_and_state_how_it_goes(driven: Any) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     said: Any = store.deserialize_cdr(driven.sent["/diagnostics"][-1], DIAGNOSTICS)
     assert {s.name: s.level for s in said.status} == {

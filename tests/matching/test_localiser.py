@@ -138,7 +138,7 @@ def test_a_blind_scan_in_the_middle_does_not_vote_and_does_no_harm(point_map: Po
     assert np.delete(off(fixes), 5).max() < 0.15
 
 
-def test_what_waits_is_bounded(point_map: PointMap) -> None:
+def test_the_queue_of_waiting_scans_is_bounded(point_map: PointMap) -> None:
     one = localiser(point_map)
     empty = np.zeros((0, 3), dtype=np.float32)
     out = [len(one.push(Scan(i * 100_000_000, empty), told(POSES[0]))) for i in range(60)]

@@ -109,7 +109,7 @@ def test_a_precise_prior_decides_what_the_geometry_leaves_open() -> None:
     np.testing.assert_allclose(held.T_map_lidar[:3, 3], [0.5, 0.0, 1.8], atol=0.06)
 
 
-def test_of_many_guesses_the_likeliest_come_first_and_the_best_of_them_is_refined(ndt_map: NdtMap, scan: F64) -> None:
+def test_the_likeliest_guesses_come_first_and_the_best_of_them_is_refined(ndt_map: NdtMap, scan: F64) -> None:
     away = [8.0, -5.0, 0.4, 3.0, -12.0]
     guesses, clouds = [T_TRUE @ from_xyz_rpy(x, 0.5 * x, 0.0) for x in away], thin_for_levels(scan)
     assert likeliest(ndt_map, clouds[0], guesses, 2)[0] is guesses[2]

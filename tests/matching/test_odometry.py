@@ -259,7 +259,7 @@ def test_on_a_first_scan_the_speed_is_found_by_how_the_scan_is_bent(tracker: Tra
     assert off(fix.registration.T_map_lidar, 0) < 0.04
 
 
-def test_where_a_vehicle_was_is_where_each_speed_is_tried_from(tracker: Tracker) -> None:
+def test_each_speed_is_tried_from_the_last_pose(tracker: Tracker) -> None:
     tracker.move_to(POSES[3], 4 * TENTH)
     around = tracker.map_around(POSES[3][:3, 3])
     assert tracker.guess_motion(around, 5 * TENTH, Sample(scan(4)), np.eye(4))[0] == 10.0

@@ -125,7 +125,7 @@ def test_heights_are_above_the_lowest_point_of_nine_cells_of_3_m(seed: int) -> N
     np.testing.assert_array_equal(height_above_lowest(points), expected)
 
 
-def test_what_stands_is_found_plumb_however_the_sensor_is_tilted() -> None:
+def test_standing_voxels_are_found_plumb_however_the_sensor_is_tilted() -> None:
     road = np.column_stack([np.linspace(-20, 20, 81), np.zeros(81), np.zeros(81)])
     post = np.array([[5.0, 0.5, 0.59], [5.0, 0.5, 0.61], [5.0, 0.5, 3.0]])
     T = from_xyz_rpy(3.0, 1.0, 1.8, 0.0, 0.3, 0.0)
@@ -226,7 +226,7 @@ def test_a_pose_that_has_not_settled_yields_to_the_one_beside_it_and_a_settled_o
 
 
 @pytest.mark.parametrize("quick", [False, True])
-def test_where_a_street_repeats_itself_no_place_leads(quick: bool) -> None:
+def test_no_place_leads_on_a_street_that_repeats_itself(quick: bool) -> None:
     boxes = np.concatenate([box(x, y) for x in np.arange(-45.0, 45.0, 6.0) for y in (-8.0, 8.0)])
     street = np.concatenate([boxes, road(np.random.default_rng(1), 45.0, 10.0)])
     ndt_map = build_ndt(street, np.zeros(3))

@@ -95,7 +95,7 @@ def test_rays_are_gathered_by_azimuth_and_only_those_that_reach_where_their_fan_
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_what_rays_pass_is_what_the_rule_says_of_each_cell_and_each_ray(seed: int) -> None:
+def test_passed_cells_are_those_that_the_rule_gives_for_each_cell_and_ray(seed: int) -> None:
     points, base = scene(seed, 1500)
     passed = np.zeros(base.size, np.uint64)
     mark_passed(gather_rays(follow_rays(rows_from(points, ORIGIN), CLEARANCE_M)), ORIGIN, CORNER, base, passed)

@@ -122,7 +122,7 @@ class AllMove:
         return []
 
 
-def test_what_moves_does_not_count_as_struck_and_given_poses_need_no_prior() -> None:
+def test_moving_points_do_not_count_as_hits_and_given_poses_need_no_prior() -> None:
     poses = GivenPoses(np.array([0, SECOND]), np.array([SENSOR, SENSOR]))
     everything = Frontend(poses, AllMove(), LocalMap(street(), 40.0))
     [seen] = everything.observe(Scan(0, POINTS))

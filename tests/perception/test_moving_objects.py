@@ -135,7 +135,7 @@ def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: f
 
 
 @pytest.mark.parametrize("waiting", [[], [((6.0, -4.0, 10.4, -2.2, 1.5), 0.0)]])
-def test_what_comes_into_view_and_a_car_that_waits_are_not_moving(waiting: list[tuple[Box, float]]) -> None:
+def test_objects_that_come_into_view_and_a_waiting_car_are_not_moving(waiting: list[tuple[Box, float]]) -> None:
     """Walls appear from behind corners and parked cars, and all of it stays."""
     sensor = coarse("hdl32e")
     assert all(mask.mean() < 1e-3 for mask in Street(sensor, 10.0, 3.0, waiting).run(sensor, MovingSettings()))

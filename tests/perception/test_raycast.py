@@ -172,7 +172,7 @@ def test_points_of_a_cell_are_counted_and_marked_at_their_heights() -> None:
     assert (at_corner.counts[0, 0], at_corner.hit[0, 0]) == (1, 0b100), "the window's first cell, too"
 
 
-def test_what_lies_in_the_sensors_own_cell_proves_nothing() -> None:
+def test_points_in_the_sensors_own_cell_prove_nothing() -> None:
     origin = np.array([0.2, 0.05, 1.8])
     near = origin + np.array([[0.29, 0.0, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, -1.8]])
     view = cast_rays(near, origin, np.ones(3, bool), np.zeros(3, bool), flat_reference())
@@ -295,7 +295,7 @@ def test_the_rays_lean_as_the_sensor_does(roll_deg: float, pitch_deg: float) -> 
 
 
 @pytest.mark.parametrize("sensor", [replace(SENSOR, rings=False), replace(SENSOR, elevations_deg=(0.0,))])
-def test_of_a_sensor_whose_beams_nobody_knows_nothing_is_told(sensor: Sensor) -> None:
+def test_a_sensor_with_unknown_beams_has_no_view_of_the_sky(sensor: Sensor) -> None:
     answered = directions()[2] < 0.0
     rays = follow_rays(np.ascontiguousarray(20.0 * directions()[0][answered].T, dtype=np.float32), 0.45)
     assert len(Sky(sensor).rays(UP, FORWARD, rays).reach) == 0

@@ -40,7 +40,7 @@ def voxels(points: F64) -> set[tuple[int, int, int]]:
 
 @settings(max_examples=6)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([30, 100_000]))
-def test_of_each_voxel_the_first_point_that_was_offered_is_kept_whenever_points_are_sorted(seed: int, at: int) -> None:
+def test_the_first_point_offered_in_each_voxel_is_kept_whenever_points_are_sorted(seed: int, at: int) -> None:
     rng = np.random.default_rng(seed)
     offered = [rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 3.0), (20, 3)) for _ in range(6)]
     new = NewPoints(LATTICE, numbers=NewPointsRule(sorted_together=at))
@@ -79,7 +79,7 @@ def test_points_of_a_tile_are_cut_to_a_word_and_told_from_its_corner() -> None:
     np.testing.assert_allclose(found, [[1.35, 1.05, 0.75]], atol=1e-5)
 
 
-def test_what_lies_beyond_the_local_grid_is_new_where_it_stands_near_and_unmapped() -> None:
+def test_points_beyond_the_local_grid_are_new_where_they_are_near_and_unmapped() -> None:
     """The kernel, against the same rule written out for arrays."""
     rng = np.random.default_rng(2)
     points = rng.uniform((-5.0, -5.0, 0.0), (95.0, 95.0, 6.0), (4000, 3))

@@ -189,14 +189,14 @@ def test_parts_without_a_shape_are_counted_and_named(tmp_path: Path, caplog: pyt
         ),
     ],
 )
-def test_what_is_no_lanelet2_map_is_refused_with_the_reason(tmp_path: Path, content: str, error: str) -> None:
+def test_a_file_that_is_no_lanelet2_map_is_refused_with_the_reason(tmp_path: Path, content: str, error: str) -> None:
     (tmp_path / "map.osm").write_text(content)
     with pytest.raises(MapvoteError, match=error):
         read_lanelets(tmp_path / "map.osm", MapFrame())
 
 
 @pytest.mark.parametrize("content", ["[]", '{"features": [{}]}', "{", '{"features": [{"geometry": {"type": "Cube"}}]}'])
-def test_what_is_no_geojson_of_changes_is_refused(tmp_path: Path, content: str) -> None:
+def test_a_file_that_is_no_geojson_of_changes_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "c.geojson").write_text(content)
     with pytest.raises(MapvoteError, match="no GeoJSON of changes"):
         read_changes(tmp_path / "c.geojson")

@@ -207,7 +207,7 @@ def test_geojson_of_a_map_on_earth_is_longitude_and_latitude() -> None:
     assert "local metres" in local.frame
 
 
-def test_what_two_vehicles_leave_behind_is_no_larger_thing_but_a_long_low_wall_is() -> None:
+def test_two_vehicles_that_left_are_no_large_object_and_a_long_low_wall_is() -> None:
     bus, car = cell_points(0, 0, 38, 9, (0.6, 1.5, 3.2)), cell_points(42, 2, 13, 3, (1.2,))
     (left,) = compare(street(bus, car), street())
     assert (left.box[2] - left.box[0]) * CELL_SIZE > 12.0

@@ -120,7 +120,7 @@ def test_two_houses_whose_fronts_touch_are_two(turn_deg: float) -> None:
     assert count(*pair, turn_deg=turn_deg) == 2
 
 
-def test_of_a_row_of_four_each_is_one() -> None:
+def test_each_house_of_a_row_of_four_is_one_object() -> None:
     row = [walls(58 * k, 0, 58 * k + 54.5, 30) for k in range(4)]
     assert count(*row, *(BRIDGE + np.array([58, 0]) * k for k in range(3))) == 4
 
@@ -131,7 +131,7 @@ def test_a_house_of_narrow_rooms_is_one(room: int) -> None:
     assert count(walls(0, 0, 120, 30), *inner) == 1
 
 
-def test_what_stood_apart_before_is_told_apart_still() -> None:
+def test_objects_that_stood_apart_stay_apart() -> None:
     assert count(walls(0, 0, 40, 20), walls(60, 0, 100, 20)) == 2
     assert count(walls(0, 0, 40, 20), walls(0, 40, 40, 60)) == 2
 
@@ -159,7 +159,7 @@ def test_two_houses_a_cell_apart_are_two() -> None:
     assert set(found.values()) == {0, 1}
 
 
-def test_what_was_built_beside_what_was_demolished_stays_apart() -> None:
+def test_a_built_object_beside_a_demolished_one_stays_apart() -> None:
     found = things(block(0, 0, 10, 10, 2) + block(0, 11, 2, 2, 3))
     assert found[0, 0, 2] != found[0, 11, 3]
 

@@ -40,7 +40,7 @@ def test_every_scenario_lays_out_by_seed_and_differently_by_another(name: str) -
     assert {"ground", "building", "pole", "parked car"} <= kinds
 
 
-def test_as_published_has_what_the_paper_tells_and_nothing_more() -> None:
+def test_the_published_scenario_has_what_the_paper_describes_and_nothing_more() -> None:
     scenario = load_scenario("as_published")
     flaws = scenario.flaws.model_dump()
     assert flaws.pop("range_sigma_m") is None, "the noise of its LiDAR's model"
@@ -158,7 +158,7 @@ def test_ar1_errors_have_their_deviation_and_their_memory() -> None:
     assert np.corrcoef(errors[:-later, 0], errors[later:, 0])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.05)
 
 
-def test_what_hangs_over_a_street_stays_and_nothing_of_it_reaches_the_ground_or_a_house_that_goes() -> None:
+def test_objects_over_a_street_stay_and_reach_neither_the_ground_nor_a_house_that_goes() -> None:
     world = make_world(load_scenario("overhead"), 4)
     hanging = [body for body in world.bodies if body.kind in ("wire", "bridge", "board", "crown")]
     assert [sum(body.kind == kind for body in hanging) for kind in ("wire", "bridge", "board", "crown")] == [8, 6, 8, 4]

@@ -143,7 +143,7 @@ BOTH = "/front/points,/rear/points"
 
 
 @pytest.mark.parametrize("late_ns", [0, 1_000, -1_000, 40_000_000, 50_000_000])
-def test_what_several_lidars_see_in_one_revolution_is_one_scan(tmp_path: Path, late_ns: int) -> None:
+def test_clouds_of_several_lidars_in_one_revolution_are_one_scan(tmp_path: Path, late_ns: int) -> None:
     drive = open_drive(two_lidars(tmp_path / "bag", late_ns=late_ns), topic=BOTH, sensor="hdl32e")
     T_front_rear = geometry.inverse(T_BASE["front"]) @ T_BASE["rear"]
     assert len(drive) == 6
@@ -252,7 +252,7 @@ def test_a_drive_that_votes_takes_odometry_and_mount_from_the_bag_as_a_live_one_
         assert drive.prior_in_map == in_map
 
 
-def test_what_the_user_says_wins_over_what_a_live_drive_would_choose(tmp_path: Path) -> None:
+def test_an_option_of_the_user_wins_over_the_choice_of_a_live_drive(tmp_path: Path) -> None:
     bag = record_vehicle(tmp_path / "bag", "/wheels")
     assert open_drive(bag, sensor="hdl32e", as_live=True, prior="none").T_map_lidar_prior is None
     drive = open_drive(bag, sensor="hdl32e", as_live=True, mount="0,0,2,0,0,0")

@@ -76,7 +76,7 @@ def test_a_driver_that_sends_one_cloud_in_several_formats_is_one_lidar(tmp_path:
         ("zstd", b"", r"0 bytes after zstd|do not decompress"),
     ],
 )
-def test_what_cannot_be_read_says_why(form: str, data: bytes, said: str) -> None:
+def test_a_cloud_that_cannot_be_read_says_why(form: str, data: bytes, said: str) -> None:
     with pytest.raises(MapvoteError, match=f"^/points: .*({said})"):
         point_cloud_table("/points", compressed(form, data))
 

@@ -43,7 +43,7 @@ def make(path: Path) -> Path:
     return path
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_a_written_drive_is_read_back(tmp_path: Path) -> None:
     drive = open_drive(make(tmp_path / "d"))
     assert (drive.vehicle, drive.drive_id, drive.sensor.name) == ("car-1", "d", "hdl32e")
     assert drive.stamps_ns.tolist() == [10**18 + 100_000_001 * i for i in range(6)]
@@ -154,7 +154,7 @@ def spoilt(points: int) -> Callable[[Path], object]:
         *((str, {"scans": scans}, "--scans") for scans in ("9", "a:b", "3:3", "", "1:2:3:4", "0:2,", "::0")),
     ],
 )
-def test_what_is_wrong_with_a_drive_or_with_what_is_said_of_it_is_named(
+def test_faults_of_a_drive_and_of_its_options_are_named(
     tmp_path: Path, edit: Callable[[Path], object], options: dict[str, str], said: str
 ) -> None:
     edit(make(tmp_path / "d"))

@@ -288,7 +288,7 @@ def test_a_sensor_that_does_not_spin_is_read_by_the_length_of_the_scan() -> None
     assert isinstance(read_times("t", 25 * t, points, STAMP, RATE_HZ), Refusal)
 
 
-def test_what_is_stated_wins() -> None:
+def test_a_stated_field_wins() -> None:
     nothing = read(t=TIMES, t2=1e3 * TIMES)
     assert nothing.times is not None
     assert nothing.times.fields == ("t",)

@@ -57,7 +57,7 @@ def test_equal_stamps_are_dropped_and_counted() -> None:
     assert f"has {N} stamps that an earlier message has too" in told
 
 
-def test_of_two_passes_over_the_same_time_the_longest_is_read() -> None:
+def test_the_longest_of_two_passes_over_the_same_time_is_read() -> None:
     shifted = EVEN[:30] + 37_000_000  # a second drive of that morning would lie between the scans of the first
     chosen, told = order_of(np.concatenate([EVEN, shifted]))
     assert chosen == list(range(N))

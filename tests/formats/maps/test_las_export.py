@@ -82,7 +82,7 @@ def test_a_map_is_never_in_degrees_or_feet(tmp_path: Path, caplog: pytest.LogCap
         ("a.las", {"crs": "EPSG:4326", "offset": (1.0, 0.0, 0.0)}, "--offset is in metres"),
     ],
 )
-def test_what_would_be_spoilt_is_refused(tmp_path: Path, name: str, options: Any, said: str) -> None:
+def test_an_export_that_would_lose_values_is_refused(tmp_path: Path, name: str, options: Any, said: str) -> None:
     with pytest.raises(MapvoteError, match=said):
         export_map(placed(200, BERLIN, "EPSG:32633"), tmp_path / name, **options)
     assert list(tmp_path.iterdir()) == []
