@@ -1,14 +1,15 @@
 """Every scan of a drive through our vehicle, through that of another checkout, and through peers: in turn, on one core.
 
     python benchmarks/judge.py OUT --street street:2 --kitti ../shared/data/kitti/* [--last N]
-        [--source OTHER/src --python OTHER/.venv/bin/python]
+        [--source OTHER/src --python OTHER/.venv/bin/python]...
 
 Times are CPU time, so that a busy neighbour counts little. Ours is everything that ``Vehicle.observe`` does, moving
 windows and first looks included. A first drive compiles; of the judged one the first WARM_UP scans do not count. Peers
 run where they are installed (extra ``bench``), each as its documentation advises, on one thread: VGICP of small_gicp
 localises, dufomap finds what moves. They get what favours them: points de-skewed with the true motion, targets made
-outside the clock. Poses are compared with the truth, each trajectory laid on it as a whole. A KITTI map is made of
-every second scan, and its truth is odometry. Drives and maps are kept in OUT.
+outside the clock. Open3D's cloud-to-cloud distances, both ways, find what changed. *whole chain* is the sum of the
+peers. Poses are compared with the truth, each trajectory laid on it as a whole. A KITTI map is made of every second
+scan, and its truth is odometry. Drives and maps are kept in OUT. Each checkout makes its map by its own ``build``.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ import subprocess
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from mapvote.core.geometry import inverse
+from mapvote.core.geometry import inverse, transform
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F32, F64, Drive, MapvoteError
-from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
+from mapvote.formats import open_drive, read_map, read_T_map_lidar
 from mapvote.matching.prepare import deskew, motion_at
-from mapvote.survey.build import build_map
 
 WARM_UP = 25
 """Scans: the first leaves for the voter after some fifteen."""
@@ -46,8 +47,12 @@ LOOK_AHEAD = 10
 """Scans in a second: how late a peer says what moves, as we do."""
 VEHICLE = Path(__file__).parent / "judged_vehicle.py"
 LOST_M = 1.0
+STAGES_OF = {"see + vote": ("see", "vote"), "whole chain": ("whole scan",)}
+"""Our stages beside that of a peer, where they are not one of the same name."""
 VOXEL_M = 0.2
 """dufomap: at its usual 0.1 m a 32-beam scan hardly ever makes a voxel void."""
+AROUND_M = 40.0
+"""Half of the square around the sensor in which clouds are compared, as large as our window."""
 Checkout = tuple[Path, Path]
 """A source tree, and the interpreter that has its dependencies."""
 Clock = Callable[[str, Callable[[], Any]], Any]
@@ -60,7 +65,7 @@ class Watched:
     def __init__(self, checkout: Checkout, drive: Path, map_path: Path) -> None:
         src, python = checkout
         command = [str(python), str(VEHICLE), str(drive), str(map_path), str(WARM_UP)]
-        environment = {**os.environ, "PYTHONPATH": str(src)}
+        environment = environment_of(src)
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         self.process = subprocess.Popen(command, env=environment, text=True, **pipes)  # type: ignore[call-overload]
         assert self.process.stdout.readline() == "ready\n"
@@ -70,6 +75,26 @@ class Watched:
         self.process.stdin.write(f"{what}\n")
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())
+
+
+def environment_of(src: Path) -> dict[str, str]:
+    """The environment of a process that runs a source tree."""
+    return {**os.environ, "PYTHONPATH": str(src)}
+
+
+def name_of(src: Path) -> str:
+    """The commit of a source tree, or the name of its folder where it has none."""
+    command = ["git", "-C", str(src), "rev-parse", "--short=8", "HEAD"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)
+    return told.stdout.strip() or src.resolve().parent.name
+
+
+def build(checkout: Checkout, surveys: Sequence[str], map_path: Path) -> None:
+    """Make a map by the command line of a checkout, unless it is there: formats of maps differ between commits."""
+    src, python = checkout
+    if not map_path.exists():
+        command = [str(python), "-m", "mapvote", "build", *surveys, "--out", str(map_path)]
+        subprocess.run(command, env=environment_of(src), check=True, stdout=subprocess.DEVNULL)
 
 
 class Vgicp:
@@ -121,28 +146,62 @@ class Dufomap:
             clock("moving", lambda: self.dufo.segment(*scan, True))
 
 
-def judge(
-    out: Path, drive: Drive, map_path: Path, T_true: F64, checkouts: dict[str, Checkout], last: int | None
-) -> str:
-    """Rows of the table: CPU milliseconds of each side and stage, and how far its poses are off."""
-    from mapvote_lab.evaluation.truths import error_summary, rigid_between
+class CloudToCloud:
+    """Distances both ways between each scan, at its true pose, and the map's points around it."""
 
-    count = min(len(drive), last or len(drive))
-    points_map = all_points(read_map(map_path))
-    peers: dict[str, Vgicp | Dufomap] = {}
+    def __init__(self, module: ModuleType, map_points: F64, T_true: F64) -> None:
+        self.o3d = module
+        self.map_points = map_points
+        self.T_true = T_true
+        self.done = 0
+
+    def __call__(self, points: F32, clock: Clock) -> None:
+        T = self.T_true[self.done]
+        self.done += 1
+        scan, near = (
+            self._cloud(cloud[np.abs(cloud[:, :2] - T[:2, 3]).max(axis=1) < AROUND_M])
+            for cloud in (transform(T, points), self.map_points)
+        )
+        clock("see + vote", lambda: (scan.compute_point_cloud_distance(near), near.compute_point_cloud_distance(scan)))
+
+    def _cloud(self, points: F64) -> Any:
+        return self.o3d.geometry.PointCloud(self.o3d.utility.Vector3dVector(points))
+
+
+Peer = Vgicp | Dufomap | CloudToCloud
+
+
+def peers_of(map_points: F64, T_true: F64) -> dict[str, Peer]:
+    """The peers that are installed."""
+    peers: dict[str, Peer] = {}
     if find_spec("small_gicp"):
-        peers["VGICP"] = Vgicp(import_module("small_gicp"), points_map, T_true)
+        peers["VGICP"] = Vgicp(import_module("small_gicp"), map_points, T_true)
     if find_spec("dufomap"):
         peers["dufomap"] = Dufomap(import_module("dufomap"), T_true)
-    watched = {name: Watched(checkout, drive.path, map_path) for name, checkout in checkouts.items()}
-    ms: dict[tuple[str, str], F64] = defaultdict(lambda: np.zeros(count))
+    if find_spec("open3d"):
+        peers["Open3D"] = CloudToCloud(import_module("open3d"), map_points, T_true)
+    return peers
+
+
+Times = dict[tuple[str, str], F64]
+"""CPU milliseconds of each scan by side and stage."""
+
+
+def judge(
+    out: Path, drive: Drive, maps: dict[str, Path], T_true: F64, checkouts: dict[str, Checkout], last: int | None
+) -> tuple[Times, str]:
+    """Rows of the table: CPU milliseconds of each side and stage, and how far its poses are off."""
+    count = min(len(drive), last or len(drive))
+    peers = peers_of(all_points(read_map(maps["ours"])), T_true)
+    watched = {name: Watched(checkout, drive.path, maps[name]) for name, checkout in checkouts.items()}
+    ms: Times = defaultdict(lambda: np.zeros(count))
     order = np.random.default_rng(0)
 
     def ours(name: str, i: int) -> None:
         for stage, took in watched[name].ask(str(i)).items():
             ms[name, stage][i] = took
 
-    def theirs(name: str, peer: Vgicp | Dufomap, points: F32, i: int) -> None:
+    def theirs(name: str, peer: Peer, points: F32, i: int) -> None:
         def clock(stage: str, work: Callable[[], Any]) -> Any:
             start = time.process_time()
             result = work()
@@ -157,21 +216,39 @@ def judge(
         turns += [partial(theirs, name, peer, points, i) for name, peer in peers.items()]
         for k in order.permutation(len(turns)):  # who comes after a peer finds the caches cold
             turns[k]()
+    chain = [took for (name, _), took in ms.items() if name in peers]
+    if chain:
+        ms["peers", "whole chain"] = np.sum(chain, axis=0)
     poses = {name: (out / f"{name}.npy", one.ask(str(out / f"{name}.npy"))) for name, one in watched.items()}
     found = {name: (np.load(path), lost) for name, (path, lost) in poses.items()}
     found |= {name: (np.array(peer.poses), peer.lost) for name, peer in peers.items() if isinstance(peer, Vgicp)}
+    return ms, "\n".join([*rows_of(drive.path.name, ms), *pose_rows_of(drive.path.name, found, T_true)])
+
+
+def rows_of(drive: str, ms: Times) -> list[str]:
+    """Rows of the table: CPU milliseconds of each side and stage, and their ratio to ours in the same stage."""
     rows = []
     for (name, stage), took in ms.items():
-        kept, mine = took[WARM_UP:], ms["ours", stage][WARM_UP:]
+        kept = took[WARM_UP:]
+        beside = [ms["ours", part] for part in STAGES_OF.get(stage, (stage,))]
+        own = np.sum(beside, axis=0)[WARM_UP:]
         rows.append(
-            f"| {drive.path.name} | {stage} | {name} | {np.median(kept):.2f} / {kept.mean():.2f} / {kept.max():.1f} "
-            f"| {kept.mean() / mine.mean():.3f} |"
+            f"| {drive} | {stage} | {name} | {np.median(kept):.2f} / {kept.mean():.2f} / {kept.max():.1f} "
+            f"| {kept.mean() / own.mean():.3f} |"
         )
+    return rows
+
+
+def pose_rows_of(drive: str, found: dict[str, tuple[F64, int]], T_true: F64) -> list[str]:
+    """Rows of the table: how far the poses of each side are off."""
+    from mapvote_lab.evaluation.truths import error_summary, rigid_between
+
+    rows = []
     for name, (T, lost) in found.items():
         errors = error_summary(T, rigid_between(T, T_true[: len(T)]) @ T_true[: len(T)])
         off = f"{errors.median_m:.4f} / {errors.max_m:.4f} m"
-        rows.append(f"| {drive.path.name} | poses off by | {name} | {off} | {lost} lost |")
-    return "\n".join(rows)
+        rows.append(f"| {drive} | poses off by | {name} | {off} | {lost} lost |")
+    return rows
 
 
 def main() -> None:
@@ -179,25 +256,27 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--street", action="append", default=[], metavar="SCENARIO:SEED[:SENSOR]")
     parser.add_argument("--kitti", type=Path, nargs="*", default=[], metavar="DRIVE")
-    parser.add_argument("--source", type=Path, metavar="OTHER/src", help="of another checkout, to compare with")
+    parser.add_argument("--source", type=Path, action="append", default=[], metavar="OTHER/src", help="to compare with")
     parser.add_argument(
-        "--python", type=Path, default=Path(sys.executable), metavar="OTHER/bin/python", help="its interpreter"
-    )
+        "--python", type=Path, action="append", default=[], metavar="OTHER/bin/python",
+        help="the interpreter of the source beside which it stands; by default this one",
+    )  # fmt: skip
     parser.add_argument("--last", type=int, metavar="N", help="stop each drive after so many scans")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    checkouts = {"ours": (Path(__file__).parents[1] / "src", Path(sys.executable))}
-    if options.source:
-        checkouts["other"] = options.source, options.python
+    own = Path(sys.executable)
+    checkouts = {"ours": (Path(__file__).parents[1] / "src", own)}
+    checkouts |= {name_of(src): (src, python) for src, python in zip_longest(options.source, options.python)}
+    checkouts = {name: (src, python or own) for name, (src, python) in checkouts.items()}
     print("| drive | stage | side | CPU ms: median / mean / worst | times ours, means |\n|---|---|---|---|---|")
 
-    def judged(name: str, folder: Path, surveys: list[Drive], poses: Path) -> None:
-        map_path = options.out / f"map_{name}"
-        if not map_path.exists():
-            write_map(build_map(surveys)[0], map_path)
+    def judged(name: str, folder: Path, surveys: list[str], poses: Path) -> None:
+        maps = {side: options.out / f"map_{name}_{side}" for side in checkouts}
+        for side, checkout in checkouts.items():
+            build(checkout, surveys, maps[side])
         T_true = read_T_map_lidar(poses, folder)
-        print(judge(options.out, open_drive(folder), map_path, T_true, checkouts, options.last), flush=True)
+        print(judge(options.out, open_drive(folder), maps, T_true, checkouts, options.last)[1], flush=True)
 
     for scene in options.street:
         from mapvote_lab.simulation import simulate
@@ -206,12 +285,12 @@ def main() -> None:
         folder = options.out / scene.replace(":", "_")
         if not folder.exists():
             simulate(scenario, folder, int(seed), overrides={"sensor": sensor[0]} if sensor else {})
-        surveys = [open_drive(one) for one in sorted(folder.glob("survey_*"))]
+        surveys = [str(one) for one in sorted(folder.glob("survey_*"))]
         judged(folder.name, folder / "v1", surveys, folder / "truth" / "v1" / "poses.txt")
     for folder in options.kitti:
         if not (folder / "poses.txt").is_file():
             raise MapvoteError(f"{folder} has no poses.txt")
-        judged(folder.name, folder, [open_drive(folder, scans="::2")], folder / "poses.txt")
+        judged(folder.name, folder, [str(folder), "--scans", "::2"], folder / "poses.txt")
 
 
 if __name__ == "__main__":

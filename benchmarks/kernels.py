@@ -203,9 +203,11 @@ def _agreeing(cells: Any, own: Any, decided: Any, state: int, found: Any) -> obj
     return np.flatnonzero((decided[cells] == state) & (own[cells] == state))
 
 
-def _deskewed(points: Any, time_s: Any, v: Any, w: Any, out: Any) -> None:
+def _deskewed(flat: Any, time_s: Any, motion: Any, turn: Any, rows: Any) -> None:
+    (t, v, w), points = motion, flat.reshape(-1, 3)
     u = v + np.cross(w, points)
-    out[:] = points + time_s[:, None] * u + 0.5 * time_s[:, None] ** 2 * np.cross(w, u)
+    there = points + time_s[:, None] * u + 0.5 * time_s[:, None] ** 2 * np.cross(w, u)
+    rows[:] = (there @ turn.T + t).T
 
 
 NUMPY: dict[str, Callable[..., object]] = {
@@ -221,7 +223,7 @@ NUMPY: dict[str, Callable[..., object]] = {
     "core.voxels._group": lambda keys, *_: np.unique(keys, return_index=True, return_inverse=True),
     "core.voxels._add": _summed,
     "core.voxels._enter_keys": _keys,
-    "core.voxels._thin_keys": lambda points, every, size, keys: _keys(points[::every], 0.0, 0.0, size, keys),
+    "core.voxels._thin_keys": lambda flat, every, size, keys: _keys(flat.reshape(-1, 3)[::every], 0.0, 0.0, size, keys),
     "codec.planes.mark": _marked,
     "codec.planes.mark_spoken": _marked_spoken,
     "codec.planes.mark_among": _marked_among,

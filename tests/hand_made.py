@@ -15,6 +15,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, check_path, pack_odds, pack
 from mapvote.codec.fields import pack_fields
 from mapvote.codec.planes import Words, compress, mark, nothing_reached, pack_plane, pack_words
 from mapvote.codec.tile_planes import base_hash
+from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.points import Fields
@@ -24,7 +25,8 @@ from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, PosePrior, S
 from mapvote.fusion.tile_vote import Vote
 from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
-from mapvote.perception.raycast import ScanView, find_obstacles
+from mapvote.perception.placement import find_obstacles
+from mapvote.perception.raycast import ScanView
 
 Cell = tuple[int, int]
 SETTINGS = "5e771465" * 8
@@ -55,7 +57,7 @@ def one_scan(point_map: PointMap, points: F64) -> Observation:
     for k, z in zip(cell, points[:, 2], strict=True):
         hit.ravel()[k] |= np.uint64(1 << int(z // CELL_SIZE - here.base.ravel()[k]))
     still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
-    scan = PlacedScan(0, points, origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
+    scan = PlacedScan(0, rows_from(points, origin), origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit, np.zeros((0, 0), np.uint8))
     return Observation(scan, still, view, here)
 

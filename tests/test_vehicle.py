@@ -67,7 +67,7 @@ def scan_of(x: float, i: int) -> tuple[Scan, F64]:
 def exactly(scan: Scan, prior: PosePrior | None) -> Fix:
     """The prior is the truth."""
     assert prior is not None
-    return Fix(scan, Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), scan.points, True)
+    return Fix(scan, Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), np.zeros(6), True)
 
 
 PAPER = Settings(voting=VotingSettings(method="paper"))

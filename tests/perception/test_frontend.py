@@ -11,7 +11,7 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Bool, MapvoteError, PosePrior, Registration, Scan
+from mapvote.core.types import F32, F64, Bool, MapvoteError, PosePrior, Registration, Scan
 from mapvote.matching.localiser import GivenPoses, Localise
 from mapvote.matching.odometry import Fix
 from mapvote.perception.frontend import Frontend, Observation
@@ -38,7 +38,7 @@ def drive(frontend: Frontend, scans: int) -> list[Observation]:
 def localise(lost: tuple[int, ...] = ()) -> Localise:
     def known(scan: Scan, prior: PosePrior | None) -> Fix:
         registration = Registration(SENSOR, np.diag([0.04, 0.01, 0.01, 0, 0, 0]), 1.0, 1.0, 0, True)
-        return Fix(scan, registration, scan.points, scan.stamp_ns * 4 // SECOND not in lost)
+        return Fix(scan, registration, np.zeros(6), scan.stamp_ns * 4 // SECOND not in lost)
 
     return AtOnce(known)
 
@@ -115,7 +115,7 @@ def test_the_window_of_comparison_may_be_another_than_that_of_the_ground() -> No
 class AllMove:
     """Whatever stands above the ground moves."""
 
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
+    def push(self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
         return [obstacle]
 
     def flush(self) -> list[Bool]:

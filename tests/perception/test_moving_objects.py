@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from mapvote.config import MovingSettings, VotingSettings
-from mapvote.core.geometry import turn
+from mapvote.core.geometry import rows_from, turn
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F32, F64, U16, Bool
@@ -68,20 +68,20 @@ class Street:
     def __init__(self, sensor: Sensor, rate_hz: float, seconds: float, movers: list[tuple[Box, float]]) -> None:
         rng = np.random.default_rng(1)
         fixed = WALLS + PARKED + POLES
-        self.scans: list[tuple[F64, F64, Bool, int]] = []
+        self.scans: list[tuple[F32, F64, Bool, int]] = []
         self.truth: list[Bool] = []
         for t in np.arange(0.0, seconds, 1.0 / rate_hz):
             origin = np.array([10.0 * t - 10.0, 0.0, LIDAR_HEIGHT])
             now = [(x0 + v * t, y0, x1 + v * t, y1, top) for (x0, y0, x1, y1, top), v in movers]
             points, which = cast(sensor, origin, fixed + now, rng)
-            self.scans.append((points, origin, points[:, 2] > 0.3, round(t * 1e9)))
+            self.scans.append((rows_from(points, origin), origin, points[:, 2] > 0.3, round(t * 1e9)))
             self.truth.append(which >= len(fixed))
 
     def run(self, sensor: Sensor, settings: MovingSettings, movers: Movers = MOVERS) -> list[Bool]:
         moving = MovingFilter(sensor, settings, movers)
         masks = []
-        for points, origin, obstacle, stamp_ns in self.scans:
-            masks += moving.push(points, origin, obstacle, stamp_ns)
+        for rows, origin, obstacle, stamp_ns in self.scans:
+            masks += moving.push(rows, origin, obstacle, stamp_ns)
         return masks + moving.flush()
 
     def score(self, masks: list[Bool]) -> tuple[float, float]:
@@ -130,8 +130,8 @@ def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: f
     corners = np.column_stack([grid.x0 + CELL_SIZE * cols, grid.y0 + CELL_SIZE * rows, np.ones(4)])
     origin = np.array([x, x, LIDAR_HEIGHT])
     assert np.linalg.norm(corners - origin, axis=1).max() > 56.5
-    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, MOVERS.reach_m, CELL_SIZE)
-    assert (voxel_of >= 0).all()
+    chosen, _, _ = voxels(rows_from(corners, origin), np.ones(4, np.bool_), origin, MOVERS.reach_m, CELL_SIZE)
+    assert chosen.tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("waiting", [[], [((6.0, -4.0, 10.4, -2.2, 1.5), 0.0)]])
@@ -148,8 +148,8 @@ def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() 
     whole = street.run(sensor, settings)
     moving = MovingFilter(sensor, settings)
     decided = 0
-    for newest, (points, origin, obstacle, stamp_ns) in enumerate(street.scans):
-        for mask in moving.push(points, origin, obstacle, stamp_ns):
+    for newest, (rows, origin, obstacle, stamp_ns) in enumerate(street.scans):
+        for mask in moving.push(rows, origin, obstacle, stamp_ns):
             assert newest - decided <= 5
             np.testing.assert_array_equal(mask, whole[decided])
             decided += 1
@@ -172,7 +172,7 @@ def test_only_obstacle_points_are_called_moving_and_an_empty_scan_is_no_trouble(
     sensor = coarse("hdl32e")
     street = Street(sensor, 10.0, 2.0, [ONCOMING])
     _, origin, _, stamp_ns = street.scans[7]
-    street.scans[7] = (np.zeros((0, 3)), origin, np.zeros(0, dtype=bool), stamp_ns)
+    street.scans[7] = (np.zeros((3, 0), np.float32), origin, np.zeros(0, dtype=bool), stamp_ns)
     masks = street.run(sensor, MovingSettings())
     assert masks[7].shape == (0,)
     assert not any((masks[i] & ~street.scans[i][2]).any() for i in range(len(street.scans)))
@@ -203,7 +203,9 @@ def test_cells_move_by_components_as_scipy_labels_them(seed: int) -> None:
         total, moving = np.bincount(label, n_seen), np.bincount(label, n_brief)
         moves |= ((moving >= 4) & (moving >= share * total))[label] & (label > 0)
         wanted = ~moves & (2 * n_brief >= n_seen)
-    np.testing.assert_array_equal(moving_components(place, SIDE, seen, brief, 4, 0.5, 0.6), moves[of])
+    plane = np.full((SIDE, SIDE), -1, np.int32)
+    np.testing.assert_array_equal(moving_components(place, plane, seen, brief, 4, 0.5, 0.6), moves[of])
+    assert (plane == -1).all()
     assert 0 < moves.sum() < len(moves)
 
 
@@ -212,16 +214,16 @@ def test_voxels_are_numbered_by_their_first_points_however_many_there_are(count:
     """The last has more than the table that is tried first holds."""
     rng = np.random.default_rng(count)
     origin = np.array([500.0, -300.0, 8.0])
-    points, obstacle = origin + rng.uniform(-12.0, 12.0, (3 * count, 3)), rng.random(3 * count) < 0.7
-    voxel_of, samples = voxels(points, obstacle, origin, 11.0, 0.3)
+    rows, obstacle = rng.uniform(-12.0, 12.0, (3, 3 * count)).astype(np.float32), rng.random(3 * count) < 0.7
+    points = rows.T + origin
+    found, voxel_of, samples = voxels(rows, obstacle, origin, 11.0, 0.3)
     chosen = np.flatnonzero(obstacle & (np.hypot(*(points - origin)[:, :2].T) <= 11.0))
     _, at, number = np.unique(np.floor(points[chosen] / 0.3), axis=0, return_index=True, return_inverse=True)
     in_order = np.argsort(at)
-    np.testing.assert_array_equal(samples, points[chosen[at[in_order]]])
-    assert count < 1000 or len(samples) > 8192
-    expected = np.full(len(points), -1)
-    expected[chosen] = np.argsort(in_order)[number.ravel()]
-    np.testing.assert_array_equal(voxel_of, expected)
+    np.testing.assert_array_equal(samples, rows[:, chosen[at[in_order]]])
+    assert count < 1000 or samples.shape[1] > 8192
+    np.testing.assert_array_equal(found, chosen)
+    np.testing.assert_array_equal(voxel_of, np.argsort(in_order)[number.ravel()])
 
 
 PIXELS = Pixels(90, 60, np.float32(-0.6), np.float32(50.0))
@@ -277,7 +279,7 @@ def test_an_image_holds_the_nearest_return_of_each_direction_and_of_those_beside
     points = origin + rng.normal(0.0, 1.0, (3000, 3)) * [30.0, 30.0, 3.0]
     points[:5] = [[0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [500.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
     points[:5] += origin
-    np.testing.assert_array_equal(range_image(points, origin, PIXELS), plain_image(points, origin))
+    np.testing.assert_array_equal(range_image(rows_from(points, origin), PIXELS), plain_image(points, origin))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -290,7 +292,7 @@ def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
     for _ in range(5):
         sensor = rng.normal(0.0, 2.0, 3)
         seen = sensor + rng.normal(0.0, 1.0, (4000, 3)) * [15.0, 15.0, 2.0]
-        image = range_image(seen, sensor, PIXELS)
+        image = range_image(rows_from(seen, sensor), PIXELS)
         rule = MARGIN_M, HEIGHT_M, ENOUGH
         n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
         some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])

@@ -22,7 +22,8 @@ from mapvote.formats import open_drive
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.matching.prepare import deskew, motion_at
 from mapvote.perception.fans import FANS, Rays, follow_rays
-from mapvote.perception.raycast import CLEARANCE_M, SKY_RULE, SKY_SECTORS, Sight, Sky, cast_rays, find_obstacles
+from mapvote.perception.placement import find_obstacles
+from mapvote.perception.raycast import CLEARANCE_M, SKY_RULE, SKY_SECTORS, Sight, Sky, cast_rays
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.scenario import load_scenario
@@ -77,7 +78,7 @@ def test_passed_words_agree_with_a_brute_force_walk_in_3d(seed: int, n: int, hil
     reach = rng.uniform(0.8, 15.0, n)
     flat = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * reach[:, None]
     points = origin + np.column_stack([flat, reach * np.tan(rng.uniform(-0.5, 0.5, n))])
-    view = cast_rays(points, origin, np.ones(n, bool), np.zeros(n, bool), reference)
+    view = cast_rays(rows_from(points, origin), origin, np.ones(n, bool), np.zeros(n, bool), reference)
     surely, possibly = brute_passed(points, origin, reference)
     assert not (view.passed & ~possibly).any(), "a voxel was called passed that no ray came near"
     assert not (surely & ~view.passed).any(), "a voxel was missed that a ray went through"
@@ -92,7 +93,7 @@ def test_first_hit_sees_up_to_the_nearest_obstacle_and_farthest_return_beyond_it
     near, far = rng.uniform(1.0, 4.0), rng.uniform(5.0, 8.0)
     direction = np.array([np.cos(angle), np.sin(angle)])
     points = np.array([[*(near * direction), 1.2], [*(far * direction), 2.4]])  # a fence, and a wall seen above it
-    view = cast_rays(points, origin, np.array([True, True]), np.zeros(2, bool), reference)
+    view = cast_rays(rows_from(points, origin), origin, np.array([True, True]), np.zeros(2, bool), reference)
     grid = reference.grid
 
     def sight(distance: float) -> int:
@@ -109,7 +110,7 @@ def test_a_moving_object_occludes_but_does_not_occupy() -> None:
     reference, origin = flat_reference(), np.array([0.0, 0.0, 1.8])
     points = np.array([[3.0, 0.0, 1.0], [3.0, 0.001, 1.1], [6.0, 0.0, 0.0]])
     moving = np.array([True, True, False])
-    view = cast_rays(points, origin, np.array([True, True, False]), moving, reference)
+    view = cast_rays(rows_from(points, origin), origin, np.array([True, True, False]), moving, reference)
     assert not view.counts.any()
     assert not view.hit.any()
     rows, cols, _ = reference.grid.indices_of(np.array([[4.5, 0.0], [2.0, 0.0]]))
@@ -147,7 +148,7 @@ def wide_reference() -> Reference:
 def test_a_ray_along_an_axis_passes_the_cells_of_one_row_or_column_and_no_other(way: tuple[int, int]) -> None:
     reference, origin = wide_reference(), np.array([0.15, 0.15, 0.75])
     end = origin + 6.09 * np.array([*way, 0.0])
-    view = cast_rays(end[None], origin, np.array([True]), np.array([False]), reference)
+    view = cast_rays(rows_from(end[None], origin), origin, np.array([True]), np.array([False]), reference)
     middle = reference.grid.rows // 2
     cells = np.argwhere(view.passed) - middle
     # the last 0.45 m before the hit prove nothing: 5.64 m are 18.8 cells, and the sensor is in the middle of one
@@ -162,20 +163,32 @@ def test_a_ray_along_an_axis_passes_the_cells_of_one_row_or_column_and_no_other(
 def test_points_of_a_cell_are_counted_and_marked_at_their_heights() -> None:
     reference = flat_reference()
     points = np.array([[3.0, 3.0, 0.4], [3.02, 3.05, 0.5], [3.0, 3.0, 1.0], [3.0, 3.0, 30.0], [-3.0, 3.0, 0.7]])
-    view = cast_rays(points, np.array([0.0, 0.0, 1.8]), np.ones(5, bool), np.array([0, 0, 0, 0, 1], bool), reference)
+    view = cast_rays(
+        rows_from(points, np.array([0.0, 0.0, 1.8])),
+        np.array([0.0, 0.0, 1.8]),
+        np.ones(5, bool),
+        np.array([0, 0, 0, 0, 1], bool),
+        reference,
+    )
     rows, cols, _ = reference.grid.indices_of(points)
     assert view.counts[rows[0], cols[0]] == 4
     assert int(view.hit[rows[0], cols[0]]) == 0b1010 | 1 << 63, "and whatever is higher than a word in its last bit"
     assert view.counts.sum() == 4
     corner = np.array([[reference.grid.x0 + 0.1, reference.grid.y0 + 0.1, 0.7]])
-    at_corner = cast_rays(corner, np.array([0.0, 0.0, 1.8]), np.ones(1, bool), np.zeros(1, bool), reference)
+    at_corner = cast_rays(
+        rows_from(corner, np.array([0.0, 0.0, 1.8])),
+        np.array([0.0, 0.0, 1.8]),
+        np.ones(1, bool),
+        np.zeros(1, bool),
+        reference,
+    )
     assert (at_corner.counts[0, 0], at_corner.hit[0, 0]) == (1, 0b100), "the window's first cell, too"
 
 
 def test_points_in_the_sensors_own_cell_prove_nothing() -> None:
     origin = np.array([0.2, 0.05, 1.8])
     near = origin + np.array([[0.29, 0.0, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, -1.8]])
-    view = cast_rays(near, origin, np.ones(3, bool), np.zeros(3, bool), flat_reference())
+    view = cast_rays(rows_from(near, origin), origin, np.ones(3, bool), np.zeros(3, bool), flat_reference())
     assert not view.passed.any()
     assert not view.sight.any()
 
@@ -185,7 +198,9 @@ def test_a_ray_goes_on_over_what_is_below_the_window_and_above_a_word() -> None:
     ground = np.zeros((SIDE, SIDE))
     ground[:, 35:40], ground[:, 45:50] = -6.0, 25.0
     reference, origin = flat_reference(ground), np.array([0.0, 0.0, 1.75])
-    view = cast_rays(np.array([[8.0, 0.0, 1.75]]), origin, np.array([True]), np.array([False]), reference)
+    view = cast_rays(
+        rows_from(np.array([[8.0, 0.0, 1.75]]), origin), origin, np.array([True]), np.array([False]), reference
+    )
     row = 30
     assert set(view.passed[row, 35:40].tolist()) == {1 << 25}, "5.75 + 0.25 voxels of 0.3 m above 20 layers down"
     assert not view.passed[row, 45:50].any()
@@ -197,8 +212,8 @@ def test_without_sight_the_same_voxels_are_passed() -> None:
     rng, reference, origin = np.random.default_rng(4), wide_reference(), np.array([0.1, -0.2, 1.8])
     points = origin + rng.normal(size=(4000, 3)) * [20.0, 20.0, 1.0]
     mask, none = points[:, 2] > 0.3, np.zeros(len(points), bool)
-    with_sight = cast_rays(points, origin, mask, none, reference)
-    without = cast_rays(points, origin, mask, none, reference, with_sight=False)
+    with_sight = cast_rays(rows_from(points, origin), origin, mask, none, reference)
+    without = cast_rays(rows_from(points, origin), origin, mask, none, reference, with_sight=False)
     np.testing.assert_array_equal(with_sight.passed, without.passed)
     assert with_sight.sight.any()
     assert without.sight.size == 0

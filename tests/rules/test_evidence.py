@@ -13,12 +13,14 @@ from scipy import ndimage
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.core.columns import TOP_BIT
+from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I32, U64, Bool, CellState, Reference
 from mapvote.perception.frontend import Observation, PlacedScan
-from mapvote.perception.raycast import ScanView, find_obstacles
+from mapvote.perception.placement import find_obstacles
+from mapvote.perception.raycast import ScanView
 from mapvote.rules.evidence import (
     CROSSED,
     HIT,
@@ -32,7 +34,7 @@ from mapvote.rules.evidence import (
     free_words,
     judge_window,
     least_passed,
-    mark_near,
+    near_hits,
     weigh_voxels,
 )
 from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, count_of
@@ -55,16 +57,6 @@ def seen_from(point_map: PointMap, points: F64, seed: int) -> Observation:
     some |= rng.integers(0, 2**63, seen.view.passed.shape, dtype=np.uint64)
     seen.view.passed[:] = np.where(rng.random(some.shape) < 0.3, np.uint64(0), some)
     return seen
-
-
-def near_hits(seen: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """(near, apart) of a scan: (rows, cols) words each."""
-    here, scan, grid = seen.reference, seen.scan, seen.view.grid
-    near, apart = np.zeros((2, *grid.shape), np.uint64)
-    still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
-    reach = SURFACE_RULE.hit_reach_m / CELL_SIZE
-    mark_near(scan.points_map, scan.cell, still, here.base, here.occupied, corner, reach, near, apart)
-    return near, apart
 
 
 def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool, bool]:
@@ -182,7 +174,7 @@ def bare_scan(points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied
     reference = Reference(grid, ground_z, base, occupied, counts, none, -none, None)
     obstacle, cell = find_obstacles(points, reference)
     up = np.array([0.0, 0.0, 1.0])
-    scan = PlacedScan(0, points, np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
+    scan = PlacedScan(0, rows_from(points, np.zeros(3)), np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
     view = ScanView(grid, counts, words, words, np.zeros((0, 0), np.uint8))
     return Observation(scan, moving, view, reference)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hand_made import make_map, make_tile, wall
 from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import below_top, span_of
-from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.geometry import from_xyz_rpy, rows_from
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
@@ -20,7 +20,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.perception.frontend import Observation, PlacedScan
-from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
+from mapvote.perception.placement import find_obstacles
+from mapvote.perception.raycast import ScanView, Sight, cast_rays
 from mapvote.rules.paper import (
     BEGINS_ABOVE,
     N_WORDS,
@@ -215,9 +216,9 @@ def observed() -> tuple[PointMap, Observation]:
     points = np.concatenate([np.column_stack([np.tile(cell, (8, 1)), heights]) for cell in cells])
     obstacle, cell = find_obstacles(points, reference)
     moving = np.zeros(len(points), dtype=np.bool_)
-    view = cast_rays(points, origin, obstacle, moving, reference)
+    view = cast_rays(rows_from(points, origin), origin, obstacle, moving, reference)
     up = np.array([0.0, 0.0, 1.0])
-    placed = PlacedScan(0, points, origin, up, 0.01, reference, reference, obstacle, cell)
+    placed = PlacedScan(0, rows_from(points, origin), origin, up, 0.01, reference, reference, obstacle, cell)
     return point_map, Observation(placed, moving, view, reference)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
 from mapvote.rules.voter import REACH_M, NewPoints, NewPointsRule, _beyond, points_in, select
@@ -17,7 +18,7 @@ LATTICE = Lattice()
 @given(st.integers(0, 2**32 - 1))
 def test_points_are_taken_from_the_voxels_of_a_word_and_of_what_stands_still(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-3.0, 25.0, (60, 3))
+    points = rng.uniform(-3.0, 25.0, (60, 3)).astype(np.float32).astype(np.float64)
     cell = rng.integers(-1, 4, 60).astype(np.int32)
     stationary = rng.random(60) < 0.7
     words = rng.integers(0, 2**63, 4).astype(np.uint64)
@@ -25,7 +26,7 @@ def test_points_are_taken_from_the_voxels_of_a_word_and_of_what_stands_still(see
     base = rng.integers(-5, 5, 4).astype(np.int32)
     moving = rng.random(60) < 0.1
     found = np.zeros(60, dtype=np.bool_)
-    found[select(points, cell, stationary, moving, words, base)] = True
+    found[select(points[:, 2].astype(np.float32), 0.0, cell, stationary, moving, words, base)] = True
     for i in range(60):
         if cell[i] < 0 or moving[i] or not stationary[i]:
             assert not found[i]
@@ -89,7 +90,9 @@ def test_points_beyond_the_local_grid_are_new_where_they_are_near_and_unmapped()
     occupied = rng.integers(0, 2**63, (300, 300), dtype=np.uint64)
     origin = np.array([20.0, 30.0, 1.8])
     found = np.empty(len(points), np.int64)
-    found = found[: _beyond(points, cell, origin, ground_z, base, occupied, (0.0, 0.0), (0, 0), found)]
+    found = found[
+        : _beyond(rows_from(points, origin), cell, origin, ground_z, base, occupied, (0.0, 0.0), (0, 0), found)
+    ]
     cols, rows = np.floor(points[:, :2] / CELL_SIZE).astype(int).T
     inside = (rows >= 0) & (rows < 300) & (cols >= 0) & (cols < 300)
     rows, cols, z = np.clip(rows, 0, 299), np.clip(cols, 0, 299), points[:, 2]

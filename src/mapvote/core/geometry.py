@@ -71,46 +71,57 @@ def hat(v: ArrayLike) -> F64:
 
 def exp(xi: ArrayLike) -> F64:
     """SE(3) exponential of a (6,) tangent vector (Barfoot 8.33)."""
-    xi = np.asarray(xi, dtype=np.float64)
-    rho = xi[:3]
-    phi = xi[3:]
-    angle = float(np.linalg.norm(phi))
-    W = hat(phi)
-    if angle < 1e-8:
-        R = np.eye(3) + W + 0.5 * W @ W
-        V = np.eye(3) + 0.5 * W
-    else:
-        s = np.sin(angle) / angle
-        half_chord = 2.0 * (np.sin(0.5 * angle) / angle) ** 2  # 1 - cos cancels at small angles
-        R = np.eye(3) + s * W + half_chord * W @ W
-        V = np.eye(3) + half_chord * W + ((1 - s) / angle**2) * W @ W
+    rho, phi = np.asarray(xi, dtype=np.float64).reshape(2, 3).tolist()
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = math.sqrt(angle2)
+    small = angle < 1e-8
+    s = 1.0 if small else math.sin(angle) / angle
+    half_chord = 0.5 if small else 2.0 * (math.sin(0.5 * angle) / angle) ** 2  # 1 - cos cancels at small angles
+    rest = 0.0 if small else (1.0 - s) / angle2
     T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = V @ rho
+    # The square of the cross-product matrix of v is v v^T - v^2.
+    (a, b, c), m = phi, 1.0 - half_chord * angle2
+    T[:3, :3] = (
+        (m + half_chord * a * a, half_chord * a * b - s * c, half_chord * a * c + s * b),
+        (half_chord * a * b + s * c, m + half_chord * b * b, half_chord * b * c - s * a),
+        (half_chord * a * c - s * b, half_chord * b * c + s * a, m + half_chord * c * c),
+    )
+    T[:3, 3] = _by_turn(rho, phi, half_chord, rest)
     return T
+
+
+def _by_turn(v: list[float], phi: list[float], first: float, second: float) -> tuple[float, float, float]:
+    """(1 + first W + second W^2) v, W the cross-product matrix of phi. Plain numbers: ten small arrays take ten times
+    as long."""
+    x, y, z = v
+    a, b, c = phi
+    along = a * x + b * y + c * z
+    rest = 1.0 - second * (a * a + b * b + c * c)
+    return (
+        rest * x + first * (b * z - c * y) + second * along * a,
+        rest * y + first * (c * x - a * z) + second * along * b,
+        rest * z + first * (a * y - b * x) + second * along * c,
+    )
 
 
 def log(T: F64) -> F64:
     """The (6,) tangent vector of T; inverse of :func:`exp` for rotations below pi."""
-    R = T[:3, :3]
-    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle = float(np.arctan2(0.5 * np.linalg.norm(vee), 0.5 * (np.trace(R) - 1.0)))
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = np.asarray(T, dtype=np.float64).tolist()
+    vee = [r21 - r12, r02 - r20, r10 - r01]
+    length = math.sqrt(vee[0] * vee[0] + vee[1] * vee[1] + vee[2] * vee[2])
+    angle = math.atan2(0.5 * length, 0.5 * (r00 + r11 + r22 - 1.0))
     if angle < 1e-8:
-        phi = 0.5 * vee
-        V_inv = np.eye(3) - 0.5 * hat(phi)
+        phi = [0.5 * v for v in vee]
+        return np.array([*_by_turn([x, y, z], phi, -0.5, 0.0), *phi])
+    if np.pi - angle < 1e-6:  # vee vanishes: take the axis from R + I instead
+        S = 0.5 * (T[:3, :3] + np.eye(3))
+        k = int(np.argmax(np.diag(S)))
+        axis = S[:, k] / np.sqrt(S[k, k])
+        phi = (angle * (axis if float(axis @ vee) >= 0 else -axis)).tolist()
     else:
-        if np.pi - angle < 1e-6:  # vee vanishes: take the axis from R + I instead
-            S = 0.5 * (R + np.eye(3))
-            k = int(np.argmax(np.diag(S)))
-            axis = S[:, k] / np.sqrt(S[k, k])
-            axis = axis if float(axis @ vee) >= 0 else -axis
-        else:
-            axis = vee / np.linalg.norm(vee)
-        phi = angle * axis
-        half = 0.5 * angle
-        W = hat(phi)
-        V_inv = np.eye(3) - 0.5 * W + (1 - half / np.tan(half)) / angle**2 * W @ W
-    return np.concatenate([V_inv @ T[:3, 3], phi])
+        phi = [v * angle / length for v in vee]
+    half = 0.5 * angle
+    return np.array([*_by_turn([x, y, z], phi, -0.5, (1.0 - half / math.tan(half)) / angle**2), *phi])
 
 
 def interpolate(T_0: F64, T_1: F64, alpha: float) -> F64:

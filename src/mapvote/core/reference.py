@@ -114,9 +114,10 @@ class LocalMap:
 
 
 def _cut(outer: Reference, window: Grid) -> Reference:
-    """The planes of ``outer`` over ``window``, which lies inside it: views, but for ``base``, whose cells points and
-    rays find by one number."""
+    """The planes of ``outer`` over ``window``, which lies inside it: views, but for those whose cells points and rays
+    find by one number."""
     cut = window.slices_in(outer.grid)
     planes = {f.name: getattr(outer, f.name) for f in fields(Reference) if f.name != "grid"}
     views: dict[str, Any] = {name: None if plane is None else plane[cut] for name, plane in planes.items()}
-    return Reference(window, **views | {"base": np.ascontiguousarray(views["base"])})
+    by_number = {name: np.ascontiguousarray(views[name]) for name in ("ground_z", "base")}
+    return Reference(window, **views | by_number)

@@ -246,16 +246,18 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 @kernel
 def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) -> None:
-    """The key (m,) of every ``every``-th of the points (n, 3), in voxels of side ``size``."""
+    """The key (m,) of every ``every``-th of the points (3 n,), in voxels of side ``size``."""
     scale = 1.0 / size
     middle = float(_OFFSET)
-    step = np.uint64(every)
+    step = np.uint64(3 * every)
+    one = np.uint64(1)
+    two = np.uint64(2)
     for j in range(np.uint64(0), np.uint64(len(keys))):  # int32 vectorises, and holds what is within reach
         i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
-        ix = np.int32(points[i, 0] * scale + middle)
-        iy = np.int32(points[i, 1] * scale + middle)
-        keys[j] = packed_key(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
+        ix = np.int32(points[i] * scale + middle)
+        iy = np.int32(points[i + one] * scale + middle)
+        keys[j] = packed_key(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i + two] * scale + middle)))
 
 
 def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
@@ -266,5 +268,5 @@ def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
     """
     cloud = read_only(np.ascontiguousarray(points, dtype=np.float32))
     keys = np.empty((len(cloud) + every - 1) // every, dtype=np.int64)
-    _thin_keys(cloud, every, size, keys)
+    _thin_keys(cloud.reshape(-1), every, size, keys)
     return first_of_each(keys, 1 << 15) * every

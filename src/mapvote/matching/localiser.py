@@ -24,7 +24,7 @@ from mapvote.matching.matcher import map_around
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
-from mapvote.matching.prepare import Sample, deskew, motion_at, solid_sample, thin_for_levels, twist_between
+from mapvote.matching.prepare import Sample, deskew, motion_at, solid_of, thin_for_levels, twist_between
 from mapvote.matching.prior_frame import PriorFrame, distance_to
 
 
@@ -140,7 +140,7 @@ class Localiser:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
             nowhere = Registration(np.eye(4), np.eye(6), 0.0, 0.0, 0, False)
-            self._waiting.append(_Waiting(Fix(scan, nowhere, scan.points, False), None, prior, nowhere=True))
+            self._waiting.append(_Waiting(Fix(scan, nowhere, np.zeros(6), False), None, prior, nowhere=True))
             return self._decide(max(0, len(self._waiting) - self.numbers.wait_scans), False)
         believed = None
         if prior is not None:
@@ -313,7 +313,7 @@ class Localiser:
         fix = self._waiting[-1].fix
         T_map_lidar = fix.registration.T_map_lidar
         around = self.map_around(T_map_lidar[:3, 3])
-        few = solid_sample(fix.points, LEVELS[-1].points_m)
+        few = solid_of(fix.scan, fix.twist, LEVELS[-1].points_m)
         if self._confirmed:  # a track that held is held again at less cost; where it is doubted, nothing is saved
             verdict = self.judge.judge(around, few, T_map_lidar, quick=True)
             if self.judge.holds(verdict):
@@ -341,9 +341,8 @@ class Localiser:
     def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
         before = waiting.fix.registration.T_map_lidar
         around = self.map_around(guess[:3, 3])
-        points = deskew(waiting.fix.scan, twist)
-        result = around.refine(thin_for_levels(points), guess)
-        waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
+        result = around.refine(thin_for_levels(deskew(waiting.fix.scan, twist)), guess)
+        waiting.fix = Fix(waiting.fix.scan, result, twist, self.tracker.is_sound(result))
         waiting.nowhere = False
         if waiting.misfit is not None:
             waiting.misfit = waiting.misfit + result.T_map_lidar[:3, 3] - before[:3, 3]
@@ -393,7 +392,7 @@ class GivenPoses:
         i = self._poses[scan.stamp_ns]
         twist = motion_at(self._stamps_ns, self._T_map_lidar, i)
         registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
-        return [Fix(scan, registration, deskew(scan, twist), True)]
+        return [Fix(scan, registration, twist, True)]
 
     def flush(self) -> list[Fix]:
         """See :class:`Localise`: nothing waits."""

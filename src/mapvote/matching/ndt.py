@@ -54,7 +54,7 @@ _UNPAIRED = np.int32(-(1 << 30))
 
 
 class Room(NamedTuple):
-    """Buffers of an alignment of n points: an allocation in a kernel takes 50 ms to compile."""
+    """Buffers of an alignment of up to n points: an allocation in a kernel takes 50 ms to compile."""
 
     of: F32
     """(7, 9, n) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its precision xx, xy,
@@ -77,7 +77,7 @@ class Room(NamedTuple):
 
 
 def room_for(n: int) -> Room:
-    """Any number of alignments of n points, one after the other, may use it."""
+    """Any number of alignments of up to n points, one after the other, may use it."""
     return Room(
         np.empty((7, 9, n), np.float32), np.empty((3, n), np.int32), np.zeros(3),
         np.empty(PAIRED_AT_ONCE, np.int64), np.empty((7, PAIRED_AT_ONCE), np.int32),
@@ -442,7 +442,7 @@ def align(
     size = window.size
     has_prior = prior[0, 0] > 0.0
     for r in range(3):
-        for i in range(room.home.shape[1]):
+        for i in range(points.shape[1]):
             room.home[r, i] = _UNPAIRED
         room.origin[r] = T[r, 3]
     for r in range(6):

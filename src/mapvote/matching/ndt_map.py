@@ -61,6 +61,8 @@ class NdtMap:
             NdtGrid(one, window_of(np.round(sides / one.voxel_m).astype(np.int64), np.zeros(3, np.int64), one.voxel_m))
             for one in levels
         ]
+        self._room = room_for(0)
+        """A megabyte that every alignment uses: new memory would be cold."""
         self.recentre(centre)
 
     def recentre(self, centre: F64) -> None:
@@ -114,8 +116,9 @@ class NdtMap:
                 believed = np.ascontiguousarray(prior.T_map_lidar), prior.information
             where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, map_variance
             cloud = clouds[i - len(self.levels)]
-            room = room_for(cloud.shape[1])
-            score, inlier_share, more, converged = align(cloud, T, *where, *believed, room, covariance)
+            if cloud.shape[1] > self._room.home.shape[1]:
+                self._room = room_for(cloud.shape[1] * 5 // 4)
+            score, inlier_share, more, converged = align(cloud, T, *where, *believed, self._room, covariance)
             iterations += more
         return Registration(T, covariance, score, inlier_share, iterations, converged)
 

@@ -59,12 +59,17 @@ class Fix:
 
     scan: Scan
     registration: Registration
-    points: F32
-    """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed."""
+    twist: F64
+    """(6,) motion per second in the lidar frame by which the scan is de-skewed."""
     trusted: bool
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
     prior: PosePrior | None = None
     """The prior in the map's frame, where its own frame had to be learnt."""
+
+    @property
+    def points(self) -> F32:
+        """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed: computed anew."""
+        return deskew(self.scan, self.twist)
 
 
 class Tracker:
@@ -128,7 +133,7 @@ class Tracker:
             self._accept(result.T_map_lidar, scan.stamp_ns, moved, twist)
             rate = self.numbers.memory if self._usual_score else 1.0
             self._usual_score += rate * (result.score - self._usual_score)
-        return Fix(scan, result, deskew(scan, twist), trusted)
+        return Fix(scan, result, twist, trusted)
 
     def _first_level(self, reach: float) -> int:
         """The coarsest level that a guess needs which may be off by ``reach`` metres."""
@@ -155,7 +160,7 @@ class Tracker:
         """Take the first pose as given: where there is no map yet, the first scan makes it."""
         self._accept(T_map_lidar, scan.stamp_ns, self._motion_to(T_map_lidar, scan.stamp_ns), self.twist)
         registration = Registration(T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True)
-        return Fix(scan, registration, deskew(scan, self.twist), True)
+        return Fix(scan, registration, self.twist, True)
 
     def _seed(self, stamp_ns: int, prior: PosePrior | None) -> tuple[F64, float]:
         """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""

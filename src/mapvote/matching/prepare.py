@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapvote.core.geometry import inverse, log
 from mapvote.core.kernel import kernel
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, I64, Scan
+from mapvote.core.types import F32, F64, I64, Scan, read_only
 from mapvote.core.voxels import slot_of, thin, voxel_key
 from mapvote.matching.ndt_voxels import LEVELS
 
@@ -67,21 +67,43 @@ def thinned(points_lidar: F32, numbers: ScanPreparation = SCAN_PREPARATION) -> d
 
 
 @kernel
-def _deskew(points: F32, time_s: F32, v: F32, w: F32, out: F32) -> None:
-    half = np.float32(0.5)
-    for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
+def _deskew(points: F32, time_s: F32, motion: F32, turn: F32, rows: F32) -> None:
+    """:func:`deskew_into` of ``points`` (3 n,): of a width that the compiler knows, so that the loop vectorises.
+    ``motion``: rows of the offset, the velocity and the angular velocity."""
+    v = motion[1, 0], motion[1, 1], motion[1, 2]
+    w = motion[2, 0], motion[2, 1], motion[2, 2]
+    first = rows[0]
+    second = rows[1]
+    third = rows[2]
+    for i in range(np.uint64(0), np.uint64(len(time_s))):  # unsigned: an index that cannot be negative vectorises
+        k = np.uint64(3) * i
         t = time_s[i]
-        x = points[i, 0]
-        y = points[i, 1]
-        z = points[i, 2]
+        x = points[k]
+        y = points[k + np.uint64(1)]
+        z = points[k + np.uint64(2)]
         # exp(t * twist) to second order: a first-order rotation would leave centimetres at 50 m in a bend.
         ux = v[0] + w[1] * z - w[2] * y
         uy = v[1] + w[2] * x - w[0] * z
         uz = v[2] + w[0] * y - w[1] * x
-        h = half * t * t
-        out[i, 0] = x + t * ux + h * (w[1] * uz - w[2] * uy)
-        out[i, 1] = y + t * uy + h * (w[2] * ux - w[0] * uz)
-        out[i, 2] = z + t * uz + h * (w[0] * uy - w[1] * ux)
+        h = np.float32(0.5) * t * t
+        x += t * ux + h * (w[1] * uz - w[2] * uy)
+        y += t * uy + h * (w[2] * ux - w[0] * uz)
+        z += t * uz + h * (w[0] * uy - w[1] * ux)
+        first[i] = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + motion[0, 0]
+        second[i] = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + motion[0, 1]
+        third[i] = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + motion[0, 2]
+
+
+def deskew_into(points: F32, time_s: F32 | None, twist: F64, R: F64, t: F64) -> F32:
+    """(3, n) rows x, y, z of points (n, 3) measured at ``time_s`` (n,) from the stamp, de-skewed as by :func:`deskew`
+    and moved by the rotation R (3, 3), then by t (3,), into another frame. Float32: t is to be short."""
+    if time_s is None:
+        time_s = np.zeros(len(points), np.float32)
+    motion = np.concatenate([t, twist]).astype(np.float32).reshape(3, 3)
+    rows = np.empty((3, len(points)), np.float32)
+    flat = read_only(np.ascontiguousarray(points)).reshape(-1)
+    _deskew(flat, read_only(np.ascontiguousarray(time_s)), motion, R.astype(np.float32), rows)
+    return rows
 
 
 def deskew(scan: Scan, twist: F64) -> F32:
@@ -89,16 +111,14 @@ def deskew(scan: Scan, twist: F64) -> F32:
 
     ``twist`` is (velocity, angular velocity) in the lidar frame. Scans without point times come back as they are.
     """
-    return deskewed(scan.points, scan.time_s, twist)
+    if scan.time_s is None:
+        return scan.points
+    return np.ascontiguousarray(deskewed_rows(scan.points, scan.time_s, twist).T)
 
 
-def deskewed(points: F32, time_s: F32 | None, twist: F64) -> F32:
-    """:func:`deskew` of points (n, 3) measured at ``time_s`` (n,) from the stamp."""
-    if time_s is None:
-        return points
-    out, (v, w) = np.empty_like(points), twist.astype(np.float32).reshape(2, 3)
-    _deskew(points, time_s, v, w, out)
-    return out
+def deskewed_rows(points: F32, time_s: F32 | None, twist: F64) -> F32:
+    """(3, n) :func:`deskew` of points (n, 3) measured at ``time_s`` (n,) from the stamp."""
+    return in_rows(points) if time_s is None else deskew_into(points, time_s, twist, np.eye(3), np.zeros(3))
 
 
 def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64:
@@ -116,22 +136,35 @@ def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
     return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
 
 
-def solid_sample(points_lidar: NDArray[np.floating], size: float, numbers: ScanPreparation = SCAN_PREPARATION) -> F64:
+def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
     """(m, 3) one point in each voxel of side ``size``, without drops in the air.
 
     ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
     """
-    few = points_lidar.take(thin(points_lidar, size), axis=0).astype(np.float64)
-    every = -(-len(points_lidar) // numbers.rays) or 1
+    points = np.ascontiguousarray(points_lidar, dtype=np.float32)
+    return points.take(solid(points, size), axis=0).astype(np.float64)
+
+
+def solid_of(scan: Scan, twist: F64, size: float) -> F64:
+    """:func:`solid_sample` of a scan, de-skewed once it is thinned."""
+    chosen = solid(scan.points, size)
+    time_s = None if scan.time_s is None else scan.time_s.take(chosen)
+    return deskewed_rows(scan.points.take(chosen, axis=0), time_s, twist).T.astype(np.float64, order="C")
+
+
+def solid(points: F32, size: float, numbers: ScanPreparation = SCAN_PREPARATION) -> I64:
+    """(m,) which of the points (n, 3) are a :func:`solid_sample`, ascending."""
+    chosen = thin(points, size)
+    few = points.take(chosen, axis=0).astype(np.float64)
+    every = -(-len(points) // numbers.rays) or 1
     range2 = (few**2).sum(axis=1)
-    rays = -(-len(points_lidar) // every)
+    rays = -(-len(points) // every)
     expected = rays / numbers.solid_angle_sr * numbers.voxel_m**2 / np.maximum(range2, numbers.voxel_m**2)
     table = np.zeros((2, max(1024, 1 << (4 * len(few) - 1).bit_length())), dtype=np.int64)
     hits = np.empty(len(few), dtype=np.int64)
-    points = np.ascontiguousarray(points_lidar, dtype=np.float32)
     far2 = (numbers.reach_m + 2.0 * numbers.voxel_m) ** 2
-    _hits_around(points, every, few, numbers.voxel_m, far2, table[0], table[1], hits)
-    return few[(range2 > numbers.reach_m**2) | (hits > numbers.share * expected)]
+    _hits_around(read_only(points), every, few, numbers.voxel_m, far2, table[0], table[1], hits)
+    return chosen[(range2 > numbers.reach_m**2) | (hits > numbers.share * expected)]
 
 
 @kernel
@@ -170,9 +203,9 @@ class Sample:
 
     def clouds(self, twist: F64) -> list[F32]:
         """(3, m) by level, at the scan's stamp if the sensor's motion per second was ``twist`` (6,)."""
-        clouds = {size: in_rows(deskewed(*part, twist)) for size, part in self._parts.items()}
+        clouds = {size: deskewed_rows(*part, twist) for size, part in self._parts.items()}
         return [clouds[level.points_m] for level in LEVELS]
 
     def coarse(self, twist: F64) -> list[F32]:
         """The clouds of the fewest points at every level: to try many guesses."""
-        return [in_rows(deskewed(*self._parts[max(self._parts)], twist))] * len(LEVELS)
+        return [deskewed_rows(*self._parts[max(self._parts)], twist)] * len(LEVELS)

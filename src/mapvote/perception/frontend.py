@@ -19,16 +19,16 @@ from typing import Protocol
 
 import numpy as np
 
-from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap
 from mapvote.core.points import Fields
 from mapvote.core.record import record
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, PosePrior, Reference, Scan
+from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, PosePrior, Reference, Scan
 from mapvote.matching.localiser import Localise
 from mapvote.matching.odometry import Fix
-from mapvote.perception.raycast import Fired, ScanView, Sky, cast_rays, find_obstacles
+from mapvote.perception.placement import cells_and_obstacles, place_points
+from mapvote.perception.raycast import Fired, ScanView, Sky, cast_rays
 
 
 @record()
@@ -47,7 +47,7 @@ SPREAD = Spread()
 class MoversFilter(Protocol):
     """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
 
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]: ...
+    def push(self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]: ...
 
     def flush(self) -> list[Bool]: ...
 
@@ -135,8 +135,8 @@ class PlacedScan:
 
     index: int
     """Its number in the drive; lost scans count."""
-    points_map: F64
-    """(n, 3) map metres, de-skewed."""
+    rows: F32
+    """(3, n) metres from ``origin_map`` along the map's axes, de-skewed."""
     origin_map: F64
     """(3,) the sensor, map metres."""
     up_map: F64
@@ -158,6 +158,15 @@ class PlacedScan:
     forward_map: F64 = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     """(3,) the sensor's own x axis, in the map's frame."""
 
+    @property
+    def points_map(self) -> F64:
+        """(n, 3) map metres: computed anew."""
+        return self.points_at(np.arange(self.rows.shape[1]))
+
+    def points_at(self, chosen: I64) -> F64:
+        """(m, 3) map metres of the points with these indices (m,)."""
+        return np.ascontiguousarray(self.rows.take(chosen, axis=1).T + self.origin_map)
+
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -176,7 +185,7 @@ class Frontend:
     """One vehicle's sensor on one drive. Memory is bounded: the scans of a second wait, and the map around the vehicle.
 
     ``ground`` separates points from the ground, and is the filter's window; rays are cast in ``compared``, by
-    default the same window, and to its edge only ``with_sight``, which surfaces do not ask for. ``localise`` and
+    default the same window, and hits and sight only ``with_sight``, which surfaces do not ask for. ``localise`` and
     ``movers`` as above, with a state of their own: fresh ones for each drive. ``sensor``: follow its rays without
     return, too.
     """
@@ -252,7 +261,7 @@ class Frontend:
             self._compared = LocalMap(point_map, self._compared.window_m)
         for i, scan in enumerate(self._waiting):
             reference, outer = self._ground.at(scan.origin_map)
-            obstacle, cell = find_obstacles(scan.points_map, reference)
+            cell, obstacle = cells_and_obstacles(scan.rows, scan.origin_map, reference)
             self._waiting[i] = replace(scan, reference=reference, outer=outer, obstacle=obstacle, cell=cell)
 
     def _take(self, fix: Fix) -> list[Observation]:
@@ -268,29 +277,28 @@ class Frontend:
             return []
         out = []
         # The LiDARs of a sweep are placed together, but their rays begin at different places: each is a scan by itself.
-        for k, (part, scan) in enumerate(fix.scan.by_lidar()):
+        for k, (_, scan) in enumerate(fix.scan.by_lidar()):
             with report.timed("ground"):
-                placed = self._place(fix, fix.points[part], scan, index)
+                placed = self._place(fix, scan, index)
             self._waiting.append(placed)
             with report.timed("moving"):
                 stamp_ns = scan.stamp_ns + k
-                decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, stamp_ns)
+                decided = self._movers.push(placed.rows, placed.origin_map, placed.obstacle, stamp_ns)
             out += self._see(decided)
         return out
 
-    def _place(self, fix: Fix, points: F32, scan: Scan, index: int) -> PlacedScan:
-        """``points`` (n, 3) of one LiDAR of the fix, de-skewed, and its ``scan``."""
+    def _place(self, fix: Fix, scan: Scan, index: int) -> PlacedScan:
+        """``scan``: of one LiDAR of the fix."""
         T_map_lidar = fix.registration.T_map_lidar
-        points_map = transform(T_map_lidar, points)
         origin_map = scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
-        obstacle, cell = find_obstacles(points_map, reference)
+        rows, cell, obstacle = place_points(scan, fix.twist, T_map_lidar, origin_map, reference)
         forward_map, _, up_map = T_map_lidar[:3, :3].T
         by_first = scan.origin is None
         return PlacedScan(
             index,
-            points_map,
+            rows,
             origin_map,
             up_map,
             sigma_m,
@@ -318,7 +326,7 @@ class Frontend:
                 if self._sky is not None and scan.by_first:
                     fired = fired._replace(sky=partial(self._sky.rays, scan.up_map, scan.forward_map))
                 view = cast_rays(
-                    scan.points_map,
+                    scan.rows,
                     scan.origin_map,
                     scan.obstacle,
                     moving,

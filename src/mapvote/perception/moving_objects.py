@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapvote.config import MovingSettings
-from mapvote.core.geometry import rows_from, turn
+from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
@@ -132,13 +132,14 @@ def _enter_image(rows: F32, pixels: Pixels, pixel: I32, steps: I32, flat: U16, o
             out[k, s] = min(flat[middle + s], min(flat[left + s], flat[right + s]))
 
 
-def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
-    """(turns, slopes) nearest horizontal range among the returns (n, 3) in each direction and to its left and right."""
-    n = len(points)
+def range_image(rows: F32, pixels: Pixels) -> U16:
+    """(turns, slopes) nearest horizontal range among the returns ``rows`` (3, n), metres from the sensor, in each
+    direction and to its left and right."""
+    n = rows.shape[1]
     size = pixels.turns * pixels.slopes
     out = np.empty((pixels.turns, pixels.slopes), np.uint16)
     flat = np.empty(size + 1, np.uint16)
-    _enter_image(rows_from(points, origin), pixels, np.empty(n, np.int32), np.empty(n, np.int32), flat, out)
+    _enter_image(rows, pixels, np.empty(n, np.int32), np.empty(n, np.int32), flat, out)
     return out
 
 
@@ -299,10 +300,14 @@ class _Scan:
     origin_map: F64
     nearest: U16
     """(azimuths, slopes) horizontal range of the nearest return around each direction, see ``range_image``."""
+    points: int
+    """How many points it has."""
+    chosen: I32
+    """(k,) those that can be moving: not ground, within reach."""
     voxel_of: I32
-    """(n,) index into ``samples`` of each point, -1 for points that cannot be moving (ground, out of reach)."""
-    samples: F64
-    """(m, 3) one obstacle point per voxel, map metres."""
+    """(k,) index into ``samples`` of each of them."""
+    samples: F32
+    """(3, m) one obstacle point per voxel, metres from ``origin_map``."""
 
 
 class MovingFilter:
@@ -320,25 +325,28 @@ class MovingFilter:
         turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, movers.pixel_deg))
         slopes = int(np.ceil((slope_max - slope_min) * per_slope))
         self._pixels = Pixels(turns, slopes, np.float32(slope_min), np.float32(per_slope))
+        self._half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
+        """Cells from the sensor to the sides of the square in which voxels are grouped, which ``_plane`` is of."""
+        self._plane = np.full((2 * self._half + 1,) * 2, -1, dtype=np.int32)
         self._window: deque[_Scan] = deque()
         self._waiting = 0
         """How many of the window's youngest scans are undecided."""
 
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
+    def push(self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
         """Take one scan; return what can now be decided: the masks of moving points (n,) of the oldest scans that
         were still undecided, in their order.
 
-        ``points_map`` (n, 3) and the sensor's ``origin_map`` (3,) in map metres; ``obstacle`` (n,) says which points
-        stand more than 0.3 m above the ground: only they can be called moving, but all of them prove what is free.
+        ``rows`` (3, n) metres from the sensor, which is at ``origin_map`` (3,), map metres, along the map's axes;
+        ``obstacle`` (n,) says which points stand more than 0.3 m above the ground: only they can be called moving, but
+        all of them prove what is free.
         Raises ValueError if stamps do not increase.
         """
         if self._window and stamp_ns <= self._window[-1].stamp_ns:
             raise ValueError(f"stamps must increase: {stamp_ns} after {self._window[-1].stamp_ns}")
-        points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
-        nearest = range_image(points, origin, self._pixels)
-        voxel_of, samples = voxels(points, obstacle, origin, self.movers.reach_m, CELL_SIZE)
-        self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, samples))
+        nearest = range_image(rows, self._pixels)
+        chosen, voxel_of, samples = voxels(rows, obstacle, origin, self.movers.reach_m, CELL_SIZE)
+        self._window.append(_Scan(stamp_ns, origin, nearest, len(obstacle), chosen, voxel_of, samples))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
@@ -364,9 +372,9 @@ class MovingFilter:
         """The mask of the window's scan ``at``, from the other scans of the window."""
         scan = self._window[at]
         movers = self.movers
-        m = left = len(scan.samples)
+        m = left = scan.samples.shape[1]
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
-        x, y, z = rows_from(scan.samples, scan.origin_map)
+        x, y, z = scan.samples.copy()
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         sought = room_to_look(m)
         # Each of the other scans counts what it saw at the samples.
@@ -374,20 +382,18 @@ class MovingFilter:
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = movers.margin_m, movers.height_m, movers.enough
             left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
-        # A voxel is brief if rays passed it on both sides and most scans that could see it saw through it.
-        free = counts.free
-        total = counts.free + counts.hit
-        brief = (counts.sides == BOTH_SIDES) & (free >= movers.min_free) & (free >= movers.free_share * total)
-        # The samples' cells in a square around the sensor.
-        half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
-        lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        cols, rows = np.floor(scan.samples[:, :2].T / CELL_SIZE).astype(np.int64) - lowest[:, None]
-        side = 2 * half + 1
+        # Which voxels were brief, and the cell of each in a square around the sensor.
+        place = np.empty(m, np.int64)
+        seen_often = np.empty(m, np.bool_)
+        brief = np.empty(m, np.bool_)
+        bounds = movers.min_free, movers.free_share
+        _weigh(scan.samples, scan.origin_map, self._half, counts, bounds, place, seen_often, brief)
         # Connected cells move together.
         shares = movers.share_whole, movers.share_part
-        seen_often = total >= movers.min_free
-        moves = moving_components(rows * side + cols, side, seen_often, brief, movers.min_voxels, *shares)
-        return np.append(moves, False)[scan.voxel_of]  # -1: points that cannot be moving
+        moves = moving_components(place, self._plane, seen_often, brief, movers.min_voxels, *shares)
+        moving = np.zeros(scan.points, np.bool_)
+        moving[scan.chosen[moves[scan.voxel_of]]] = True
+        return moving
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.
@@ -408,39 +414,55 @@ def _spread(scans: list[_Scan], count: int) -> list[_Scan]:
 
 
 @kernel
-def _choose(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float, chosen: I32, keys: I64) -> int:
-    """How many points (n, 3) are obstacles within ``reach``: which, and the keys of their voxels, into the first of
-    ``chosen`` (n,) and ``keys`` (n,)."""
-    count = np.uint64(0)
-    for i in range(np.uint64(0), np.uint64(len(points))):  # what is not chosen is written over: no branch to predict
-        x = points[i, 0] - origin[0]
-        y = points[i, 1] - origin[1]
-        chosen[count] = i
-        count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach * reach) else np.uint64(0)
-    for k in range(count):
-        p = np.uint64(chosen[k])
-        keys[k] = voxel_key(points[p, 0], points[p, 1], points[p, 2], cell)
-    return int(count)
+def _weigh(
+    samples: F32, origin: F64, half: int, counts: LookCounts, bounds: tuple[int, float], place: I64, seen: Bool,
+    brief: Bool,
+) -> None:  # fmt: skip
+    """For each of ``samples`` (3, m) from ``origin``: its cell in the square of ``half`` cells to each side, whether
+    enough scans could see it, and whether it is brief: rays passed it on both sides, and most scans that could see it
+    saw through it. ``bounds``: min_free and free_share."""
+    min_free, free_share = bounds
+    side = 2 * half + 1
+    col0 = np.int64(np.floor(origin[0] / CELL_SIZE)) - half
+    row0 = np.int64(np.floor(origin[1] / CELL_SIZE)) - half
+    for i in range(np.uint64(0), np.uint64(len(place))):
+        col = np.int64(np.floor((np.float64(samples[0, i]) + origin[0]) / CELL_SIZE)) - col0
+        row = np.int64(np.floor((np.float64(samples[1, i]) + origin[1]) / CELL_SIZE)) - row0
+        place[i] = row * side + col
+        free = counts.free[i]
+        total = free + counts.hit[i]
+        seen[i] = total >= min_free
+        brief[i] = (counts.sides[i] == BOTH_SIDES) & (free >= min_free) & (free >= free_share * total)
 
 
 @kernel
-def _scatter(chosen: I32, of: I32, voxel_of: I32) -> None:
-    """``of`` (k,) at the first k places ``chosen`` of ``voxel_of`` (n,), and -1 elsewhere."""
-    for i in range(np.uint64(0), np.uint64(len(voxel_of))):
-        voxel_of[i] = -1
-    for k in range(np.uint64(0), np.uint64(len(of))):
-        voxel_of[chosen[k]] = of[k]
+def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, chosen: I32, keys: I64) -> int:
+    """How many points ``rows`` (3, n) from ``origin`` are obstacles within ``reach``: which, and the keys of their
+    voxels, into the first of ``chosen`` (n,) and ``keys`` (n,)."""
+    count = np.uint64(0)
+    reach2 = np.float32(reach * reach)
+    for i in range(np.uint64(0), np.uint64(len(obstacle))):  # what is not chosen is written over: no branch to predict
+        x = rows[0, i]
+        y = rows[1, i]
+        chosen[count] = i
+        count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach2) else np.uint64(0)
+    for k in range(np.uint64(0), count):
+        p = np.uint64(chosen[k])
+        x = np.float64(rows[0, p]) + origin[0]
+        y = np.float64(rows[1, p]) + origin[1]
+        keys[k] = voxel_key(x, y, np.float64(rows[2, p]) + origin[2], cell)
+    return int(count)
 
 
-def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, F64]:
-    """(voxel_of (n,), first point of each voxel (m, 3)), voxels in order of their first points; -1 for no voxel."""
-    chosen = np.empty(len(points), np.int32)
-    keys = np.empty(len(points), np.int64)
-    count = _choose(points, obstacle, origin, reach, cell, chosen, keys)
+def voxels(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I32, F32]:
+    """(obstacles within ``reach`` (k,), the voxel of each (k,), the first point of each voxel (3, m)), voxels in order
+    of their first points."""
+    n = rows.shape[1]
+    chosen = np.empty(n, np.int32)
+    keys = np.empty(n, np.int64)
+    count = _choose(rows, obstacle, origin, reach, cell, chosen, keys)
     of, first = grouped(keys[:count])  # scans of 66,000 points have 7,000 voxels
-    voxel_of = np.empty(len(points), dtype=np.int32)
-    _scatter(chosen, of, voxel_of)
-    return voxel_of, points.take(chosen[first], axis=0)
+    return chosen[:count].copy(), of, rows.take(chosen[first], axis=1)
 
 
 @inlined
@@ -478,7 +500,7 @@ def _components(
     work: I64, out: Bool,
 ) -> None:  # fmt: skip
     """Into ``out`` (m,) which voxels move, see :func:`moving_components`; ``work`` (9, m): scratch, ``plane``
-    (side * side,): scratch that holds -1."""
+    (side * side,): scratch that holds -1, and does so again afterwards."""
     cells = work[0]
     cell_of = work[1]
     n_seen = work[2]
@@ -522,20 +544,22 @@ def _components(
             out[i] |= stack[cell_of[i]] == 2
         for k in range(n):
             wanted[k] = 1 if stack[k] == 0 and 2 * n_brief[k] >= n_seen[k] else 0
+    for k in range(n):
+        plane[cells[k]] = -1
 
 
 def moving_components(
-    place: I64, side: int, seen: Bool, brief: Bool, min_voxels: int, share_whole: float, share_part: float
+    place: I64, plane: I32, seen: Bool, brief: Bool, min_voxels: int, share_whole: float, share_part: float
 ) -> Bool:
     """Which voxels move (m,), from which were decidable (``seen``) and occupied only briefly (``brief``).
 
-    ``place`` (m,): the cell of each, row * side + col with 0 < row, col < side - 1. Connected cells move together: a
+    ``place`` (m,): the cell of each, row * side + col with 0 < row, col < side - 1. ``plane`` (side, side): scratch
+    that holds -1, and does so again afterwards. Connected cells move together: a
     component of the plane moves as a whole if at least ``share_whole`` of its decidable voxels were brief, and
     ``min_voxels`` of them. Where a mover touches something static, the component splits at the cells that are mostly
     static, and each remaining part moves if at least ``share_part`` of it was brief.
     """
     out = np.empty(len(place), dtype=np.bool_)
-    plane = np.full(side * side, -1, dtype=np.int32)
     work = np.empty((9, len(place)), dtype=np.int64)
-    _components(place, side, seen, brief, min_voxels, share_whole, share_part, plane, work, out)
+    _components(place, len(plane), seen, brief, min_voxels, share_whole, share_part, plane.reshape(-1), work, out)
     return out

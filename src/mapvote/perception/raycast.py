@@ -18,14 +18,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
-from mapvote.core.geometry import rows_from
+from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 from mapvote.perception.fans import FANS, Fans, Rays, follow_rays, gather_rays, mark_passed, set_out
+from mapvote.perception.placement import cells_and_obstacles
 
 
 @record(votes=True)
@@ -61,56 +61,24 @@ class ScanView:
 
     grid: Grid
     counts: I32
-    """Obstacle points of stationary objects in the cell: n of paper Eq. (1)."""
+    """Obstacle points of stationary objects in the cell: n of paper Eq. (1); (0, 0) if not requested."""
     hit: U64
-    """Column words of those points."""
+    """Column words of those points; (0, 0) if not requested."""
     passed: U64
     """Column words of voxels that a ray passed well before its own hit. Bit 63 (all above) is never passed."""
     sight: U8
     """:class:`Sight` of the cell; (0, 0) if not requested."""
 
 
-@kernel
-def _obstacles(
-    points: F64, ground_z: F32, base: I32, lattice: tuple[float, float], corner: tuple[int, int],
-    cell: I32, obstacle: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    rows, cols = ground_z.shape
-    (x0, y0), (row0, col0) = lattice, corner
-    for i in range(len(points)):  # cells as Lattice.cells_of has them, to the last bit
-        c = int(np.floor((points[i, 0] - x0) / CELL_SIZE)) - col0
-        r = int(np.floor((points[i, 1] - y0) / CELL_SIZE)) - row0
-        cell[i] = -1
-        obstacle[i] = False
-        if r < 0 or c < 0 or r >= rows or c >= cols:
-            continue
-        cell[i] = r * cols + c
-        obstacle[i] = height_above(points[i, 2], ground_z[r, c], base[r, c]) >= GROUND_MARGIN_M
-
-
-def find_obstacles(points_map: F64, reference: Reference) -> tuple[Bool, I32]:
-    """(obstacle (n,) bool, cell (n,) int32) of points (n, 3), map metres.
-
-    By the rule that built the reference, see :func:`mapvote.core.columns.height_above`. ``cell`` is row * cols + col in
-    the reference's grid, -1 outside it.
-    """
-    cell = np.empty(len(points_map), dtype=np.int32)
-    obstacle = np.empty(len(points_map), dtype=np.bool_)
-    grid = reference.grid
-    lattice = (grid.lattice.x0, grid.lattice.y0)
-    corner = (grid.row0, grid.col0)
-    _obstacles(points_map, reference.ground_z, reference.base, lattice, corner, cell, obstacle)
-    return obstacle, cell
-
-
-@kernel
-def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, counts: I32, hit: U64) -> None:
-    """Stationary obstacle points into counts and hit words (flat planes, in place)."""
-    for i in range(len(points)):
-        if keep[i] and cell[i] >= 0:
-            k = cell[i]
-            hit[k] |= np.uint64(1) << np.uint64(column_bit(points[i, 2], base[k]))
-            counts[k] += 1
+def enter_hits(up: F32, origin_z: float, cell: I32, keep: Bool, base: I32, counts: I32, hit: U64) -> None:
+    """Stationary obstacle points, ``up`` (n,) metres from ``origin_z``, into ``counts`` and ``hit`` words (flat planes,
+    in place)."""
+    here = np.flatnonzero(keep & (cell >= 0))
+    at = cell[here]
+    layer = np.floor((up[here].astype(np.float64) + origin_z) / CELL_SIZE).astype(np.int64)
+    bit = np.clip(layer - base[at], 0, TOP_BIT).astype(np.uint64)
+    np.bitwise_or.at(hit, at, np.uint64(1) << bit)
+    counts += np.bincount(at, minlength=len(counts)).astype(np.int32)
 
 
 def mark_sight(
@@ -166,7 +134,7 @@ class Fired(NamedTuple):
 
 
 def cast_rays(
-    points_map: F64,
+    rows: F32,
     origin_map: F64,
     obstacle: Bool,
     moving: Bool,
@@ -177,27 +145,29 @@ def cast_rays(
 ) -> ScanView:
     """One scan's planes over ``reference.grid``, which must hold the sensor.
 
-    ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
-    (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
-    occupy (docs/method.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
-    the view has none: rays are followed to their ends only. ``fired``: what the sensor is known to
-    have done beside its returns.
+    ``rows`` (3, n) metres from ``origin_map`` (3,), map metres, along the map's axes; ``obstacle`` (n,) and ``cell``
+    as :func:`mapvote.perception.placement.place_points` gives them (``cell`` is computed where it is not given). Points
+    of ``moving`` objects occlude but do not occupy (docs/method.md); the rays of ground points prove emptiness above
+    the ground. Without ``with_sight`` the view has neither sight nor hits: rays are followed to their ends only.
+    ``fired``: what the sensor is known to have done beside its returns.
     """
     if cell is None:
-        _, cell = find_obstacles(points_map, reference)
+        cell, _ = cells_and_obstacles(rows, origin_map, reference)
     grid = reference.grid
-    counts = np.zeros(grid.shape, dtype=np.int32)
-    hit = np.zeros(grid.shape, dtype=np.uint64)
+    requested = grid.shape if with_sight else (0, 0)
+    counts = np.zeros(requested, dtype=np.int32)
+    hit = np.zeros(requested, dtype=np.uint64)
     passed = np.zeros(grid.shape, dtype=np.uint64)
-    sight = np.zeros(grid.shape if with_sight else (0, 0), dtype=np.uint8)
+    sight = np.zeros(requested, dtype=np.uint8)
     base = np.ascontiguousarray(reference.base)
-    _enter_hits(points_map, cell, obstacle & ~moving, base.ravel(), counts.ravel(), hit.ravel())
-    rays = follow_rays(rows_from(points_map, origin_map), CLEARANCE_M)
+    rays = follow_rays(rows, CLEARANCE_M)
     fans = gather_rays(rays, every_fan=fired.every_fan)
     mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if fired.sky is not None:
         mark_passed(gather_rays(fired.sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
+        still = obstacle & ~moving
+        enter_hits(rows[2], float(origin_map[2]), cell, still, base.ravel(), counts.ravel(), hit.ravel())
         mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)
 
@@ -234,6 +204,34 @@ def _highest(rays: Rays, lean: F64, top: F32, count: I32) -> None:
         slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
         top[sector] = max(top[sector], slope)
         count[sector] += 1
+
+
+@kernel
+def _rise(
+    top: F32, edge: F32, slopes: F32, lean: F64, casting: tuple[I32, F32, F32], out: tuple[F32, F32, F32, I32]
+) -> int:  # fmt: skip
+    """Enter into the first of ``out`` (x, y, slope, fan) the rays of the beams, of ascending ``slopes``, between
+    ``top`` and ``edge`` (SKY_SECTORS,) of each fan that casts; returns how many. ``casting``: the numbers of these fans
+    and their directions x and y."""
+    fans, along_x, along_y = casting
+    x, y, slope, fan = out
+    n = 0
+    for f in range(len(fans)):
+        s = fans[f] // (FANS // SKY_SECTORS)
+        most = max(top[s], max(top[s - 1], top[(s + 1) % SKY_SECTORS]))
+        first = 0
+        while first < len(slopes) and slopes[first] <= most:
+            first += 1
+        # The beam next to the highest return may have grazed the same surface: it is left out.
+        for beam in range(first + 1, len(slopes)):
+            if slopes[beam] > edge[s]:
+                break
+            x[n] = along_x[f]
+            y[n] = along_y[f]
+            slope[n] = (slopes[beam] - along_x[f] * lean[0] - along_y[f] * lean[1]) / CELL_SIZE
+            fan[n] = fans[f]
+            n += 1
+    return n
 
 
 class Sky:
@@ -286,18 +284,10 @@ class Sky:
     def _above_returns(self, top: F32, edge: F32, slopes: F32, lean: F64) -> Rays:
         """Rays of the beams, of ascending ``slopes`` (beams,), that lie above the highest returns ``top`` of their
         sector and its neighbours and below the ``edge`` of the field of view, (SKY_SECTORS,) each."""
-        most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
-        # The beam next to the highest return may have grazed the same surface: it is left out.
-        above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))
-        below = np.maximum(np.searchsorted(slopes, edge, side="right"), above)
-        sector = self._fan // (FANS // SKY_SECTORS)
-        above = above[sector]
-        beams_above = below[sector] - above
-        fan_of = np.repeat(np.arange(len(self._fan)), beams_above)
-        n_rays = int(beams_above.sum())
-        beam = np.arange(n_rays) - np.repeat(np.cumsum(beams_above) - beams_above - above, beams_above)
-        x = self._x[fan_of]
-        y = self._y[fan_of]
-        slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
-        far = np.full(n_rays, np.float32(self._rule.follow_m))
-        return Rays(far, x, y, slope, far, self._fan[fan_of])
+        most = len(self._fan) * len(slopes)
+        x, y, slope = np.empty((3, most), np.float32)
+        fan = np.empty(most, np.int32)
+        casting = self._fan, self._x, self._y
+        n = _rise(top.astype(np.float32), edge, slopes, lean, casting, (x, y, slope, fan))
+        far = np.full(n, np.float32(self._rule.follow_m))
+        return Rays(far, x[:n], y[:n], slope[:n], far, fan[:n])

@@ -44,7 +44,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.perception.frontend import Observation
-from mapvote.perception.raycast import find_obstacles
+from mapvote.perception.placement import cells_and_obstacles
 from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, add_one, count_of
 
 
@@ -88,50 +88,84 @@ def count_scan(evidence: PackedTiles, seen: Observation, rule: SurfaceRule = SUR
     cols) words of the voxels that hold a return which the map does not explain."""
     view = seen.view
     here = seen.reference
-    scan = seen.scan
-    grid = seen.view.grid
-    near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
-    cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-    still = scan.obstacle & ~seen.moving
-    corner = (grid.x0, grid.y0)
-    mark_near(scan.points_map, cell, still, here.base, here.occupied, corner, rule.hit_reach_m / CELL_SIZE, near, apart)
+    grid = view.grid
+    near, apart = near_hits(seen, rule)
     for planes, part in evidence.under(grid):
         _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
     evidence.leave(grid)
     return apart
 
 
+def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64, U64]:
+    """(near, apart), words (rows, cols) of one scan: the voxels within ``hit_reach_m``, along each axis, of a return
+    that stands still, and the voxel of each such return that has none of the map's so near."""
+    here = seen.reference
+    scan = seen.scan
+    grid = seen.view.grid
+    near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
+    cell = scan.cell if here is scan.reference else cells_and_obstacles(scan.rows, scan.origin_map, here)[0]
+    from_corner = scan.origin_map - np.array([grid.x0, grid.y0, 0.0])
+    chosen = np.empty(len(cell) + 1, np.int32)
+    planes = np.ascontiguousarray(here.base).reshape(-1), near.reshape(-1), apart.reshape(-1)
+    reach = rule.hit_reach_m / CELL_SIZE
+    _mark_near(scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, here.occupied, planes, chosen)
+    return near, apart
+
+
 @kernel
-def mark_near(
-    points: F64, cell: I32, chosen: Bool, base: I32, occupied: U64, corner: tuple[float, float], reach: float,
-    near: U64, apart: U64,
+def _mark_near(
+    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: F64, reach: float, occupied: U64,
+    planes: tuple[I32, U64, U64], chosen: I32,
 ) -> None:  # fmt: skip
-    """Enter into ``near`` the voxels that come within ``reach`` cells, along each axis, of the points (n, 3), and into
-    ``apart`` the voxel of each that has none of the map's so near: planes (rows, cols), ``cell`` (n,) flat in them."""
+    """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of ``occupied`` (rows,
+    cols) and of the flat ``planes``: base, near, apart. ``reach``: cells, below a half, so that a return reaches two
+    cells or one along each axis. Four are always entered, be they one: no branch to predict. ``chosen`` (n + 1,):
+    scratch."""
+    base, near, apart = planes
     rows, cols = occupied.shape
-    for i in range(np.uint64(0), np.uint64(len(points))):
-        if not chosen[i] or cell[i] < 0:
-            continue
-        x = (points[i, 0] - corner[0]) / CELL_SIZE
-        y = (points[i, 1] - corner[1]) / CELL_SIZE
-        z = points[i, 2] / CELL_SIZE
-        mapped = np.uint64(0)
-        for r in range(max(int(y - reach), 0), min(int(y + reach), rows - 1) + 1):
-            for c in range(max(int(x - reach), 0), min(int(x + reach), cols - 1) + 1):
-                word = _layers(int(np.floor(z - reach)), int(np.floor(z + reach)), base[r, c])
-                near[r, c] |= word
-                mapped |= occupied[r, c] & word
-        if not mapped:
-            r, c = divmod(cell[i], cols)
-            apart[r, c] |= _layers(int(np.floor(z)), int(np.floor(z)), base[r, c])
+    east = points[0]
+    north = points[1]
+    up = points[2]
+    count = np.uint64(0)
+    for i in range(np.uint64(0), np.uint64(len(cell))):
+        chosen[count] = i
+        count += np.uint64(1) if obstacle[i] & (not moving[i]) & (cell[i] >= 0) else np.uint64(0)
+    for k in range(np.uint64(0), count):
+        p = np.uint64(chosen[k])
+        x = (np.float64(east[p]) + origin[0]) / CELL_SIZE
+        y = (np.float64(north[p]) + origin[1]) / CELL_SIZE
+        z = (np.float64(up[p]) + origin[2]) / CELL_SIZE
+        lowest = np.int64(np.floor(z - reach))
+        highest = np.int64(np.floor(z + reach))
+        left = np.int64(max(x - reach, 0.0))
+        right = min(np.int64(x + reach), np.int64(cols - 1))
+        first = np.int64(max(y - reach, 0.0))
+        last = min(np.int64(y + reach), np.int64(rows - 1))
+        a = np.uint64(first * cols + left)
+        b = np.uint64(first * cols + right)
+        c = np.uint64(last * cols + left)
+        d = np.uint64(last * cols + right)
+        of_a = _layers(lowest, highest, np.int64(base[a]))
+        of_b = _layers(lowest, highest, np.int64(base[b]))
+        of_c = _layers(lowest, highest, np.int64(base[c]))
+        of_d = _layers(lowest, highest, np.int64(base[d]))
+        near[a] |= of_a
+        near[b] |= of_b
+        near[c] |= of_c
+        near[d] |= of_d
+        mapped = occupied[first, left] & of_a | occupied[first, right] & of_b
+        if not mapped | occupied[last, left] & of_c | occupied[last, right] & of_d:
+            at = np.uint64(cell[p])
+            layer = np.int64(np.floor(z))
+            apart[at] |= _layers(layer, layer, np.int64(base[at]))
 
 
 @inlined
-def _layers(lowest: int, highest: int, base: int) -> np.uint64:
+def _layers(lowest: np.int64, highest: np.int64, base: np.int64) -> np.uint64:
     """The word of the layers ``lowest`` to ``highest`` of the world in a column that begins at ``base``."""
-    low = layer_bit(lowest, base)
-    high = layer_bit(highest, base)
-    return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+    low = np.uint64(layer_bit(lowest, base))
+    high = np.uint64(layer_bit(highest, base))
+    return (np.uint64(2) << high) - (np.uint64(1) << low)
 
 
 @kernel

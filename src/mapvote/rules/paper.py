@@ -172,9 +172,9 @@ def _cast(seen: Observation, chosen: Bool, obstacle: Bool) -> ScanView:
     """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that occlude the cells behind them."""
     scan = seen.scan
     still = np.zeros(int(chosen.sum()), dtype=np.bool_)
-    points = scan.points_map[chosen]
+    rows = np.ascontiguousarray(scan.rows[:, chosen])
     cell = scan.cell[chosen]
-    return cast_rays(points, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
+    return cast_rays(rows, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
 
 
 @lru_cache(maxsize=64)

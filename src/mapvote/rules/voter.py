@@ -96,21 +96,24 @@ NEW_POINTS_RULE = NewPointsRule()
 REACH_M = NEW_POINTS_RULE.reach_m
 
 
-def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
-    """Indices of the points (n, 3), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
+def select(up: F32, origin_z: float, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
+    """Indices of the points (n,), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
 
-    ``cell`` (n,) the flat cell of each point, -1 outside; ``base`` (cells,) the lowest layer of each column.
+    ``up`` (n,) the height of each point above ``origin_z``, map metres; ``cell`` (n,) its flat cell, -1 outside;
+    ``base`` (cells,) the lowest layer of each column.
     """
-    chosen = np.empty(len(points) + 1, np.int64)
-    return chosen[: _select(points, cell, wanted, unwanted, words, base, chosen)].copy()
+    chosen = np.empty(len(cell) + 1, np.int64)
+    return chosen[: _select(up, origin_z, cell, wanted, unwanted, words, base, chosen)].copy()
 
 
 @kernel
-def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64) -> np.int64:
+def _select(
+    up: F32, origin_z: float, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64
+) -> np.int64:
     """:func:`select` into the first of ``chosen`` (n + 1,); returns how many. Each index is written, and written over
     if its point is not chosen: a branch could not be predicted."""
     near = np.uint64(0)
-    for i in range(np.uint64(0), np.uint64(len(points))):
+    for i in range(np.uint64(0), np.uint64(len(cell))):
         k = np.uint64(max(cell[i], np.int32(0)))
         here = wanted[i] & (not unwanted[i]) & (cell[i] >= 0)
         chosen[near] = i
@@ -120,28 +123,28 @@ def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, ba
         point = np.uint64(chosen[w])
         k = np.uint64(cell[point])
         chosen[found] = point
-        found += words[k] >> np.uint64(column_bit(points[point, 2], base[k])) & np.uint64(1)
+        found += words[k] >> np.uint64(column_bit(np.float64(up[point]) + origin_z, base[k])) & np.uint64(1)
     return np.int64(found)
 
 
 @kernel
 def _beyond(
-    points: F64, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
+    points: F32, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
     corner: tuple[int, int], found: I64,
 ) -> int:  # fmt: skip
-    """Into the first of ``found`` (n,) which of the points (n, 3) outside the local grid (``cell`` -1) are obstacles,
-    within reach, and in voxels that the map does not hold; returns how many. The map is the planes (rows, cols) whose
-    first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
+    """Into the first of ``found`` (n,) which of the points (3, n) from ``origin`` outside the local grid (``cell`` -1)
+    are obstacles, within reach, and in voxels that the map does not hold; returns how many. The map is the planes
+    (rows, cols) whose first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
     rows, cols = occupied.shape
     n, (x0, y0), (row0, col0) = 0, lattice, corner
-    for i in range(len(points)):
-        if cell[i] >= 0 or (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 >= REACH_M**2:
+    for i in range(np.uint64(0), np.uint64(len(cell))):
+        if cell[i] >= 0 or points[0, i] ** 2 + points[1, i] ** 2 >= np.float32(REACH_M**2):
             continue
-        c = int(np.floor((points[i, 0] - x0) / CELL_SIZE)) - col0
-        r = int(np.floor((points[i, 1] - y0) / CELL_SIZE)) - row0
+        c = int(np.floor((np.float64(points[0, i]) + origin[0] - x0) / CELL_SIZE)) - col0
+        r = int(np.floor((np.float64(points[1, i]) + origin[1] - y0) / CELL_SIZE)) - row0
         if not (0 <= r < rows and 0 <= c < cols):
             continue
-        z = points[i, 2]
+        z = np.float64(points[2, i]) + origin[2]
         if height_above(z, ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
             continue
         if not (occupied[r, c] >> np.uint64(column_bit(z, base[r, c]))) & np.uint64(1):
@@ -180,13 +183,15 @@ class NewPoints:
         scan = seen.scan
         words = may_be_new.ravel()
         base = np.ascontiguousarray(scan.reference.base).ravel()
-        self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
+        up = scan.rows[2]
+        chosen = select(up, float(scan.origin_map[2]), scan.cell, scan.obstacle, seen.moving, words, base)
+        self._offer_of(scan, chosen)
         if self.beyond:
             self._offer_of(scan, self._strange_beyond(scan))
 
     def _offer_of(self, scan: PlacedScan, chosen: I64) -> None:
         fields = {name: scan.fields[name][chosen] for name in self.names if name in scan.fields}
-        self.offer(scan.points_map[chosen], fields)
+        self.offer(scan.points_at(chosen), fields)
 
     def _strange_beyond(self, scan: PlacedScan) -> I64:
         """(m,) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
@@ -197,9 +202,9 @@ class NewPoints:
         outer = scan.outer
         lattice = (grid.lattice.x0, grid.lattice.y0)
         corner = (grid.row0, grid.col0)
-        found = np.empty(len(scan.points_map), np.int64)
+        found = np.empty(len(scan.cell), np.int64)
         n = _beyond(
-            scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
+            scan.rows, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
             found,
         )  # fmt: skip
         return found[:n].copy()
@@ -261,6 +266,8 @@ def points_in(
     rows, cols, _ = window.indices_of(points_map)
     cell = (rows * window.cols + cols).astype(np.int32)
     every = np.ones(len(points_map), np.bool_)
-    kept = points_map[select(points_map, cell, every, ~every, words.ravel(), base.ravel())]
+    z0 = float(points_map[:, 2].min()) if len(points_map) else 0.0
+    up = (points_map[:, 2] - z0).astype(np.float32)
+    kept = points_map[select(up, z0, cell, every, ~every, words.ravel(), base.ravel())]
     sent = {name: kept[:, 3 + k].astype(point_field(name).dtype) for k, name in enumerate(names)}
     return window.from_map(kept[:, :3]), sent

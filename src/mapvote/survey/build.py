@@ -279,7 +279,8 @@ class Surveyor:
         T_map_lidar = fix.registration.T_map_lidar
         if self.fine_map is None:
             return fix
-        points = in_rows(fix.points[thin(fix.points, self._fine.points_m)])
+        points = fix.points
+        points = in_rows(points[thin(points, self._fine.points_m)])
         polished = self.fine_map.around(T_map_lidar[:3, 3]).refine([points], T_map_lidar)
         moved_m = np.linalg.norm(polished.T_map_lidar[:3, 3] - T_map_lidar[:3, 3])
         if not polished.converged or moved_m > self.numbers.polish_m:

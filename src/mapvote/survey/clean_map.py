@@ -142,9 +142,10 @@ class Mapper:
             left_out = np.empty(len(moving), np.bool_)
             reach2 = self.settings.mapping.reach_m**2
             beside = np.zeros(ground_z.size, np.bool_)
-            places = scan.points_map, scan.origin_map, reach2, self.numbers.road_m
+            points_map = scan.points_map
+            places = points_map, scan.origin_map, reach2, self.numbers.road_m
             _leave_out(*places, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
-            self.cloud.enter(scan.points_map, left_out)
+            self.cloud.enter(points_map, left_out)
             count_scan(self.evidence, observation)
 
     def finish(self) -> PointMap:

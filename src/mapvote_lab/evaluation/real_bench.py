@@ -21,7 +21,7 @@ from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud
 from mapvote.matching.localiser import GivenPoses
-from mapvote.perception.raycast import find_obstacles
+from mapvote.perception.placement import find_obstacles
 from mapvote_lab.evaluation.cases import Case, Progress
 from mapvote_lab.evaluation.cast_things import Site, Thing, with_things
 from mapvote_lab.evaluation.real_street import (

@@ -29,7 +29,7 @@ from mapvote.formats.drives.options import parse_scans
 from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.perception.raycast import find_obstacles
+from mapvote.perception.placement import find_obstacles
 from mapvote.survey.build import BuildReport, build_map
 from mapvote_lab.evaluation.cases import Case, fuse_case
 from mapvote_lab.evaluation.scene import SharedPass
