@@ -44,8 +44,8 @@ class NotInFile(MapvoteError):
 class TooMany(MapvoteError):
     """Beyond what a key or a vehicle may send; try again in ``after_s``."""
 
-    def __init__(self, why: str, after_s: float = 1.0) -> None:
-        super().__init__(why)
+    def __init__(self, message: str, after_s: float = 1.0) -> None:
+        super().__init__(message)
         self.after_s = after_s
 
 

@@ -95,11 +95,11 @@ def gate_by(ndt: NdtSettings, drives: str) -> Gate:
     """The gate of the policy's reference drive, which lies below the folder ``drives`` ("": there is none); an
     abstention lets the version through. MapvoteError if the drive is missing."""
 
-    def reasons(asked: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
-        settings = GateSettings.model_validate(asked.model_dump(exclude={"drive"}))
-        verdict, why = gate(old, new, _gate_drive(drives, asked.drive), settings, ndt)
-        structlog.get_logger("mapvote").info("gate", verdict=verdict, reasons=why)
-        return why if verdict == "hold" else []
+    def reasons(policy: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
+        settings = GateSettings.model_validate(policy.model_dump(exclude={"drive"}))
+        verdict, reason = gate(old, new, _gate_drive(drives, policy.drive), settings, ndt)
+        structlog.get_logger("mapvote").info("gate", verdict=verdict, reasons=reason)
+        return reason if verdict == "hold" else []
 
     return reasons
 
@@ -210,9 +210,9 @@ def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, list[str]]:
 
 def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F64], ndt: NdtSettings) -> Localised:
     ndt_map = window(prior[:3, 3])
-    found = [ndt_map.refine(clouds, guess) for guess in guesses]
-    best = max(found, key=lambda registration: registration.score)
-    positions = np.array([registration.T_map_lidar[:3, 3] for registration in found])
+    registrations = [ndt_map.refine(clouds, guess) for guess in guesses]
+    best = max(registrations, key=lambda registration: registration.score)
+    positions = np.array([registration.T_map_lidar[:3, 3] for registration in registrations])
     scatter = float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
     trusted = best.inlier_share >= ndt.min_inlier_share and sigma_m <= ndt.max_sigma_m

@@ -125,27 +125,27 @@ def who() -> str:
 def check_store(store: Store) -> list[Finding]:
     """Everything that the doctor finds in an open store, errors first. Every byte is read."""
     damaged = check(store)
-    found = []
+    findings = []
     for kind, count in Counter(damage.kind for damage in damaged).items():
-        some = [damage for damage in damaged if damage.kind == kind][:_DAMAGE_LISTED]
-        found += [Finding("error", f"damaged: {damage}", _STORE_MEND) for damage in some]
+        of_kind = [damage for damage in damaged if damage.kind == kind][:_DAMAGE_LISTED]
+        findings += [Finding("error", f"damaged: {damage}", _STORE_MEND) for damage in of_kind]
         if count > _DAMAGE_LISTED:
-            found.append(Finding("error", f"damaged: {count - _DAMAGE_LISTED} more of the kind {kind}", _STORE_MEND))
+            findings.append(Finding("error", f"damaged: {count - _DAMAGE_LISTED} more of the kind {kind}", _STORE_MEND))
     glance = overview(store)
     sizes = ", ".join(f"{getattr(glance, key):,} {key.replace('_', ' ')}" for key in _SIZES)
-    found.append(Finding("note", f"version {glance.version}: {sizes}"))
+    findings.append(Finding("note", f"version {glance.version}: {sizes}"))
     if glance.quarantined:
-        what = f"{glance.quarantined} damaged things were set aside: their votes and tiles do not count"
-        found.append(Finding("warning", what, f"{_STORE_MEND} brings back what a backup has"))
+        text = f"{glance.quarantined} damaged things were set aside: their votes and tiles do not count"
+        findings.append(Finding("warning", text, f"{_STORE_MEND} brings back what a backup has"))
     valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
     if valid["operator"]:
         roles = ", ".join(f"{count} {role}" for role, count in sorted(valid.items()))
-        found.append(Finding("note", f"keys: {roles}"))
+        findings.append(Finding("note", f"keys: {roles}"))
     else:
-        what = "no operator has a valid key: the server cannot be operated remotely"
-        found.append(Finding("warning", what, "mapvote keys STORE issue NAME --role operator"))
+        text = "no operator has a valid key: the server cannot be operated remotely"
+        findings.append(Finding("warning", text, "mapvote keys STORE issue NAME --role operator"))
     try:
         newest = store.point_map()
-        return in_order([*found, *check_cloud(tile_by_tile(newest), classified_ground(newest)), *check_map(newest)])
+        return in_order([*findings, *check_cloud(tile_by_tile(newest), classified_ground(newest)), *check_map(newest)])
     except MapvoteError as error:
-        return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _STORE_MEND)])
+        return in_order([*findings, Finding("error", f"its newest map cannot be read: {error}", _STORE_MEND)])

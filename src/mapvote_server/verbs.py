@@ -139,10 +139,10 @@ def publish(
 
 
 def _print_outcome(answer: Mapping[str, Any], otherwise: str) -> None:
-    what = "published" if answer["published"] else otherwise
+    outcome = "published" if answer["published"] else otherwise
     tiles = f" in tiles {'; '.join(answer['tiles'])}" if answer["tiles"] else ""
     changed = f"{answer['points_added']} points added, {answer['points_deleted']} deleted"
-    print(f"version {answer['version']} ({what}): {changed}{tiles}")
+    print(f"version {answer['version']} ({outcome}): {changed}{tiles}")
     if answer["waits"]:
         print(answer["waits"])
     for doubt in answer["doubts"]:
@@ -231,20 +231,20 @@ def log(
     from mapvote.formats.atomic import write_whole
 
     local = metres or (out is not None and out.suffix.lower() == ".gpkg")
-    asked = f"from={old or 1}" + ("" if new is None else f"&to={new}")
+    query = f"from={old or 1}" + ("" if new is None else f"&to={new}")
     with api_at(store, key_file) as server, waiting("comparing versions"):
-        found = all_changes(server, f"{asked}&lonlat={str(not local).lower()}")
-        text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
+        changes = all_changes(server, f"{query}&lonlat={str(not local).lower()}")
+        text = server.ask("GET", f"/v1/changes/page?{query}").text if page is not None else ""
     if page is not None:
         write_whole(page, text)
-        print(f"the largest of {len(found['features'])} changes in {page}")
-    _tell_damaged(found)
+        print(f"the largest of {len(changes['features'])} changes in {page}")
+    _tell_damaged(changes)
     if out is not None:
-        _write_changes(found, out)
+        _write_changes(changes, out)
     elif geojson:
-        print(json.dumps(found, indent=1))
+        print(json.dumps(changes, indent=1))
     elif page is None:
-        _print_changes(found)
+        _print_changes(changes)
 
 
 def _print_versions(answer: Mapping[str, Any]) -> None:
@@ -261,35 +261,35 @@ def _print_versions(answer: Mapping[str, Any]) -> None:
 _MOST_CHANGES = 40
 
 
-def _print_changes(found: Mapping[str, Any]) -> None:
+def _print_changes(changes: Mapping[str, Any]) -> None:
     """The changes as a table, the largest first."""
     rows = []
-    largest_first = sorted(found["features"], key=lambda feature: -feature["properties"]["area_m2"])
+    largest_first = sorted(changes["features"], key=lambda feature: -feature["properties"]["area_m2"])
     for feature in largest_first[:_MOST_CHANGES]:
         about = feature["properties"]
         (x0, y0), (x1, y1) = about["box"]
         votes = f"{about['votes_min']}" if about["versions"] else "none: taken back"
         sizes = f"{about['area_m2']:.1f}", f"{about['height_m']:.1f}", str(about["points"])
         rows.append((about["kind"], f"{0.5 * (x0 + x1):.1f}", f"{0.5 * (y0 + y1):.1f}", *sizes, votes))
-    versions = f"from version {found['from_version']} to {found['to_version']}"
+    versions = f"from version {changes['from_version']} to {changes['to_version']}"
     if not rows:
         print(f"nothing changed {versions}")
         return
     print_table(("change", "x (m)", "y (m)", "m2", "m high", "points", "votes at least"), rows)
-    if len(found["features"]) > _MOST_CHANGES:
-        print(f"and {len(found['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
-    print(f"{len(found['features'])} changes {versions}")
-    if not all(feature["properties"]["versions"] for feature in found["features"]):
+    if len(changes["features"]) > _MOST_CHANGES:
+        print(f"and {len(changes['features']) - _MOST_CHANGES} smaller ones; --out FILE writes all of them")
+    print(f"{len(changes['features'])} changes {versions}")
+    if not all(feature["properties"]["versions"] for feature in changes["features"]):
         print("taken back: no vehicle voted for it, a rollback or a replay took an earlier decision back")
 
 
-def _tell_damaged(found: Mapping[str, Any]) -> None:
-    if found.get("damaged"):
-        left_out = "; ".join(found["damaged"])
+def _tell_damaged(answer: Mapping[str, Any]) -> None:
+    if answer.get("damaged"):
+        left_out = "; ".join(answer["damaged"])
         typer.echo(f"left out: tiles {left_out} are damaged (see mapvote check)", err=True)
 
 
-def _write_changes(found: dict[str, Any], out: Path) -> None:
+def _write_changes(changes: dict[str, Any], out: Path) -> None:
     import json
 
     from mapvote.formats.atomic import write_whole
@@ -297,10 +297,10 @@ def _write_changes(found: dict[str, Any], out: Path) -> None:
     from mapvote.formats.geo.geopackage import write_geopackage
 
     if out.suffix.lower() == ".gpkg":
-        write_geopackage(out, found["features"], frame_of(found["georeference"]))
+        write_geopackage(out, changes["features"], frame_of(changes["georeference"]))
     else:
-        write_whole(out, json.dumps(found, indent=1) + "\n")
-    print(f"{len(found['features'])} objects in {out}")
+        write_whole(out, json.dumps(changes, indent=1) + "\n")
+    print(f"{len(changes['features'])} objects in {out}")
 
 
 def explain(
@@ -331,12 +331,12 @@ def explain(
         ended = v["end"][:19].replace("T", " ") + "Z"
         counted = ", ".join(str(number) for number in v["counted_in"])
         before = f"counted in version {counted}" if counted else "counted in no version"
-        now = "counts now" if v["counts"] else f"does not count now: {v['why']}"
+        counts_text = "counts now" if v["counts"] else f"does not count now: {v['why']}"
         gone = f", {v['marks']} of its voxels gone" if v["marks"] and v["state"] == "unchanged_occupied" else ""
         print(
             f"{v['vehicle']}: {v['state']}{gone}{sure}. Drive {v['drive']} ended {ended}, with version {v['version']}"
         )
-        print(f"    {before}; {now}")
+        print(f"    {before}; {counts_text}")
 
 
 _MOST_STRETCHES = 20
@@ -361,27 +361,29 @@ def coverage(
 
     check_ending(out, "--out", ".geojson", ".json")
     with api_at(store, key_file) as server:
-        found = server.ask_json("GET", "/v1/coverage/passes")
+        passes = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
-    for feature in found["features"][:_MOST_STRETCHES]:
+    for feature in passes["features"][:_MOST_STRETCHES]:
         about = feature["properties"]
         line = feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
-        counts = (str(about[what]) for what in ("cells", "built", "gone"))
+        counts = (str(about[name]) for name in ("cells", "built", "gone"))
         rows.append((f"{about['row']},{about['col']}", f"{about['heading_deg']}°", *ends, *counts))
     if rows:
         print_table(("tile", "heading", "from (x, y), m", "to", "cells", "built", "gone"), rows, "One more pass")
-    elif not found["cells"]:
+    elif not passes["cells"]:
         print("no cell waits for one more pass")
-    if found["without_path"]:
-        print(f"{found['without_path']} of {found['cells']} cells that wait: their ballots do not say where they drove")
-    if found["waits"]:
-        print(found["waits"])
-    if found["damaged"]:
-        typer.echo(f"left out: tiles {'; '.join(found['damaged'])} are damaged (see mapvote check)", err=True)
+    if passes["without_path"]:
+        print(
+            f"{passes['without_path']} of {passes['cells']} cells that wait: their ballots do not say where they drove"
+        )
+    if passes["waits"]:
+        print(passes["waits"])
+    if passes["damaged"]:
+        typer.echo(f"left out: tiles {'; '.join(passes['damaged'])} are damaged (see mapvote check)", err=True)
     if out is not None:
-        write_whole(out, json.dumps(found) + "\n")
-        print(f"{out}: {len(found['features'])} stretches of road")
+        write_whole(out, json.dumps(passes) + "\n")
+        print(f"{out}: {len(passes['features'])} stretches of road")
 
 
 def rollback(
@@ -462,12 +464,12 @@ def check(
                 restored = [digest for digest in sorted(planes) if _restored(server, backup, digest)]
             for digest in restored:
                 print(f"plane {digest}: mended from {other}")
-        found = server.ask_json("POST" if mend else "GET", "/v1/check")["damage"]
-    for damage in found:
+        damages = server.ask_json("POST" if mend else "GET", "/v1/check")["damage"]
+    for damage in damages:
         done = f"; {damage['mended']}" if damage["mended"] else ""
         print(f"{damage['kind']} {damage['name']}: {damage['why']}{done}")
-    if found:
-        raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
+    if damages:
+        raise MapvoteError(f"{store}: {len(damages)} things are damaged" + ("" if mend else "; --mend sets them aside"))
     print("every plane, ballot and version is what it was when it was written")
 
 

@@ -72,8 +72,8 @@ def said_in_order(drives: Sequence[Vote], cells: I64) -> tuple[U8, I64, I64]:
 
 
 @kernel
-def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, last: I64, found: Bool) -> None:
-    """Into ``found`` (n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since.
+def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, last: I64, turned: Bool) -> None:
+    """Into ``turned`` (n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since.
     ``last`` (m,): memory for the last word of each vehicle."""
     for cell in range(said.shape[1]):
         for i in range(len(last)):
@@ -92,7 +92,7 @@ def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, las
                 newest_before = max(newest_before, ends_ns[word])
             elif word >= 0 and said[word, cell] < _UN:
                 other = True
-        found[cell] = not other and newest_before < oldest_after
+        turned[cell] = not other and newest_before < oldest_after
 
 
 def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, settings: FuseSettings) -> F64:

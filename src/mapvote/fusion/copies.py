@@ -167,8 +167,8 @@ def free_marks(drive: Vote, least: int) -> U64:
     if drive.free is None or len(drive.free.cells) < least:
         return _NO_MARKS
     marks = np.empty(len(drive.free.cells), dtype=np.uint64)
-    found = marks[: _patterns(drive.free.cells, drive.free.words, marks)]
-    unique, times = np.unique(found, return_counts=True)
+    patterns = marks[: _patterns(drive.free.cells, drive.free.words, marks)]
+    unique, times = np.unique(patterns, return_counts=True)
     return _enough(unique[times == 1], least)
 
 
@@ -180,7 +180,7 @@ def _enough(marks: U64, least: int) -> U64:
 def _patterns(cells: NDArray[np.intp], words: U64, marks: U64) -> int:
     """Into ``marks`` (n,), returning how many: a number for the words (n,) of each cell that is not alone, and of those
     to its east and north, unless all three are equal. ``cells``: flat, ascending."""
-    found = 0
+    n = 0
     north = 0
     for i in range(len(cells) - 1):
         while north < len(cells) - 1 and cells[north] < cells[i] + TILE_CELLS:
@@ -192,9 +192,9 @@ def _patterns(cells: NDArray[np.intp], words: U64, marks: U64) -> int:
             continue
         mark = words[i] * np.uint64(0x9E3779B97F4A7C15) ^ words[i + 1] * np.uint64(0xC2B2AE3D27D4EB4F)
         mark = (mark ^ (mark >> np.uint64(29))) * np.uint64(0x165667B19E3779F9) + words[north]
-        marks[found] = (mark ^ (mark >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
-        found += 1
-    return found
+        marks[n] = (mark ^ (mark >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
+        n += 1
+    return n
 
 
 @kernel
@@ -262,11 +262,11 @@ def _dilate(mask: U64, out: U64) -> None:
     """Into ``out`` (256, 4) the cells that are or have a neighbour in the mask."""
     for r in range(TILE_CELLS):
         for w in range(4):
-            some = np.uint64(0)
+            any_bits = np.uint64(0)
             for k in range(max(r - 1, 0), min(r + 2, TILE_CELLS)):
                 right = mask[k, w + 1] << np.uint64(63) if w < 3 else np.uint64(0)
-                some |= mask[k, w] | _moved_east(mask[k], w, 1) | (mask[k, w] >> np.uint64(1)) | right
-            out[r, w] = some
+                any_bits |= mask[k, w] | _moved_east(mask[k], w, 1) | (mask[k, w] >> np.uint64(1)) | right
+            out[r, w] = any_bits
 
 
 def _agreement(drive: Vote, others: Sequence[Vote], every: int) -> int:
@@ -313,16 +313,16 @@ def _look_at(masks: U64, looked: U64, moved: I64, east: U64) -> None:
         for n in range(looked.shape[1]):
             row = 1 + _APART * n
             for w in range(4):
-                some = np.uint64(0)
+                any_bits = np.uint64(0)
                 every = ~np.uint64(0)
                 for r in range(row - 1, row + 2):
                     here = masks[i, r, w]
                     west = _moved_east(masks[i, r], w, 1)
                     right = (here >> np.uint64(1)) | (masks[i, r, w + 1] << np.uint64(63) if w < 3 else np.uint64(0))
-                    some |= here | west | right
+                    any_bits |= here | west | right
                     every &= here & west & right
                 looked[i, n, 0, w] = masks[i, row, w]
-                looked[i, n, 1, w] = some
+                looked[i, n, 1, w] = any_bits
                 looked[i, n, 2, w] = every
             for plane in range(3):
                 for w in range(4):

@@ -50,8 +50,8 @@ def unpack_standings(data: bytes) -> list[Vote]:
     except msgspec.DecodeError as error:
         raise MapvoteError(f"decision: standings are damaged ({error})") from error
     return [
-        Vote(ballot=ballot, why=why, spent=_cells_in(spent), reviewed=_cells_in(reviewed), alike=alike)
-        for ballot, why, spent, reviewed, alike in standings
+        Vote(ballot=ballot, why=reason, spent=_cells_in(spent), reviewed=_cells_in(reviewed), alike=alike)
+        for ballot, reason, spent, reviewed, alike in standings
     ]
 
 

@@ -61,14 +61,14 @@ def deniers(
 
 def borne_out(votes: Sequence[Vote], tile: Tile) -> I64:
     """(n,) in how many cells each vote no longer counts because the map is now as voted: built on, or empty."""
-    found = np.zeros(len(votes), dtype=np.int64)
+    counts = np.zeros(len(votes), dtype=np.int64)
     holds = tile.obstacle_words.reshape(-1)
     for i, vote in enumerate(votes):
         if vote.unrestricted is not None and vote.states is not None:
             sent = vote.unrestricted.reshape(-1)
             spent = np.flatnonzero((vote.states.reshape(-1) == NO_VOTE) & ((sent == _CO) | (sent == _CE)))
-            found[i] = np.count_nonzero((sent[spent] == _CO) == (holds[spent] != 0))
-    return found
+            counts[i] = np.count_nonzero((sent[spent] == _CO) == (holds[spent] != 0))
+    return counts
 
 
 @kernel
@@ -79,15 +79,15 @@ def contradicts(own: U8, others: U8, most: float) -> bool:
     It is judged only if a majority of the others, and at least the quorum, agree on most cells that so many of them
     determined.
     """
-    asked = 0
+    compared = 0
     agreed = 0
     opposed = 0
     for i in range(len(others)):
         said = others[i, own[i] & 7]
-        asked += said & 1
+        compared += said & 1
         agreed += (said >> 1) & 1
         opposed += said >> 2
-    return bool(agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed)
+    return bool(agreed >= _MIN_ASKED and 2 * agreed > compared and opposed > most * agreed)
 
 
 def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
@@ -99,8 +99,8 @@ def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
     """
     determined = states < _UN
     denied = (determined & (states != decided)).sum(axis=1)
-    asked = determined.sum(axis=1) + came_true
-    return np.asarray((asked >= _MIN_ASKED) & (denied > most * asked))
+    changes = determined.sum(axis=1) + came_true
+    return np.asarray((changes >= _MIN_ASKED) & (denied > most * changes))
 
 
 def others_say(tally: NDArray[Any], quorum: int) -> U8:
@@ -112,13 +112,13 @@ def others_say(tally: NDArray[Any], quorum: int) -> U8:
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
     least = quorum * VOTE_UNIT
     total = tally[:_UN].sum(axis=0, dtype=np.int32) - VOTE_UNIT  # whatever the vehicle's own vote is
-    asked = np.flatnonzero(total >= least)
-    total = total[asked]
-    votes = tally[:_UN].take(asked, axis=1).astype(np.int32)  # class by class in memory, as indexing would not leave it
+    cells = np.flatnonzero(total >= least)
+    total = total[cells]
+    votes = tally[:_UN].take(cells, axis=1).astype(np.int32)  # class by class in memory, as indexing would not leave it
     for own in range(_UN):
         votes[own] -= VOTE_UNIT
         best = votes.max(axis=0)
         agreed = (2 * best > total) & (best >= max(least, 1))
-        said[asked, own] = _ASKED | _AGREED * agreed | _OPPOSED * (agreed & (votes[own] != best))
+        said[cells, own] = _ASKED | _AGREED * agreed | _OPPOSED * (agreed & (votes[own] != best))
         votes[own] += VOTE_UNIT
     return said

@@ -64,10 +64,10 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     base = tile.base.reshape(-1)
     flat = gone.reshape(-1)
     dropped = np.zeros(len(tile.points), dtype=np.bool_)
-    asked = np.flatnonzero((flat != 0)[tile.cells])
-    cells = tile.cells[asked]
-    bit, obstacle = column_bits(tile.points[asked, 2].astype(np.float64), ground[cells], base[cells])
-    dropped[asked] = obstacle & ((flat[cells] >> bit.astype(np.uint64)) & np.uint64(1) != 0)
+    in_cells = np.flatnonzero((flat != 0)[tile.cells])
+    cells = tile.cells[in_cells]
+    bit, obstacle = column_bits(tile.points[in_cells, 2].astype(np.float64), ground[cells], base[cells])
+    dropped[in_cells] = obstacle & ((flat[cells] >> bit.astype(np.uint64)) & np.uint64(1) != 0)
     deleted = int(np.count_nonzero(dropped))
     return (tile.without(dropped), deleted) if deleted else (tile, 0)
 
@@ -83,9 +83,9 @@ def add_points(tile: Tile, points: F32, fields: Fields, cells: I64, voters: I32,
         return tile, 0
     voxels = _voxels(cells, points)
     order = np.argsort(voxels)
-    asked = np.zeros(CELLS, dtype=np.bool_)
-    asked[cells] = True
-    mapped = np.flatnonzero(asked[tile.cells])
+    changed = np.zeros(CELLS, dtype=np.bool_)
+    changed[cells] = True
+    mapped = np.flatnonzero(changed[tile.cells])
     taken = np.isin(voxels, _voxels(tile.cells[mapped], tile.points[mapped]))
     chosen = np.empty(len(voxels), np.int64)
     seen = np.full(int(voters.max()) + 1, -1, dtype=np.int64)
@@ -117,7 +117,7 @@ def _represent(
     sum of whole micrometres.
     """
     n = len(voxels)
-    found = 0
+    n_out = 0
     low = 0
     start = 0
     while start < n:
@@ -135,10 +135,10 @@ def _represent(
                 support += 1
             i += 1
         if support >= min_votes and not taken[order[start]]:
-            out[found] = _nearest_to_mean(points, numbers, order, start, stop)
-            found += 1
+            out[n_out] = _nearest_to_mean(points, numbers, order, start, stop)
+            n_out += 1
         start = stop
-    return found
+    return n_out
 
 
 @inlined
@@ -212,10 +212,10 @@ def _trimmed(remnants: Words, marks: I32, determined: I64, tile: Tile) -> EditVo
     held = remnants.words & tile.obstacle_words.reshape(-1)[remnants.cells]
     # A column without known ground goes by any mark.
     voxels = bits_of(held if tile.has_ground else np.where(held == 0, held, remnants.words))
-    some = np.flatnonzero(voxels.any(axis=1))
-    votes = np.where(voxels, marks, np.iinfo(np.int32).max).min(axis=1)[some].astype(np.int32)
-    against = (determined[some] - votes).astype(np.int32)
-    return EditVotes(remnants.cells[some], np.full(len(some), CellState.CHANGED_EMPTY, np.uint8), votes, against)
+    trimmed = np.flatnonzero(voxels.any(axis=1))
+    votes = np.where(voxels, marks, np.iinfo(np.int32).max).min(axis=1)[trimmed].astype(np.int32)
+    against = (determined[trimmed] - votes).astype(np.int32)
+    return EditVotes(remnants.cells[trimmed], np.full(len(trimmed), CellState.CHANGED_EMPTY, np.uint8), votes, against)
 
 
 def _deleted(gone: U64, tile: Tile) -> U64:
@@ -239,7 +239,7 @@ def _remnants(
     with the whole cell goes in any case. ``stays`` (256, 256): the map without what leaves other cells; a voxel that
     half of the vehicles call left does not stay. Everything beyond the tile's edge stays.
     """
-    cells = np.unique(np.concatenate([found.cells for found in (*left, *emptied_by)]))
+    cells = np.unique(np.concatenate([words.cells for words in (*left, *emptied_by)]))
     halves = counted(cells, left)
     marks = halves + counted(cells, emptied_by)
     determined = np.asarray(np.sum([vote.determined(cells) for vote in votes], axis=0, dtype=np.int64))

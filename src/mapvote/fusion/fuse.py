@@ -182,8 +182,8 @@ def decide_tile(
     if len(pending.cells):
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
-    told = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
-    return Decision(told, tally, states, quorum, names, votes, denied, passing, past, copies, odds, pending)
+    stated = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
+    return Decision(stated, tally, states, quorum, names, votes, denied, passing, past, copies, odds, pending)
 
 
 def _originals_of(
@@ -265,8 +265,8 @@ def _without(fell: Fallen, decided: Decision, tile: Tile, edited: Tile, left: Re
     edits = decided.edits.copy()
     edits.reshape(-1)[emptied] = int(CellState.CHANGED_EMPTY)
     states = decided.states.copy()
-    told = without_spilled_in(emptied, edits, tile) if len(decided.odds.cells) else edits
-    states.reshape(-1)[emptied] = told.reshape(-1)[emptied]
+    stated = without_spilled_in(emptied, edits, tile) if len(decided.odds.cells) else edits
+    states.reshape(-1)[emptied] = stated.reshape(-1)[emptied]
     undecided = None if decided.undecided is None else left
     return replace(decided, fell=fell, states=states, edits=edits, undecided=undecided), edited, deleted
 
@@ -290,10 +290,10 @@ def hear(
     if quorum < 2 or any(vote.states is None for vote in heard):
         return heard, states, tally, quorum
     for judged in (contradictors, partial(deniers, tile=tile)):
-        found = judged(heard, states, tally, quorum, settings)
-        if found.any():
-            heard = [vote for vote, out in zip(heard, found, strict=True) if not out]
-            quorum = max(2, quorum - int(found.sum()))
+        is_excluded = judged(heard, states, tally, quorum, settings)
+        if is_excluded.any():
+            heard = [vote for vote, out in zip(heard, is_excluded, strict=True) if not out]
+            quorum = max(2, quorum - int(is_excluded.sum()))
             states, tally = count(heard, rule, quorum)
     return heard, states, tally, quorum
 
@@ -390,9 +390,9 @@ def _out_of_step(
 
 def _of_cells(cells: I64, words: NDArray[np.uint32], among: Bool) -> tuple[I64, NDArray[np.uint32]]:
     """Cells (m,), ascending, and words (m, 3) of the points in the cells ``among`` (65536,), each cell's in order."""
-    mine = np.flatnonzero(among[cells])
-    mine = mine[np.argsort(cells[mine], kind="stable")]
-    return cells[mine], words[mine]
+    chosen = np.flatnonzero(among[cells])
+    chosen = chosen[np.argsort(cells[chosen], kind="stable")]
+    return cells[chosen], words[chosen]
 
 
 def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np.uint32]]) -> Bool:

@@ -238,17 +238,17 @@ def _fall_in(
 class _Window:
     """The planes of some sites as one window of whole tiles, and what is found in it."""
 
-    def __init__(self, corner: TileIndex, known: Bool, rest: U64, holds: U64, deleted: U64, base: I32) -> None:
+    def __init__(self, corner: TileIndex, at_hand: Bool, rest: U64, holds: U64, deleted: U64, base: I32) -> None:
         self.corner = corner
-        self.known = known
+        self.known = at_hand
         self.base = base
         self.deleted = deleted
-        self.shown = read_only(rest), read_only(holds), read_only(base), known
+        self.shown = read_only(rest), read_only(holds), read_only(base), at_hand
         self.loose = rest & ~holds != 0
         most = int(np.bitwise_count(rest & ~holds).sum()) + 1
         self.carried = np.zeros(rest.shape, np.uint64)
         self.words = np.zeros(rest.shape, np.uint64)
-        self.asked = np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
+        self.asked = np.zeros((at_hand.shape[0] + 2, at_hand.shape[1] + 2), np.bool_)
         seen = np.zeros(rest.shape, np.uint64)
         stays = np.zeros(rest.shape, np.uint64)
         self.memory = seen, stays, np.empty(most, np.int64), np.empty(most, np.uint64)
@@ -260,11 +260,11 @@ class _Window:
         """The smallest window that holds all ``sites``; what no site shows is not known."""
         row0 = min(row for row, _ in sites)
         col0 = min(col for _, col in sites)
-        known = np.zeros((max(row for row, _ in sites) - row0 + 1, max(col for _, col in sites) - col0 + 1), np.bool_)
+        at_hand = np.zeros((max(row for row, _ in sites) - row0 + 1, max(col for _, col in sites) - col0 + 1), np.bool_)
         for row, col in sites:
-            known[row - row0, col - col0] = True
+            at_hand[row - row0, col - col0] = True
         names = "rest", "holds", "deleted", "base"
-        return cls((row0, col0), known, *(_laid_out(sites, name, (row0, col0), known.shape) for name in names))
+        return cls((row0, col0), at_hand, *(_laid_out(sites, name, (row0, col0), at_hand.shape) for name in names))
 
     @property
     def lattice_corner(self) -> tuple[int, int]:
@@ -464,17 +464,17 @@ def _find_carried(deleted: U64, base: I32, ground: int, gap: int, beside: int, c
 
 @kernel
 def _drop_touching(
-    rest: U64, holds: U64, base: I32, known: Bool, deleted: U64, carried: U64, row0: int, col0: int,
+    rest: U64, holds: U64, base: I32, at_hand: Bool, deleted: U64, carried: U64, row0: int, col0: int,
     lattice_row: int, lattice_col: int, touch: int, longest: int, beside_cells: int, seen: U64, stays: U64,
-    cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
+    cells: I64, words: U64, needed: Bool, fallen: U64, beside: I64,
 ) -> None:  # fmt: skip
     """Into ``fallen`` and ``beside`` the groups that touch a deleted voxel of one tile and that nothing holds.
 
-    The planes are of a window of tiles; ``known`` says which of them are shown. ``row0`` and ``col0`` are the first
+    The planes are of a window of tiles; ``at_hand`` says which of them are shown. ``row0`` and ``col0`` are the first
     cell of the tile in it, ``lattice_row`` and ``lattice_col`` its own on the lattice. Only ``carried`` voxels of the
     ``deleted`` ones count; cells up to ``beside_cells`` away may carry more of them. ``seen`` and ``stays`` mark the
     voxels of groups that were followed, and of those that are held; ``cells`` and ``words`` are memory for one group.
-    Into ``asked``, which has one tile more on every side, the tiles that would decide a group.
+    Into ``needed``, which has one tile more on every side, the tiles that would decide a group.
     """
     rows, cols = rest.shape
     for r in range(row0, row0 + TILE_CELLS):
@@ -484,8 +484,8 @@ def _drop_touching(
             hangs = deleted[r, c] & ~carried[r, c]
             for a in range(r - touch, r + touch + 1):
                 for b in range(c - touch, c + touch + 1):
-                    if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
-                        asked[a // TILE_CELLS + 1, b // TILE_CELLS + 1] = True
+                    if a < 0 or b < 0 or a >= rows or b >= cols or not at_hand[a // TILE_CELLS, b // TILE_CELLS]:
+                        needed[a // TILE_CELLS + 1, b // TILE_CELLS + 1] = True
                         continue
                     loose = rest[a, b] & ~holds[a, b] & ~seen[a, b]
                     if loose == 0:
@@ -493,9 +493,9 @@ def _drop_touching(
                     if hangs:
                         for i in range((r - beside_cells) // TILE_CELLS, (r + beside_cells) // TILE_CELLS + 1):
                             for j in range((c - beside_cells) // TILE_CELLS, (c + beside_cells) // TILE_CELLS + 1):
-                                outside = i < 0 or j < 0 or i >= known.shape[0] or j >= known.shape[1]
-                                if outside or not known[i, j]:
-                                    asked[i + 1, j + 1] = True
+                                outside = i < 0 or j < 0 or i >= at_hand.shape[0] or j >= at_hand.shape[1]
+                                if outside or not at_hand[i, j]:
+                                    needed[i + 1, j + 1] = True
                     near = _seen_from(carried[r, c], base[r, c] - base[a, b])
                     for _ in range(touch):
                         near |= (near << np.uint64(1)) | (near >> np.uint64(1))
@@ -504,8 +504,8 @@ def _drop_touching(
                         start = near & ~seen[a, b]
                         start &= ~start + np.uint64(1)
                         n = _follow(
-                            rest, holds, base, known, a, b, start, _ANYWHERE, 0, 0, _NO_CELLS, _NO_CELLS, _NO_TOPS,
-                            touch, longest, 0, seen, stays, cells, words, asked,
+                            rest, holds, base, at_hand, a, b, start, _ANYWHERE, 0, 0, _NO_CELLS, _NO_CELLS, _NO_TOPS,
+                            touch, longest, 0, seen, stays, cells, words, needed,
                         )  # fmt: skip
                         for k in range(n):
                             x = cells[k] // cols
@@ -516,9 +516,9 @@ def _drop_touching(
 
 @kernel
 def _drop_inside(
-    rest: U64, holds: U64, base: I32, known: Bool, inside: Bool, row0: int, col0: int, body_rows: I64,
+    rest: U64, holds: U64, base: I32, at_hand: Bool, inside: Bool, row0: int, col0: int, body_rows: I64,
     body_cols: I64, body_tops: I32, key: int, rise: int, longest: int, nearest: int, seen: U64, stays: U64,
-    cells: I64, words: U64, asked: Bool, fallen: U64, beside: I64,
+    cells: I64, words: U64, needed: Bool, fallen: U64, beside: I64,
 ) -> None:  # fmt: skip
     """Into ``fallen`` and ``beside`` (``key``) the groups inside a body that nothing holds: ``inside`` (h, w) as in
     :class:`_Body`, from ``row0``, ``col0`` of the window; ``body_rows``, ``body_cols`` and ``body_tops`` (n,) are
@@ -534,8 +534,8 @@ def _drop_inside(
             while waiting:
                 start = waiting & (~waiting + np.uint64(1))
                 n = _follow(
-                    rest, holds, base, known, a, b, start, inside, row0, col0, body_rows, body_cols, body_tops, rise,
-                    longest, nearest, seen, stays, cells, words, asked,
+                    rest, holds, base, at_hand, a, b, start, inside, row0, col0, body_rows, body_cols, body_tops, rise,
+                    longest, nearest, seen, stays, cells, words, needed,
                 )  # fmt: skip
                 for k in range(n):
                     x = cells[k] // cols
@@ -547,9 +547,9 @@ def _drop_inside(
 
 @kernel
 def _follow(
-    rest: U64, holds: U64, base: I32, known: Bool, row: int, col: int, start: np.uint64, inside: Bool, row0: int,
+    rest: U64, holds: U64, base: I32, at_hand: Bool, row: int, col: int, start: np.uint64, inside: Bool, row0: int,
     col0: int, body_rows: I64, body_cols: I64, body_tops: I32, rise: int, longest: int, nearest: int, seen: U64,
-    stays: U64, cells: I64, words: U64, asked: Bool,
+    stays: U64, cells: I64, words: U64, needed: Bool,
 ) -> int:  # fmt: skip
     """How many entries of ``cells`` and ``words`` are the group of a voxel that falls; 0 if it stays or is undecided.
 
@@ -591,7 +591,7 @@ def _follow(
             begins = base[r, c] + lowest <= top + rise
         for a in range(r - 1, r + 2):
             for b in range(c - 1, c + 2):
-                if a < 0 or b < 0 or a >= rows or b >= cols or not known[a // TILE_CELLS, b // TILE_CELLS]:
+                if a < 0 or b < 0 or a >= rows or b >= cols or not at_hand[a // TILE_CELLS, b // TILE_CELLS]:
                     wanted |= 1 << ((a // TILE_CELLS + 1) * wide + b // TILE_CELLS + 1)
                     continue
                 near = _seen_from(words[done], base[r, c] - base[a, b])
@@ -624,7 +624,7 @@ def _follow(
         for k in range(n):
             seen[cells[k] // cols, cells[k] % cols] &= ~words[k]
         return 0
-    for k in range(asked.shape[0] * wide):
+    for k in range(needed.shape[0] * wide):
         if wanted >> k & 1:
-            asked[k // wide, k % wide] = True
+            needed[k // wide, k % wide] = True
     return 0 if wanted else n

@@ -105,8 +105,8 @@ def change_probability(
     UNSAID where none is stated; (n,) each."""
     built = (states == CellState.CHANGED_OCCUPIED)[:, None]
     more = np.minimum(votes, HARM_CURVES.most_votes) - 2.0
-    told = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
-    alone = (np.where(built, HARM_CURVES.built, HARM_CURVES.demolished) * told).sum(axis=1)
+    features = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
+    alone = (np.where(built, HARM_CURVES.built, HARM_CURVES.demolished) * features).sum(axis=1)
     if odds is None:
         return _logistic(alone)
     curve = np.where(built, HARM_CURVES.built_stated, HARM_CURVES.demolished_stated)
@@ -159,8 +159,8 @@ class PendingDeletions:
 
     def at(self, cell: tuple[int, int]) -> float | None:
         """Probability of the waiting deletion of one cell (row, col) of the tile; None if it does not wait."""
-        found = np.flatnonzero(self.cells == cell[0] * TILE_CELLS + cell[1])
-        return float(self.probability[found[0]]) if len(found) else None
+        places = np.flatnonzero(self.cells == cell[0] * TILE_CELLS + cell[1])
+        return float(self.probability[places[0]]) if len(places) else None
 
 
 def beyond_budget(states: U8, odds: Odds, settings: FuseSettings) -> PendingDeletions:
@@ -202,12 +202,12 @@ class Waypoint:
 
 def waypoints(pending: Mapping[TileIndex, PendingDeletions], lattice: Lattice) -> list[Waypoint]:
     """Waiting deletions on some tiles, by squares of WAYPOINT_CELLS cells, those with the most cells first."""
-    found = [(tile, waits) for tile, waits in pending.items() if len(waits.cells)]
-    if not found:
+    waiting = [(tile, waits) for tile, waits in pending.items() if len(waits.cells)]
+    if not waiting:
         return []
-    rows = np.concatenate([tile[0] * TILE_CELLS + waits.cells // TILE_CELLS for tile, waits in found])
-    cols = np.concatenate([tile[1] * TILE_CELLS + waits.cells % TILE_CELLS for tile, waits in found])
-    probability = np.concatenate([waits.probability for _, waits in found])
+    rows = np.concatenate([tile[0] * TILE_CELLS + waits.cells // TILE_CELLS for tile, waits in waiting])
+    cols = np.concatenate([tile[1] * TILE_CELLS + waits.cells % TILE_CELLS for tile, waits in waiting])
+    probability = np.concatenate([waits.probability for _, waits in waiting])
     squares = np.stack([rows // WAYPOINT_CELLS, cols // WAYPOINT_CELLS], axis=1)
     square, size = np.unique(squares, axis=0, return_inverse=True, return_counts=True)[1:]
     square = square.reshape(-1)

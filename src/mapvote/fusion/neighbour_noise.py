@@ -53,9 +53,9 @@ def without_spilled(states: U8, tile: Tile, votes: Sequence[Vote]) -> U8:
     cells = spilled(tile, votes, states)
     if not len(cells):
         return states
-    told = states.copy()
-    told.reshape(-1)[cells] = int(CellState.UNCHANGED_EMPTY)
-    return told
+    stated = states.copy()
+    stated.reshape(-1)[cells] = int(CellState.UNCHANGED_EMPTY)
+    return stated
 
 
 def without_spilled_in(cells: I64, states: U8, tile: Tile) -> U8:
@@ -77,7 +77,7 @@ def spilled(tile: Tile, votes: Sequence[Vote], states: U8) -> I64:
     not used. Every such cell lies beside a changed one of its kind with more points.
     """
     flat = states.reshape(-1)
-    found = [
+    cells_of = [
         _beside_their_surface(points, flat == kind, tile.window)
         for points, kind in (
             (_going(tile, flat), int(CellState.CHANGED_EMPTY)),
@@ -85,7 +85,7 @@ def spilled(tile: Tile, votes: Sequence[Vote], states: U8) -> I64:
         )
         if len(points) >= NOISE_RULE.enough_points
     ]
-    return np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
+    return np.sort(np.concatenate([np.zeros(0, np.int64), *cells_of]))
 
 
 def _going(tile: Tile, states: U8) -> F32:
@@ -105,9 +105,9 @@ def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:
     points = points[order]
     cells = cells[order]
     count = np.bincount(cells, minlength=CELLS)
-    asked = np.flatnonzero(_at_a_fuller_one(points, cells, count, changed)[cells])
-    stands = _on_planes(points, asked, np.concatenate([[0], np.cumsum(count)]), cells)
-    own = cells[asked]
+    tested = np.flatnonzero(_at_a_fuller_one(points, cells, count, changed)[cells])
+    stands = _on_planes(points, tested, np.concatenate([[0], np.cumsum(count)]), cells)
+    own = cells[tested]
     to = flat_cells(window, stands.astype(np.float32))
     away = np.bincount(own[(to != own) & changed[to] & (count[to] > count[own])], minlength=CELLS)
     return np.flatnonzero((away > 0) & (away >= (1.0 - NOISE_RULE.stay_share) * count))
@@ -116,7 +116,7 @@ def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:
 def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool:
     """(65536,) of which flat cells all points (m, 3) lie near one side, and across it lies a ``changed`` cell with more
     of them. ``cells`` (m,) of the points, ``count`` (65536,) how many each has."""
-    found = np.zeros(CELLS, dtype=np.bool_)
+    is_beside = np.zeros(CELLS, dtype=np.bool_)
     filled = np.flatnonzero(count)
     wide = TILE_CELLS + 2
     held = np.pad(np.where(changed, count, 0).reshape(TILE_CELLS, TILE_CELLS), 1).reshape(-1)
@@ -126,18 +126,18 @@ def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool
             deep = np.bincount(cells[depth > NOISE_RULE.near_m], minlength=CELLS)
             near = filled[deep[filled] <= NOISE_RULE.stay_share * count[filled]]
             beside = held[(near // TILE_CELLS + 1) * wide + near % TILE_CELLS + 1 + across]
-            found[near[beside > count[near]]] = True
-    return found
+            is_beside[near[beside > count[near]]] = True
+    return is_beside
 
 
-def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
-    """(k, 3) the points ``asked`` (k,), each moved onto the upright plane through those about it, where there
+def _on_planes(points: F32, tested: I64, first: I64, cells: I64) -> F64:
+    """(k, 3) the points ``tested`` (k,), each moved onto the upright plane through those about it, where there
     is one and it is near."""
-    about = points[asked].astype(np.float64)
-    n = np.zeros(len(asked), np.int64)
-    mean = np.zeros((len(asked), 3))
-    spread = np.zeros((len(asked), 3, 3))
-    _moments(points, asked, first, cells, n, mean, spread)
+    about = points[tested].astype(np.float64)
+    n = np.zeros(len(tested), np.int64)
+    mean = np.zeros((len(tested), 3))
+    spread = np.zeros((len(tested), 3, 3))
+    _moments(points, tested, first, cells, n, mean, spread)
     variance, axes = np.linalg.eigh(spread)
     normal = axes[:, :, 0]
     plane = (
@@ -151,14 +151,14 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
 
 
 @kernel
-def _moments(points: F32, asked: I64, first: I64, cells: I64, number: I64, mean: F64, spread: F64) -> None:
+def _moments(points: F32, tested: I64, first: I64, cells: I64, number: I64, mean: F64, spread: F64) -> None:
     """Into zeros: ``number`` (k,), ``mean`` (k, 3) from the point itself and covariance ``spread`` (k, 3, 3) of the
-    points within REACH_M of each of ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,);
+    points within REACH_M of each of ``tested`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,);
     ``first`` (65537,) of each cell."""
     reach = int(np.ceil(REACH_M / CELL_SIZE))
-    for k in range(len(asked)):
-        point = asked[k]
-        row, col = divmod(cells[asked[k]], TILE_CELLS)
+    for k in range(len(tested)):
+        point = tested[k]
+        row, col = divmod(cells[tested[k]], TILE_CELLS)
         for r in range(max(row - reach, 0), min(row + reach + 1, TILE_CELLS)):
             left = max(col - reach, 0)
             right = min(col + reach, TILE_CELLS - 1)

@@ -127,11 +127,11 @@ def stretches(window: Grid, witnesses: Sequence[Witness], quorum: int) -> list[S
         nearest = scipy.spatial.cKDTree(at).query(np.column_stack([x[cols], y[rows]]))[1]
         sector = np.round(np.arctan2(*heading[nearest].T[::-1]) * SECTORS / (2 * np.pi)).astype(np.int64) % SECTORS
         for k in np.unique(sector).tolist():
-            mine = sector == k
-            counted.setdefault(k, np.zeros(short.shape, dtype=np.bool_))[rows[mine], cols[mine]] = True
-            if mine.sum() > roads.get(k, (0, at))[0]:
-                road = at[nearest[mine].min() : nearest[mine].max() + 1]
-                roads[k] = int(mine.sum()), np.concatenate([road, road[-1:] + heading[nearest[mine].max()]])
+            in_sector = sector == k
+            counted.setdefault(k, np.zeros(short.shape, dtype=np.bool_))[rows[in_sector], cols[in_sector]] = True
+            if in_sector.sum() > roads.get(k, (0, at))[0]:
+                road = at[nearest[in_sector].min() : nearest[in_sector].max() + 1]
+                roads[k] = int(in_sector.sum()), np.concatenate([road, road[-1:] + heading[nearest[in_sector].max()]])
     out = [
         Stretch(
             window.tile_index,

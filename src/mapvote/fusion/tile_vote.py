@@ -100,8 +100,8 @@ class Vote(Planes):
         """Indices of those of the flat ``cells`` (n,) that are ``decided`` (256, 256) as ``state``, which this vote
         supports."""
         if self.states is not None:
-            found = np.empty(len(cells), dtype=np.intp)
-            return found[: agreeing(cells, self.states.reshape(-1), decided.reshape(-1), int(state), found)]
+            places = np.empty(len(cells), dtype=np.intp)
+            return places[: agreeing(cells, self.states.reshape(-1), decided.reshape(-1), int(state), places)]
         return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
 
     def determined(self, cells: NDArray[np.intp]) -> Bool:
@@ -228,16 +228,16 @@ def fold(drives: Sequence[Vote], grid: Grid) -> Vote:
         states = _laid_over([drive.states for drive in ordered])
     else:
         tally = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.uint16)
-        for drive, mine in zip(ordered, last, strict=True):
+        for drive, is_last in zip(ordered, last, strict=True):
             if drive.tally is not None:
-                tally[mine.reshape(tally.shape[:2])] = drive.tally[mine.reshape(tally.shape[:2])]
+                tally[is_last.reshape(tally.shape[:2])] = drive.tally[is_last.reshape(tally.shape[:2])]
     if any(drive.unrestricted is not None for drive in ordered):
         unrestricted = _laid_over([drive.sent for drive in ordered])
     points: list[F32] = []
     fields: list[tuple[int, Fields]] = []
-    for drive, mine in zip(ordered, last, strict=True):
+    for drive, is_last in zip(ordered, last, strict=True):
         if drive.new_points is not None:
-            here = mine[flat_cells(grid, drive.new_points)]
+            here = is_last[flat_cells(grid, drive.new_points)]
             points.append(drive.new_points[here])
             fields.append((len(points[-1]), {name: values[here] for name, values in drive.fields.items()}))
     free = [drive.free.within(said) for drive, said in zip(ordered, spoken, strict=True) if drive.free is not None]
@@ -248,7 +248,7 @@ def fold(drives: Sequence[Vote], grid: Grid) -> Vote:
         states=states,
         unrestricted=unrestricted,
         tally=tally,
-        gone=union([_marked(drive, mine) for drive, mine in zip(ordered, last, strict=True)]),
+        gone=union([_marked(drive, is_last) for drive, is_last in zip(ordered, last, strict=True)]),
         new_points=np.concatenate(points) if points else None,
         fields=joined_fields(fields),
         free=union(free) if free else None,
@@ -259,7 +259,7 @@ def fold(drives: Sequence[Vote], grid: Grid) -> Vote:
 def folded(drives: Sequence[Vote], last: Sequence[Bool]) -> Odds | None:
     """The confidence of a vehicle's ``drives``, each in the flat cells (65536,) in which it is the ``last`` to vote;
     None if none states any."""
-    parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
+    parts = [drive.odds.within(is_last) for drive, is_last in zip(drives, last, strict=True) if drive.odds is not None]
     if not parts:
         return None
     cells = np.concatenate([part.cells for part in parts])
@@ -270,11 +270,11 @@ def folded(drives: Sequence[Vote], last: Sequence[Bool]) -> Odds | None:
 def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
     """The flat cells (65536,) in which each drive has a vote and no later one has; drives in the order of time."""
     since = np.zeros(CELLS, dtype=np.bool_)
-    found = []
-    for mine in reversed(spoken):
-        found.append(mine > since)
-        since = since | mine
-    return found[::-1]
+    last = []
+    for votes_here in reversed(spoken):
+        last.append(votes_here > since)
+        since = since | votes_here
+    return last[::-1]
 
 
 def _laid_over(planes: Sequence[U8 | None]) -> U8:
@@ -286,11 +286,11 @@ def _laid_over(planes: Sequence[U8 | None]) -> U8:
     return out
 
 
-def _marked(drive: Vote, mine: Bool) -> Words:
-    """The voxels that a drive deletes, and its remnants, in the flat cells ``mine`` (65536,)."""
+def _marked(drive: Vote, cells: Bool) -> Words:
+    """The voxels that a drive deletes, and its remnants, in the flat cells ``cells`` (65536,)."""
     if drive.gone is None:
-        return drive.deletes(Words.whole(mine))
-    marked = drive.gone.within(mine)
+        return drive.deletes(Words.whole(cells))
+    marked = drive.gone.within(cells)
     emptied = CellState.CHANGED_EMPTY
     stands = CellState.UNCHANGED_OCCUPIED
     return marked.at(drive.supports(emptied, marked.cells) | drive.supports(stands, marked.cells))
@@ -308,14 +308,14 @@ def offered(votes: Sequence[Vote], decided: U8, grid: Grid) -> tuple[F32, dict[s
     """(points (n, 3), their attributes (n,), cells (n,), numbers of their votes (n,)) that ``votes`` offer for the
     cells ``decided`` (256, 256) as changed-occupied for which they voted so too."""
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
-    found: list[tuple[F32, I64, I32]] = [nothing]
+    offers: list[tuple[F32, I64, I32]] = [nothing]
     fields: list[tuple[int, Fields]] = []
     for number, vote in enumerate(votes):
         if vote.new_points is not None and len(vote.new_points):
             cells = flat_cells(grid, vote.new_points)
             keep = vote.agreed(cells, decided, CellState.CHANGED_OCCUPIED)
             whose = np.full(len(keep), number, dtype=np.int32)
-            found.append((vote.new_points.take(keep, axis=0), cells[keep], whose))
+            offers.append((vote.new_points.take(keep, axis=0), cells[keep], whose))
             fields.append((len(keep), {name: values[keep] for name, values in vote.fields.items()}))
-    points, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    points, cells, voters = (np.concatenate(parts) for parts in zip(*offers, strict=True))
     return points, joined_fields(fields), cells, voters

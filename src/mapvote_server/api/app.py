@@ -105,18 +105,18 @@ def create_app(
 
 async def keep_overview(parts: Services) -> None:
     """Make the overview of each new version, until it is cancelled; no tile is begun once the server stops."""
-    known = None
+    drawn = None
     stop = parts.stopping.is_set
     while True:
         try:
             newest = await parts.newest.put(None)
-            if newest != known:
-                known = newest
+            if newest != drawn:
+                drawn = newest
                 await parts.rounds.run(parts.clouds.overview, newest, stop)
         except Unavailable:
             pass
         except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error
-            structlog.get_logger("mapvote").warning("overview", version=known, error=str(error)[:200])
+            structlog.get_logger("mapvote").warning("overview", version=drawn, error=str(error)[:200])
         await asyncio.sleep(_EVERY_S)
 
 
@@ -165,7 +165,7 @@ class _Transport(httpx2.BaseTransport):
         return self._portal.call(self._answer, request)
 
     async def _answer(self, request: httpx2.Request) -> httpx2.Response:
-        asked = httpx2.Request(request.method, request.url, headers=request.headers, content=request.read())
-        answer = await self._asgi.handle_async_request(asked)
+        own_request = httpx2.Request(request.method, request.url, headers=request.headers, content=request.read())
+        answer = await self._asgi.handle_async_request(own_request)
         encoded = b"".join([part async for part in answer.aiter_raw()])
         return httpx2.Response(answer.status_code, headers=answer.headers, content=encoded)

@@ -53,19 +53,21 @@ class ChangesAsked(Between):
     summary="What changed, as GeoJSON in map metres or as CSV",
 )
 @on("questions")
-def changes(request: Request, parts: Parts, known: Known, asked: Annotated[ChangesAsked, Query()]) -> Response:
+def changes(request: Request, parts: Parts, with_names: Known, query: Annotated[ChangesAsked, Query()]) -> Response:
     """Things built and demolished between two versions, the largest first; ``to`` is the newest by default.
 
     If there are more than ``limit``, the header Link names the next part.
     """
-    newest = parts.store.current() if asked.new is None else asked.new
-    headers = _headers(compare_versions(parts.store, asked.old, newest), known, asked)
+    newest = parts.store.current() if query.new is None else query.new
+    headers = _headers(compare_versions(parts.store, query.old, newest), with_names, query)
     if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    shown: dict[str, Any] = {"limit": asked.limit, "offset": asked.offset}
-    listed = changes_between(parts.store, asked.old, newest, asked.min_cells, lonlat=asked.lonlat, known=known, **shown)
-    answer = as_table(feature_rows(listed.features)) if asked.format == "csv" else as_json(listed)
-    after = asked.offset + listed.numberReturned
+    shown: dict[str, Any] = {"limit": query.limit, "offset": query.offset}
+    listed = changes_between(
+        parts.store, query.old, newest, query.min_cells, lonlat=query.lonlat, with_names=with_names, **shown
+    )
+    answer = as_table(feature_rows(listed.features)) if query.format == "csv" else as_json(listed)
+    after = query.offset + listed.numberReturned
     if after < listed.numberMatched:
         following = dict(request.query_params) | {"to": str(newest), "offset": str(after)}
         headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
@@ -110,20 +112,20 @@ def _lanelets(store: Store, names: bool, choice: LaneletsAsked, osm: bytes) -> R
     summary="What changed, as a page that needs no server",
 )
 @on("questions")
-def changes_page(request: Request, parts: Parts, known: Known, asked: Annotated[Between, Query()]) -> Response:
+def changes_page(request: Request, parts: Parts, with_names: Known, query: Annotated[Between, Query()]) -> Response:
     """A file to keep or to mail: the clouds of the largest changes, before and after."""
     store = parts.store
-    newest = store.current() if asked.new is None else asked.new
-    headers = _headers(compare_versions(store, asked.old, newest), known, asked)
+    newest = store.current() if query.new is None else query.new
+    headers = _headers(compare_versions(store, query.old, newest), with_names, query)
     if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     page = page_between(
-        store, asked.old, newest, changes_between(store, asked.old, newest, asked.min_cells, known=known)
+        store, query.old, newest, changes_between(store, query.old, newest, query.min_cells, with_names=with_names)
     )
     headers["Content-Disposition"] = 'attachment; filename="changes.html"'
     return Response(page, media_type="text/html", headers=headers)
 
 
-def _headers(compared: Comparison, known: bool, asked: Between) -> dict[str, str]:
-    tag = tag_of(compared.digest, known, asked.model_dump(exclude={"new"}))
+def _headers(compared: Comparison, with_names: bool, query: Between) -> dict[str, str]:
+    tag = tag_of(compared.digest, with_names, query.model_dump(exclude={"new"}))
     return {"ETag": tag, "Cache-Control": "private, no-cache"}

@@ -102,13 +102,13 @@ async def _stream(request: Request, parts: Services, seq: int, key: Key | None, 
     yield b": listening\n\n"
     silent = 0.0
     while not parts.stopping.is_set() and not await request.is_disconnected():
-        found = await parts.look_up(parts.feed.after, seq)
+        events = await parts.look_up(parts.feed.after, seq)
         if not await _still_open(parts, key, request.state.key_hash):
             return
-        for event in found if named else without_names(found):
+        for event in events if named else without_names(events):
             yield as_sse(event)
-        if found:
-            seq = found[-1].seq
+        if events:
+            seq = events[-1].seq
             silent = 0.0
             continue
         await asyncio.sleep(LISTENER_TIMES.poll_s)
@@ -154,8 +154,8 @@ async def deliver(parts: Services) -> None:
 
     A post that is not answered by 2xx is repeated, after one second, then two, four, at most sixty; none overtakes it.
     """
-    asked = parts.settings.server
-    seq = noted = await parts.look_up(taken_up_to, parts.store, asked.webhook_url)
+    configured = parts.settings.server
+    seq = noted = await parts.look_up(taken_up_to, parts.store, configured.webhook_url)
     wait = LISTENER_TIMES.poll_s
     async with httpx2.AsyncClient(timeout=LISTENER_TIMES.timeout_s, follow_redirects=False) as client:
         while True:
@@ -164,11 +164,11 @@ async def deliver(parts: Services) -> None:
                 if events:
                     body = msgspec.json.encode({"map_id": parts.store.map_id, "events": events})
                     at = datetime.fromtimestamp(parts.store.clock() // 10**9, UTC)
-                    headers = signed(asked.webhook_secret, events, at, body)
-                    (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
+                    headers = signed(configured.webhook_secret, events, at, body)
+                    (await client.post(configured.webhook_url, content=body, headers=headers)).raise_for_status()
                     seq = events[-1].seq
                 if seq != noted:
-                    await parts.look_up(take, parts.store, asked.webhook_url, seq)
+                    await parts.look_up(take, parts.store, configured.webhook_url, seq)
                     noted = seq
                 wait = LISTENER_TIMES.poll_s
             except (httpx2.HTTPError, Unavailable) as error:

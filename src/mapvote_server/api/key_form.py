@@ -30,10 +30,10 @@ def key_in_cookie(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
     """The key that the form has left with the browser."""
     sent = next((value.decode("latin-1") for name, value in headers if name == b"cookie"), "")
     try:
-        found = SimpleCookie(sent).get(COOKIE)
+        cookie = SimpleCookie(sent).get(COOKIE)
     except CookieError:
         return None
-    return found.value if found else None
+    return cookie.value if cookie else None
 
 
 def asks_for_page(scope: Scope) -> bool:
@@ -48,9 +48,9 @@ def is_page(scope: Scope) -> bool:
     return scope["method"] == "GET" and scope["path"] in _PAGES and mode == b"navigate"
 
 
-def form(why: str = "") -> Response:
-    """401 with the form; ``why`` the last key was not taken."""
-    body = _file("key.html").replace("WHY", html.escape(why))
+def form(reason: str = "") -> Response:
+    """401 with the form; ``reason`` the last key was not taken."""
+    body = _file("key.html").replace("WHY", html.escape(reason))
     return Response(body, 401, {"WWW-Authenticate": "Bearer", "Cache-Control": "no-store"}, media_type="text/html")
 
 
@@ -71,12 +71,12 @@ async def key_sent(scope: Scope, receive: Receive) -> str:
         if len(body) > _MOST_BYTES:
             raise Unauthorised("this is no key: paste the one that the operator gave you")
     try:
-        found = parse_qs(body.decode()).get("key", [""])[0].strip()
+        key = parse_qs(body.decode()).get("key", [""])[0].strip()
     except (UnicodeDecodeError, ValueError):
-        found = ""
-    if not found:
+        key = ""
+    if not key:
         raise Unauthorised("this is no key: paste the one that the operator gave you")
-    return found
+    return key
 
 
 def welcome(scope: Scope, key: str) -> Response:

@@ -67,14 +67,14 @@ class Budget:
         for unit, per_minute in self._limits.items():
             over = self._used(name, unit) - per_minute
             if over >= 0.0:
-                why = f"{name!r} has used more than {per_minute:g} {unit} a minute: ask less often, or for less"
-                raise TooMany(why, max(1.0, 60.0 * over / per_minute))
+                message = f"{name!r} has used more than {per_minute:g} {unit} a minute: ask less often, or for less"
+                raise TooMany(message, max(1.0, 60.0 * over / per_minute))
 
     def spend(self, name: str, seconds: float, rows: int) -> None:
         """Charge work that was done."""
-        now = self._clock()
+        now_s = self._clock()
         for unit, used in (("seconds of work", seconds), ("rows", rows)):
-            self._spent[name, unit] = self._used(name, unit) + used, now
+            self._spent[name, unit] = self._used(name, unit) + used, now_s
         if len(self._spent) > QUEUES.names_kept:
             self._spent = {key: kept for key, kept in self._spent.items() if self._used(*key) > 0.0}
 

@@ -88,28 +88,28 @@ async def documentation(request: Request) -> Response:
 
 @router.get("/ogc/collections")
 @on("questions")
-def collections(request: Request, parts: Parts, known: Known) -> Response:
+def collections(request: Request, parts: Parts, with_names: Known) -> Response:
     """All that the key may see."""
     _check(request)
     place = OnEarth.of(parts.store)
-    shown = [name for name, kind in COLLECTIONS.items() if known or not kind.for_reviewers]
+    shown = [name for name, kind in COLLECTIONS.items() if with_names or not kind.for_reviewers]
     listed = [_described(request, name, COLLECTIONS[name], place) for name in shown]
     links = [_link(request, "/collections", "self", _JSON, "the collections")]
     return _answer(request, {"links": links, "collections": listed, "crs": place.systems})
 
 
 @router.get("/ogc/collections/{name}")
-async def collection(request: Request, parts: Parts, known: Known, name: str) -> Response:
+async def collection(request: Request, parts: Parts, with_names: Known, name: str) -> Response:
     """One of them, with its extent."""
-    pending = await _pending(parts, _named(name, known))
-    return await parts.questions.run(_collection, request, parts.store, known, name, pending)
+    pending = await _pending(parts, _named(name, with_names))
+    return await parts.questions.run(_collection, request, parts.store, with_names, name, pending)
 
 
-def _collection(request: Request, store: Store, known: bool, name: str, pending: Features | None) -> Response:
+def _collection(request: Request, store: Store, with_names: bool, name: str, pending: Features | None) -> Response:
     _check(request)
     kind = COLLECTIONS[name]
     place = OnEarth.of(store)
-    box = extent(_features(store, kind, known, request, pending), place)
+    box = extent(_features(store, kind, with_names, request, pending), place)
     about = _described(request, name, kind, place)
     if box is not None:
         about["extent"] = {"spatial": {"bbox": [box], "crs": CRS84}}
@@ -117,20 +117,20 @@ def _collection(request: Request, store: Store, known: bool, name: str, pending:
 
 
 @router.get("/ogc/collections/{name}/items")
-async def items(request: Request, parts: Parts, known: Known, name: str) -> Response:
+async def items(request: Request, parts: Parts, with_names: Known, name: str) -> Response:
     """Its features: those that meet ``bbox`` and ``datetime``, ``limit`` of them after ``offset``."""
-    pending = await _pending(parts, _named(name, known))
-    return await parts.questions.run(_items, request, parts.store, known, name, pending)
+    pending = await _pending(parts, _named(name, with_names))
+    return await parts.questions.run(_items, request, parts.store, with_names, name, pending)
 
 
-def _items(request: Request, store: Store, known: bool, name: str, pending: Features | None) -> Response:
+def _items(request: Request, store: Store, with_names: bool, name: str, pending: Features | None) -> Response:
     kind = COLLECTIONS[name]
     place = OnEarth.of(store)
-    asked = _Asked.of(request, kind, place)
-    features = _features(store, kind, known, request, pending)
-    features = within(features, asked.box, place, asked.box_crs) if asked.box and features else features
-    features = during(features, asked.datetime) if asked.datetime else features
-    shown = [placed(feature, place, asked.crs) for feature in features[asked.offset : asked.offset + asked.limit]]
+    wanted = _Asked.of(request, kind, place)
+    features = _features(store, kind, with_names, request, pending)
+    features = within(features, wanted.box, place, wanted.box_crs) if wanted.box and features else features
+    features = during(features, wanted.datetime) if wanted.datetime else features
+    shown = [placed(feature, place, wanted.crs) for feature in features[wanted.offset : wanted.offset + wanted.limit]]
     path = f"/collections/{name}/items"
     query = dict(request.query_params)
     links = [
@@ -138,33 +138,33 @@ def _items(request: Request, store: Store, known: bool, name: str, pending: Feat
         _link(request, path, "alternate", _HTML, "this page for people", query | {"f": "html"}),
         _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
     ]
-    after = asked.offset + len(shown)
+    after = wanted.offset + len(shown)
     if after < len(features):
         links.append(_link(request, path, "next", _GEOJSON, "the next page", query | {"offset": str(after)}))
-    if asked.offset > 0:
-        before = query | {"offset": str(max(asked.offset - asked.limit, 0))}
+    if wanted.offset > 0:
+        before = query | {"offset": str(max(wanted.offset - wanted.limit, 0))}
         links.append(_link(request, path, "prev", _GEOJSON, "the page before", before))
     counts = {"numberMatched": len(features), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
-    found = {"type": "FeatureCollection", "features": shown, "links": links} | counts
-    return _answer(request, found, _GEOJSON, {"Content-Crs": f"<{asked.crs}>"})
+    answer = {"type": "FeatureCollection", "features": shown, "links": links} | counts
+    return _answer(request, answer, _GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
 
 
 @router.get("/ogc/collections/{name}/items/{feature_id}")
-async def item(request: Request, parts: Parts, known: Known, name: str, feature_id: str) -> Response:
+async def item(request: Request, parts: Parts, with_names: Known, name: str, feature_id: str) -> Response:
     """One feature."""
-    pending = await _pending(parts, _named(name, known))
-    return await parts.questions.run(_item, request, parts.store, known, name, feature_id, pending)
+    pending = await _pending(parts, _named(name, with_names))
+    return await parts.questions.run(_item, request, parts.store, with_names, name, feature_id, pending)
 
 
 def _item(
-    request: Request, store: Store, known: bool, name: str, feature_id: str, pending: Features | None
+    request: Request, store: Store, with_names: bool, name: str, feature_id: str, pending: Features | None
 ) -> Response:
     kind = COLLECTIONS[name]
     place = OnEarth.of(store)
-    asked = _Asked.of(request, kind, place, ("crs",))
-    features = _features(store, kind, known, request, pending)
-    found = next((feature for feature in features if feature["id"] == feature_id), None)
-    if found is None:
+    query = _Asked.of(request, kind, place, ("crs",))
+    features = _features(store, kind, with_names, request, pending)
+    wanted = next((feature for feature in features if feature["id"] == feature_id), None)
+    if wanted is None:
         raise NotFound(f"{name} has no feature {feature_id[:80]!r}")
     path = f"/collections/{name}/items/{feature_id}"
     links = [
@@ -172,8 +172,8 @@ def _item(
         _link(request, path, "alternate", _HTML, "this feature for people", {"f": "html"}),
         _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
     ]
-    shown = placed(found, place, asked.crs) | {"links": links}
-    return _answer(request, shown, _GEOJSON, {"Content-Crs": f"<{asked.crs}>"})
+    shown = placed(wanted, place, query.crs) | {"links": links}
+    return _answer(request, shown, _GEOJSON, {"Content-Crs": f"<{query.crs}>"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,11 +221,11 @@ def _check(request: Request, names: Sequence[str] = ()) -> None:
         raise BadRequest("f is json or html")
 
 
-def _named(name: str, known: bool) -> Collection:
+def _named(name: str, with_names: bool) -> Collection:
     kind = COLLECTIONS.get(name)
     if kind is None:
         raise NotFound(f"no collection {name[:80]!r}; there are {', '.join(COLLECTIONS)}")
-    if kind.for_reviewers and not known:
+    if kind.for_reviewers and not with_names:
         raise Forbidden(f"only a reviewer or operator can see {name}")
     return kind
 
@@ -234,19 +234,19 @@ async def _pending(parts: Services, kind: Collection) -> Features | None:
     """The features of the desk, whose work has a lane of its own; None for every other collection."""
     if kind.features is not None:
         return None
-    found = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
-    pending: Features = msgspec.to_builtins(found.answer.pending.features)
+    desk_now = await parts.rounds.run(desk, parts.store, parts.fusing, parts.gate)
+    pending: Features = msgspec.to_builtins(desk_now.answer.pending.features)
     return pending
 
 
-def _features(store: Store, kind: Collection, known: bool, request: Request, pending: Features | None) -> Features:
+def _features(store: Store, kind: Collection, with_names: bool, request: Request, pending: Features | None) -> Features:
     """All features of a collection, in map metres; of the desk those ``pending``."""
     if kind.features is None:
         return pending or []
     newest = store.current() if kind.of_versions else 1
     new = _integer(request.query_params, "to", newest, LEAST)
     old = _integer(request.query_params, "from", max(new - 1, LEAST), LEAST)
-    return kind.features(store, known, old, new)
+    return kind.features(store, with_names, old, new)
 
 
 def _described(request: Request, name: str, kind: Collection, place: OnEarth) -> dict[str, Any]:

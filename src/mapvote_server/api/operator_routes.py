@@ -184,10 +184,10 @@ async def roll_back(by: Operator, parts: Parts, ask: RollbackAsk) -> Response:
     summary="The votes behind one cell",
 )
 @on("questions")
-def cell(parts: Parts, known: Known, x: Metres, y: Metres) -> Response:
+def cell(parts: Parts, with_names: Known, x: Metres, y: Metres) -> Response:
     """Each ballot's statement on the cell at (x, y), map metres, whether it counts, and the decision of each
     version."""
-    return as_json(explain_cell(parts.store, x, y, known=known))
+    return as_json(explain_cell(parts.store, x, y, with_names=with_names))
 
 
 @answer
@@ -206,9 +206,9 @@ class Coverage:
     summary="Freshness of every tile",
 )
 @on("questions")
-def fresh(parts: Parts, known: Known, format: TableOrMap = "json") -> Response:
+def fresh(parts: Parts, with_names: Known, format: TableOrMap = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
-    tiles = tiles_seen(parts.store, known)
+    tiles = tiles_seen(parts.store, with_names)
     if format == "json":
         return as_json(Coverage(tiles))
     rows = [asdict(tile) for tile in tiles]
@@ -246,13 +246,13 @@ class Vehicles:
 @on("questions")
 def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
     """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
-    found = vehicle_standings(parts.store)
+    standings = vehicle_standings(parts.store)
     if format == "csv":
-        return as_table(standing_rows(found))
+        return as_table(standing_rows(standings))
     if format == "geojson":
-        return as_json(contradictions(found))
+        return as_json(contradictions(standings))
     return as_json(
-        Vehicles([replace(standing, evidence=standing.evidence[: OPERATOR_SIZES.evidence]) for standing in found])
+        Vehicles([replace(standing, evidence=standing.evidence[: OPERATOR_SIZES.evidence]) for standing in standings])
     )
 
 
@@ -260,15 +260,15 @@ def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Respons
     "/v1/policy", operation_id="get_policy", response_model=PolicyChange, responses=problems(), summary="The policy"
 )
 @on("questions")
-def policy(parts: Parts, known: Known) -> Response:
+def policy(parts: Parts, with_names: Known) -> Response:
     """The policy in force, who set it and why. Only reviewers and operators see the name of its gate drive."""
-    return _policy_of(parts, known)
+    return _policy_of(parts, with_names)
 
 
-def _policy_of(parts: Services, known: bool) -> Response:
+def _policy_of(parts: Services, with_names: bool) -> Response:
     newest = parts.store.policy_changes()[-1]
-    told = newest.policy if known else Policy.model_validate(without_drive(newest.policy.model_dump()))
-    return as_json(replace(newest, policy=told))
+    shown = newest.policy if with_names else Policy.model_validate(without_drive(newest.policy.model_dump()))
+    return as_json(replace(newest, policy=shown))
 
 
 @router.patch(
@@ -282,7 +282,7 @@ def _policy_of(parts: Services, known: bool) -> Response:
 def change_policy(by: Operator, parts: Parts, ask: PolicyAsk) -> Response:
     """In force at once. 422 names the value that is not possible, or the key that does not exist."""
     parts.store.change_policy(ask.values, by=by, reason=ask.reason)
-    return _policy_of(parts, known=True)
+    return _policy_of(parts, with_names=True)
 
 
 @router.get(
@@ -475,7 +475,7 @@ def revoke_keys(by: Operator, parts: Parts, ask: RevokeAsk) -> KeysRevoked:
 def _damaged(store: Store) -> list[str]:
     """The items in quarantine, as "kind name: why"."""
     with store.database.reading() as connection:
-        return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
+        return [f"{kind} {name}: {defect}" for (kind, name), defect in sorted(set_aside(connection).items())]
 
 
 @router.get(

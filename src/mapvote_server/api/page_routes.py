@@ -123,8 +123,8 @@ def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicl
 def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
     """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
     ``csv`` without the lines."""
-    found = paths(parts.store, vehicle)
-    return as_table([line.properties for line in found.features]) if format == "csv" else as_json(found)
+    driven_paths = paths(parts.store, vehicle)
+    return as_table([line.properties for line in driven_paths.features]) if format == "csv" else as_json(driven_paths)
 
 
 def packed(request: Request, data: bytes, cache: str) -> Response:
@@ -162,15 +162,15 @@ async def index(request: Request) -> Response:
 @router.get("/viewer/{name:path}", include_in_schema=False)
 async def asset(request: Request, name: str) -> Response:
     """A script or style of the operator's page."""
-    found = _assets().get(name)
-    if found is None or found.kind == "text/html":
+    served = _assets().get(name)
+    if served is None or served.kind == "text/html":
         raise NotFound(f"there is no page {name[:80]!r}")
-    headers = {"Cache-Control": "no-cache", "ETag": found.tag, "Vary": "Accept-Encoding"}
-    if has_already(request, found.tag):
+    headers = {"Cache-Control": "no-cache", "ETag": served.tag, "Vary": "Accept-Encoding"}
+    if has_already(request, served.tag):
         return Response(status_code=304, headers=headers)
     if takes_zstd(request):
-        return Response(found.packed, media_type=found.kind, headers=headers | {"Content-Encoding": "zstd"})
-    return Response(found.plain, media_type=found.kind, headers=headers)
+        return Response(served.packed, media_type=served.kind, headers=headers | {"Content-Encoding": "zstd"})
+    return Response(served.plain, media_type=served.kind, headers=headers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,15 +185,15 @@ class _Asset:
 def _assets() -> dict[str, _Asset]:
     """Every file of the page by its name; nothing else can be asked for."""
     shapes = resources.files("mapvote.shapes") / "viewer"
-    found = {}
+    assets = {}
     for home, folder in ((resources.files("mapvote_server") / "web", ""), (shapes, ""), (shapes / "vendor", "vendor/")):
         for file in home.iterdir():
             kind = _KINDS.get("." + file.name.rpartition(".")[2])
             if kind is not None:
                 data = file.read_bytes()
                 tag = f'"{hashlib.sha256(data).hexdigest()[:20]}"'
-                found[folder + file.name] = _Asset(kind, data, compress(data, 12), tag)
-    return found
+                assets[folder + file.name] = _Asset(kind, data, compress(data, 12), tag)
+    return assets
 
 
 @cache

@@ -44,10 +44,10 @@ class Proxies:
     def _last(self, addresses: Sequence[str], peer: str) -> str:
         """The nearest address on the way that is no proxy's; the last is the nearest."""
         for name in reversed(addresses):
-            found = _ADDRESS.fullmatch(name.strip())
-            if found is None:
+            match = _ADDRESS.fullmatch(name.strip())
+            if match is None:
                 return peer  # "unknown", or a name that the proxy made up
-            address = found[1] or found[2] or found[3]
+            address = match[1] or match[2] or match[3]
             if not self.is_one(address):
                 return address
         return peer

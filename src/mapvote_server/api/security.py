@@ -180,8 +180,8 @@ _MEND = "if it should be, add it to [server] hosts in the server's configuration
 
 def _name_in(host: str) -> str:
     """The name or address in ``name:port``, without brackets; "" if it is neither."""
-    found = _HOST.fullmatch(host.lower())
-    return (found[1] or found[2]) if found else ""
+    match = _HOST.fullmatch(host.lower())
+    return (match[1] or match[2]) if match else ""
 
 
 def _authorization(headers: Iterable[tuple[bytes, bytes]]) -> str | None:

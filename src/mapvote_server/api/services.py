@@ -46,9 +46,9 @@ class RateLimit:
     """A token bucket for each name: ``burst`` at once, ``per_minute`` on average. For one thread (the event loop)."""
 
     def __init__(
-        self, per_minute: float, burst: float, what: str = "ballots", clock: Callable[[], float] = time.monotonic
+        self, per_minute: float, burst: float, unit: str = "ballots", clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._what = what
+        self._unit = unit
         self._per_s = per_minute / 60.0
         self._burst = float(burst)
         self._clock = clock
@@ -58,21 +58,21 @@ class RateLimit:
         """TooMany if the bucket of ``name`` is empty; takes nothing."""
         lacking = 1.0 - self._tokens(name, self._clock())
         if lacking > 0.0:
-            too_fast = f"{name!r} sends more than {self._per_s * 60:g} {self._what} a minute: try again later"
+            too_fast = f"{name!r} sends more than {self._per_s * 60:g} {self._unit} a minute: try again later"
             raise TooMany(too_fast, lacking / self._per_s)
 
     def take(self, name: str) -> None:
         """One request of ``name``; TooMany if its bucket is empty."""
         self.check(name)
-        now = self._clock()
-        self._buckets[name] = (self._tokens(name, now) - 1.0, now)
+        now_s = self._clock()
+        self._buckets[name] = (self._tokens(name, now_s) - 1.0, now_s)
         if len(self._buckets) > 10_000:  # full buckets carry no information: drop them
             wait = self._burst / self._per_s
-            self._buckets = {n: b for n, b in self._buckets.items() if now - b[1] < wait}
+            self._buckets = {n: b for n, b in self._buckets.items() if now_s - b[1] < wait}
 
-    def _tokens(self, name: str, now: float) -> float:
-        tokens, then = self._buckets.get(name, (self._burst, now))
-        return min(self._burst, tokens + (now - then) * self._per_s)
+    def _tokens(self, name: str, now_s: float) -> float:
+        tokens, then = self._buckets.get(name, (self._burst, now_s))
+        return min(self._burst, tokens + (now_s - then) * self._per_s)
 
 
 _SIZE_MEND = "send a shorter drive, or raise [server] max_body_bytes"
@@ -178,14 +178,14 @@ class Batcher(Generic[Asked, Answer]):
         loop = asyncio.get_running_loop()
         while self._waiting:
             await asyncio.sleep(0)  # requests of the same moment join
-            some = self._waiting[: self._limit]
+            batch = self._waiting[: self._limit]
             self._waiting = self._waiting[self._limit :]
             answers: Sequence[Answer | Exception]
             try:
-                answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in some])
+                answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in batch])
             except Exception as error:
-                answers = [error] * len(some)
-            for (_, future), answer in zip(some, answers, strict=True):
+                answers = [error] * len(batch)
+            for (_, future), answer in zip(batch, answers, strict=True):
                 if future.cancelled():
                     continue
                 if isinstance(answer, Exception):
@@ -208,9 +208,9 @@ class Metrics:
         self.version = Gauge("mapvote_version", "Newest version", registry=self.registry)
         self.quarantined = Gauge("mapvote_quarantined", "Damaged, and set aside", ["kind"], registry=self.registry)
 
-    def tell_damaged(self, found: Sequence[str]) -> None:
-        """``found``: "kind name: why"."""
-        counts = TallyOf(text.partition(" ")[0] for text in found)
+    def tell_damaged(self, damaged: Sequence[str]) -> None:
+        """``damaged``: "kind name: why"."""
+        counts = TallyOf(text.partition(" ")[0] for text in damaged)
         for kind in KINDS:
             self.quarantined.labels(kind).set(counts[kind])
 
@@ -300,14 +300,14 @@ class Publishing:
     @contextmanager
     def watched(self, executor: Executor, by: str, dry_run: bool) -> Iterator[Executor]:
         """An executor for one round, which can be seen and cancelled as long as it lasts."""
-        mine = Progress(by, dry_run)
+        progress = Progress(by, dry_run)
         with self._lock:
-            self._rounds.append(mine)
+            self._rounds.append(progress)
         try:
-            yield Watched(executor, mine.report)
+            yield Watched(executor, progress.report)
         finally:
             with self._lock:
-                self._rounds.remove(mine)
+                self._rounds.remove(progress)
 
     def now(self) -> list[Progress]:
         """The rounds under way, oldest first."""
@@ -362,7 +362,7 @@ class Services:
         self.writer: Batcher[Examination, Receipt] = Batcher(self.intake.write, SERVICE_SIZES.batch, self._writing)
         """Writes ballots, many in one transaction."""
         self.newest: Batcher[None, int] = Batcher(
-            lambda asked: [store.current()] * len(asked), SERVICE_SIZES.readers, self.lookups
+            lambda requests: [store.current()] * len(requests), SERVICE_SIZES.readers, self.lookups
         )
         """The number of the newest version, read once for all requests that wait for it."""
         self.known_keys: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), SERVICE_SIZES.keys, self.lookups)
@@ -411,8 +411,8 @@ class Services:
 
 def services(request: Request) -> Services:
     """The parts of the app of a request."""
-    found: Services = request.app.state.services
-    return found
+    parts: Services = request.app.state.services
+    return parts
 
 
 async def _parts(request: Request) -> Services:

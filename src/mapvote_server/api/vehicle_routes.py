@@ -68,10 +68,10 @@ class Versions:
     summary="All versions",
 )
 @on("questions")
-def versions(parts: Parts, known: Known, format: Table = "json") -> Response:
+def versions(parts: Parts, with_names: Known, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by. Only reviewers and operators see the name of the
     policy's gate drive."""
-    listed = dated_versions(parts.store, known)
+    listed = dated_versions(parts.store, with_names)
     if format == "csv":
         return as_table([{name: value for name, value in asdict(one).items() if name != "policy"} for one in listed])
     return as_json(Versions(listed))

@@ -88,11 +88,11 @@ class _Kept:
             if mark is not None and (cleared_since(connection, mark) or hurt_or_mended_since(connection, mark)):
                 self._pairs.clear()
             self._mark = newest_seq(connection)
-            found = self._pairs.setdefault((old, new), _Pair())
+            kept = self._pairs.setdefault((old, new), _Pair())
             self._pairs.move_to_end((old, new))
             while len(self._pairs) > 1 and self._are_too_many():
                 self._pairs.popitem(last=False)
-            return found
+            return kept
 
     def _are_too_many(self) -> bool:
         cells = sum(pair.cells for pair in self._pairs.values())
@@ -132,8 +132,8 @@ def _compare(store: Store, connection: sa.Connection, old: int, new: int, pair: 
             raise
         except MapvoteError:
             pair.tiles[index] = None
-    found = [cells for cells in pair.tiles.values() if cells is not None]
-    objects = sorted(change_objects(found), key=lambda one: -one.cells)
+    changed = [cells for cells in pair.tiles.values() if cells is not None]
+    objects = sorted(change_objects(changed), key=lambda one: -one.cells)
     damaged = [tile_key(index) for index, cells in sorted(pair.tiles.items()) if cells is None]
     pair.cells = sum(one.cells for one in objects)
     pair.tiles.clear()
@@ -148,12 +148,12 @@ def changes_between(
     min_cells: int = 1,
     *,
     lonlat: bool = False,
-    known: bool = True,
+    with_names: bool = True,
     limit: int | None = None,
     offset: int = 0,
 ) -> Changes:
     """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``),
-    the largest first. ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
+    the largest first. ``with_names``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
 
     ``limit``, ``offset``: so many of them, after so many. "numberMatched" is the number of all with at least
     ``min_cells`` cells, "numberReturned" of those here (OGC API Features). NotFound if one of the versions does not
@@ -162,9 +162,13 @@ def changes_between(
     compared = compare_versions(store, old, new)
     listed = [thing for thing in compared.objects if thing.cells >= min_cells]
     shown = slice(offset, None if limit is None else offset + limit)
-    found = to_geojson(
+    features = to_geojson(
         [
-            replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
+            replace(
+                thing,
+                first_seen_ns=seen(thing.first_seen_ns, with_names),
+                last_seen_ns=seen(thing.last_seen_ns, with_names),
+            )
             for thing in listed[shown]
         ],
         store.lattice,
@@ -175,20 +179,20 @@ def changes_between(
         lonlat=lonlat,
         among=listed,
     )
-    return replace(found, damaged=list(compared.damaged) or None)
+    return replace(features, damaged=list(compared.damaged) or None)
 
 
-def cutouts_between(store: Store, old: int, new: int, found: Changes, most: int = 12) -> list[Cutout]:
+def cutouts_between(store: Store, old: int, new: int, changes: Changes, most: int = 12) -> list[Cutout]:
     """The largest things of :func:`changes_between` with their surroundings, before and after."""
     tiles = tiles_at(store, old), tiles_at(store, new)
-    large = [feature for feature in found.features if feature.properties.size == "large"] or found.features
+    large = [feature for feature in changes.features if feature.properties.size == "large"] or changes.features
     largest = sorted(large, key=lambda feature: -feature.properties.area_m2)[:most]
     return [of_feature(feature, tiles, store.lattice) for feature in largest]
 
 
-def page_between(store: Store, old: int, new: int, found: Changes) -> str:
+def page_between(store: Store, old: int, new: int, changes: Changes) -> str:
     """HTML of :func:`cutouts_between`, one file without any request."""
-    return whole_page(f"{found.map_id}: version {old} to {new}", cutouts_between(store, old, new, found))
+    return whole_page(f"{changes.map_id}: version {old} to {new}", cutouts_between(store, old, new, changes))
 
 
 def tiles_at(store: Store, version: int) -> Tiles:
@@ -216,7 +220,7 @@ def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) ->
 def _drives(record: Record, sound: Mapping[int, Vote]) -> list[tuple[int, U8]]:
     """(end_ns, states) of the ballots that counted, in the cells where they did. A cell that the version trimmed is
     CHANGED_EMPTY where the ballot marks voxels of it as gone."""
-    found = []
+    drives = []
     for standing in record.standings:
         vote = sound.get(standing.ballot)
         if not standing.why and vote is not None and vote.states is not None:
@@ -227,5 +231,5 @@ def _drives(record: Record, sound: Mapping[int, Vote]) -> list[tuple[int, U8]]:
                 states.reshape(-1)[trimmed[at]] = CellState.CHANGED_EMPTY
             for cells in (standing.spent, standing.reviewed):
                 states.reshape(-1)[cells] = NO_VOTE
-            found.append((vote.end_ns, states))
-    return found
+            drives.append((vote.end_ns, states))
+    return drives

@@ -86,10 +86,10 @@ class Clouds:
     def levels(self, hashes: TileHashes) -> Levels:
         """The levels of one tile; NotFound if no version ever held it and none is proposed."""
         with self._lock:
-            known = self._made.get(hashes)
-            if known is not None:
+            kept = self._made.get(hashes)
+            if kept is not None:
                 self._made.move_to_end(hashes)
-                return known
+                return kept
         proposed = self._proposed.get(hashes)
         (tile,) = self._load(hashes) if proposed is None else (proposed(),)
         made = make_levels(tile.points, tile.ground_z, bright=self._bright(hashes, tile))
@@ -126,18 +126,18 @@ class Clouds:
         share = _share(len(tiles))
 
         def made(hashes: TileHashes) -> Levels | None:
-            known = self._coarse.get(_Drawn.of(hashes, share))
-            if known is not None or stop():
-                return known
+            kept = self._coarse.get(_Drawn.of(hashes, share))
+            if kept is not None or stop():
+                return kept
             for tile in self._sound(hashes):
                 return make_levels(tile.points, tile.ground_z, share, self._bright(hashes, tile))
             return None
 
         with ThreadPoolExecutor(OVERVIEW_SIZES.threads, "coarse") as pool:
-            found = dict(zip(tiles, pool.map(made, tiles.values()), strict=True))
+            levels_of = dict(zip(tiles, pool.map(made, tiles.values()), strict=True))
         if stop():
             return None
-        sound = {index: levels for index, levels in found.items() if levels is not None}
+        sound = {index: levels for index, levels in levels_of.items() if levels is not None}
         self._coarse = {_Drawn.of(tiles[index], share): levels for index, levels in sound.items()}
         return list(sound.items())
 

@@ -63,10 +63,10 @@ class Objects:
         return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.uint8))
 
     @classmethod
-    def all_of(cls, some: Sequence[Objects]) -> Objects:
+    def all_of(cls, parts: Sequence[Objects]) -> Objects:
         """Those of several tiles."""
-        fields = (np.concatenate([getattr(one, name) for one in some]) for name in cls.__slots__)
-        return cls(*fields) if some else cls.none()
+        fields = (np.concatenate([getattr(one, name) for one in parts]) for name in cls.__slots__)
+        return cls(*fields) if parts else cls.none()
 
     def __len__(self) -> int:
         return len(self.cells)
@@ -167,12 +167,12 @@ def _objects_on(index: TileIndex, flat: I64, occupied: Bool) -> tuple[int, Objec
     says = np.zeros(label.max() + 1, dtype=np.uint8)
     says[label] = occupied
     row_sum, col_sum = (np.bincount(label, weights=values).astype(np.float64) for values in (rows, cols))
-    found = Objects(np.bincount(label), row_sum, col_sum, says)
-    touches = np.zeros(len(found), dtype=np.bool_)
+    objects = Objects(np.bincount(label), row_sum, col_sum, says)
+    touches = np.zeros(len(objects), dtype=np.bool_)
     touches[label[at_border]] = True
-    inside = found.among(~touches & (found.cells >= CONTRADICTIONS.least_cells))
+    inside = objects.among(~touches & (objects.cells >= CONTRADICTIONS.least_cells))
     part = np.cumsum(touches)[label[at_border]] - 1
-    border = Border(found.among(touches), part, rows[at_border], cols[at_border])
+    border = Border(objects.among(touches), part, rows[at_border], cols[at_border])
     return len(inside), inside.largest(CONTRADICTIONS.told_a_tile), border
 
 

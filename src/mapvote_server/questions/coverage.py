@@ -83,23 +83,23 @@ def waiting_votes(store: Store) -> Waiting | None:
     with tiles.lock:
         with store.database.reading() as connection:
             now_ns = store.clock()
-            asked = electorate_now(connection, now_ns)
-            quorum = asked.settings.min_votes
+            electorate = electorate_now(connection, now_ns)
+            quorum = electorate.settings.min_votes
             newest = version_of(connection).number
 
             def look(index: TileIndex) -> _Tile | None:
                 if _vehicles_on(connection, index) >= quorum:
                     return None
                 window = store.lattice.tile(index)
-                counting = _counting(connection, newest, asked, window)
+                counting = _counting(connection, newest, electorate, window)
                 if counting is None:
                     return None
                 drives = list(counting.values())
-                states = [said_by(vote) for vote in one_each(by_voter(drives, asked.settings), window)]
+                states = [said_by(vote) for vote in one_each(by_voter(drives, electorate.settings), window)]
                 waits = _waits(drives, states, quorum)
                 return None if waits is None else _Tile(waits)
 
-            tiles.refresh(connection, asked, now_ns, look)
+            tiles.refresh(connection, electorate, now_ns, look)
         return _together(tiles.found.values(), quorum)
 
 
@@ -116,7 +116,7 @@ _VEHICLES = Question(
 )
 
 
-def _counting(connection: sa.Connection, newest: int, asked: Electorate, window: Grid) -> dict[int, Vote] | None:
+def _counting(connection: sa.Connection, newest: int, electorate: Electorate, window: Grid) -> dict[int, Vote] | None:
     """By ballot the votes on a tile of the newest version that count, in the cells where they do; None if the tile
     cannot be read."""
     try:
@@ -125,7 +125,7 @@ def _counting(connection: sa.Connection, newest: int, asked: Electorate, window:
         raise
     except MapvoteError:
         return None
-    judged = from_sound_ballots(connection, asked, lambda now: judged_on(connection, tile, now))
+    judged = from_sound_ballots(connection, electorate, lambda sound: judged_on(connection, tile, sound))
     return {vote.ballot: vote for vote in judged if not vote.why}
 
 
@@ -145,10 +145,10 @@ def _waits(drives: Sequence[Vote], states: Sequence[U8], quorum: int) -> _Waits 
 
 def _together(tiles: Iterable[_Tile], quorum: int) -> Waiting | None:
     """Changes that lack only the quorum, over some tiles."""
-    found = [tile.waits for tile in tiles if tile.waits is not None]
-    drives = frozenset[str]().union(*(waits.drives for waits in found))
-    vehicles = frozenset[str]().union(*(waits.vehicles for waits in found))
-    cells = sum(waits.cells for waits in found)
+    all_waits = [tile.waits for tile in tiles if tile.waits is not None]
+    drives = frozenset[str]().union(*(waits.drives for waits in all_waits))
+    vehicles = frozenset[str]().union(*(waits.vehicles for waits in all_waits))
+    cells = sum(waits.cells for waits in all_waits)
     return Waiting(cells, len(drives), sorted(vehicles), quorum) if cells else None
 
 
@@ -175,7 +175,7 @@ def wanted_passes(store: Store) -> Passes:
     with tiles.lock:
         with store.database.reading() as connection:
             now_ns = store.clock()
-            asked = electorate_now(connection, now_ns)
+            electorate = electorate_now(connection, now_ns)
             newest = version_of(connection).number
 
             @lru_cache(maxsize=100)
@@ -185,35 +185,35 @@ def wanted_passes(store: Store) -> Passes:
             def look(index: TileIndex) -> _Tile | None:
                 if not _vehicles_on(connection, index):
                     return None
-                return _look(connection, newest, asked, store.lattice.tile(index), path_of)
+                return _look(connection, newest, electorate, store.lattice.tile(index), path_of)
 
-            tiles.refresh(connection, asked, now_ns, look)
-        found = list(tiles.found.values())
-    waits = _together(found, asked.settings.min_votes)
-    every = _in_order([stretch for tile in found for stretch in tile.stretches])
+            tiles.refresh(connection, electorate, now_ns, look)
+        kept = list(tiles.found.values())
+    waits = _together(kept, electorate.settings.min_votes)
+    every = _in_order([stretch for tile in kept for stretch in tile.stretches])
     return Passes(
         type="FeatureCollection",
         frame=MAP_METRES,
         features=[_line(stretch) for stretch in every[: COVERAGE_SIZES.stretches]],
-        cells=sum(tile.cells for tile in found),
-        without_path=sum(tile.without_path for tile in found),
+        cells=sum(tile.cells for tile in kept),
+        without_path=sum(tile.without_path for tile in kept),
         waits="" if waits is None else str(waits),
-        damaged=sorted(tile.damaged for tile in found if tile.damaged),
+        damaged=sorted(tile.damaged for tile in kept if tile.damaged),
     )
 
 
 def _look(
-    connection: sa.Connection, newest: int, asked: Electorate, window: Grid, path_of: Callable[[int], F64]
+    connection: sa.Connection, newest: int, electorate: Electorate, window: Grid, path_of: Callable[[int], F64]
 ) -> _Tile | None:
     """Changes that one more pass would decide on a tile of the newest version; None without any."""
-    quorum = asked.settings.min_votes
-    counting = _counting(connection, newest, asked, window)
+    quorum = electorate.settings.min_votes
+    counting = _counting(connection, newest, electorate, window)
     if counting is None:
         return _Tile(None, damaged=tile_key(window.tile_index))
     if not counting:
         return None
     drives = list(counting.values())
-    named = by_voter(drives, asked.settings)
+    named = by_voter(drives, electorate.settings)
     vehicles = {voter.vehicle: drive.vehicle for voter, drive in zip(named, drives, strict=True)}
     voters = one_each(named, window)
     states = [said_by(vote) for vote in voters]
@@ -250,8 +250,8 @@ def _driven(connection: sa.Connection, store: Store, ballot: int) -> F64:
 _PATH = Question(sa.select(schema.paths.c.path).where(schema.paths.c.ballot == sa.bindparam("ballot")))
 
 
-def _in_order(found: Sequence[Stretch]) -> list[Stretch]:
-    return sorted(found, key=lambda one: (-one.cells, one.tile, one.heading_rad))
+def _in_order(every: Sequence[Stretch]) -> list[Stretch]:
+    return sorted(every, key=lambda one: (-one.cells, one.tile, one.heading_rad))
 
 
 def _line(stretch: Stretch) -> PlacedFeature:

@@ -134,31 +134,33 @@ _desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
     """The changes that a publish would make now. Nothing is written, and nothing is computed again while the round
     holds."""
-    found = round_at(store, store.clock(), executor=executor, every=True)
+    fused_round = round_at(store, store.clock(), executor=executor, every=True)
     with _lock:
-        known = _desks.get(found)
-        if known is None:
-            known = _desks[found] = _desk_of(store, found)
-    held = list(reasons_to_hold(store, found, gate))
-    return replace(known, answer=replace(known.answer, held=held))
+        last_desk = _desks.get(fused_round)
+        if last_desk is None:
+            last_desk = _desks[fused_round] = _desk_of(store, fused_round)
+    held = list(reasons_to_hold(store, fused_round, gate))
+    return replace(last_desk, answer=replace(last_desk.answer, held=held))
 
 
-def _desk_of(store: Store, found: Round) -> Desk:
-    version = found.newest.number
-    looked = [_look_at(store, version, fused) for fused in found.changed]
+def _desk_of(store: Store, fused_round: Round) -> Desk:
+    version = fused_round.newest.number
+    looked = [_look_at(store, version, fused) for fused in fused_round.changed]
     objects = change_objects([cells for cells, _ in looked])
-    edited = {fused.index: _proposed(store, version, fused) for fused in found.changed}
+    edited = {fused.index: _proposed(store, version, fused) for fused in fused_round.changed}
     reviews = standing(store)
     left_out = [review for review, _ in reviews if review.given.verdict != "accepted"]
-    budget = found.asked.settings.false_deletions
-    lacking = None if found.changed else waiting_votes(store)
+    budget = fused_round.electorate.settings.false_deletions
+    lacking = None if fused_round.changed else waiting_votes(store)
     content = DeskAnswer(
         version=version,
         held=[],
-        doubts=list(doubts_of(store, found).told(found.asked.settings)),
+        doubts=list(doubts_of(store, fused_round).told(fused_round.electorate.settings)),
         waits="" if lacking is None else str(lacking),
         pending=_pending(store, version, objects, reviews),
-        waiting=_waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget),
+        waiting=_waiting_features(
+            store, version, [*fused_round.decided.values(), *fused_round.beside.values()], budget
+        ),
         reviewed=list(map(_reviewed, left_out)),
         tiles={tile_key(index): _drawn(made) for index, made in edited.items()},
     )
@@ -232,13 +234,13 @@ def review(
 
     ``after`` as in :func:`mapvote_server.store.reviews.decide`. NotFound if no such change is pending any more.
     """
-    now = desk(store, executor)
-    features = {feature.id: msgspec.to_builtins(feature) for feature in now.answer.pending.features}
-    features |= {f"{_OF_REVIEW}{one.given.seq}": dict(one.feature) for one in now.reviews}
+    desk_now = desk(store, executor)
+    features = {feature.id: msgspec.to_builtins(feature) for feature in desk_now.answer.pending.features}
+    features |= {f"{_OF_REVIEW}{one.given.seq}": dict(one.feature) for one in desk_now.reviews}
     if change not in features:
         raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
     feature = features[change] | {"properties": features[change]["properties"] | {"verdict": None}}
-    cells = _cells_of(now.objects[change]) if change in now.objects else _cells_of_review(store, change)
+    cells = _cells_of(desk_now.objects[change]) if change in desk_now.objects else _cells_of_review(store, change)
     return decide(store, verdict, feature, cells, by=by, comment=comment, after=after)
 
 
@@ -260,19 +262,19 @@ def _tile(store: Store, version: int, index: TileIndex) -> Tile:
 
 
 def _cells_of(change: ChangeObject) -> dict[TileIndex, Bool]:
-    found: dict[TileIndex, Bool] = {}
+    planes: dict[TileIndex, Bool] = {}
     rows, cols = change.where
     tiles = np.stack([rows // TILE_CELLS, cols // TILE_CELLS], axis=1)
     for index in np.unique(tiles, axis=0):
-        mine = (tiles == index).all(axis=1)
+        on_tile = (tiles == index).all(axis=1)
         plane = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
-        plane[rows[mine] % TILE_CELLS, cols[mine] % TILE_CELLS] = True
-        found[int(index[0]), int(index[1])] = plane
-    return found
+        plane[rows[on_tile] % TILE_CELLS, cols[on_tile] % TILE_CELLS] = True
+        planes[int(index[0]), int(index[1])] = plane
+    return planes
 
 
-def _meet(mine: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> bool:
-    return any((mine[i] & theirs[i]).any() for i in mine.keys() & theirs.keys())
+def _meet(ours: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> bool:
+    return any((ours[i] & theirs[i]).any() for i in ours.keys() & theirs.keys())
 
 
 def _waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[PendingFeature]:
@@ -312,7 +314,7 @@ def _likeliest(change: ChangeObject, waits: Mapping[TileIndex, PendingDeletions]
     rows, cols = change.where
     largest = 0.0
     for index, pending in waits.items():
-        mine = (rows // TILE_CELLS == index[0]) & (cols // TILE_CELLS == index[1])
-        cells = rows[mine] % TILE_CELLS * TILE_CELLS + cols[mine] % TILE_CELLS
+        on_tile = (rows // TILE_CELLS == index[0]) & (cols // TILE_CELLS == index[1])
+        cells = rows[on_tile] % TILE_CELLS * TILE_CELLS + cols[on_tile] % TILE_CELLS
         largest = max(largest, float(pending.probability[np.isin(pending.cells, cells)].max(initial=0.0)))
     return largest

@@ -143,7 +143,7 @@ class _Now:
 
     tile: Tile
     cell: tuple[int, int]
-    asked: Electorate
+    electorate: Electorate
     standings: Sequence[Vote]
     """Every standing vote on the tile, and why the next version does not count it."""
     said: Mapping[int, Vote]
@@ -156,9 +156,9 @@ FARTHEST_M = 1e7
 """No place of a map lies farther from its origin."""
 
 
-def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> CellStory:
-    """The votes behind the cell that holds (x, y), map metres. ``known``: with the names of vehicles and exact times,
-    else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
+def explain_cell(store: Store, x: float, y: float, *, with_names: bool = True) -> CellStory:
+    """The votes behind the cell that holds (x, y), map metres. ``with_names``: with the names of vehicles and
+    exact times, else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
     if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M):
         raise MapvoteError(f"({x}, {y}): give map metres, within {FARTHEST_M / 1e3:,.0f} km of the map's origin")
     rows, cols = store.lattice.cells_of(np.array([[x, y]]))
@@ -168,12 +168,12 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
     cell = (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
         tile = tile_as_of(connection, store.lattice.tile(index), version_of(connection).number)
-        now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
-        found = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
-        decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
+        present = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
+        states = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
+        decisions = [(record, state) for record, state in states if state != state_name(NO_VOTE)]
         falls = [fell_with(store, connection, index, record, cell) for record, _ in decisions]
-        votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]], known)
-    if not known:
+        votes = _votes(connection, present, [record for record, _ in decisions[-MOST_RECORDS:]], with_names)
+    if not with_names:
         shown = pseudonyms(store, {vote.vehicle for vote in votes})
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="", clouds="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions and not falls[-1] else None
@@ -181,16 +181,16 @@ def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> Cel
         CellDecision(record.version, state, _edit_of(record, cell), fell)
         for (record, state), fell in zip(decisions, falls, strict=True)
     ]
-    thing = [*_lacks(now, votes), *_thing(now)]
-    if not thing and not votes and not decisions and not len(now.tile.points):
+    thing = [*_lacks(present, votes), *_thing(present)]
+    if not thing and not votes and not decisions and not len(present.tile.points):
         thing = ["outside the map"]
     return CellStory(row, col, votes, by_version, probability, "; ".join(thing))
 
 
-def seen(stamp_ns: int | None, known: bool) -> int | None:
-    """The time of a drive, or only its day for readers that may not know the vehicle (not ``known``): on a road with
+def seen(stamp_ns: int | None, exactly: bool) -> int | None:
+    """The time of a drive, or only its day for readers that may not know the vehicle (not ``exactly``): on a road with
     few vehicles the minute would identify it."""
-    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
+    return stamp_ns if exactly or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
 def state_name(state: int) -> str:
@@ -218,45 +218,47 @@ def sound_votes(connection: sa.Connection, index: TileIndex, ballots: Collection
             stored = [vote for vote in stored if lost.isdisjoint((str(vote.ballot), ballot_name(vote.ballot, *index)))]
 
 
-def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], asked: Electorate) -> _Now:
+def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], electorate: Electorate) -> _Now:
     """The standing ballots on a tile, without those that cannot be read."""
 
-    def look(asked: Electorate) -> tuple[Electorate, Sequence[Vote], Mapping[int, Vote]]:
-        judged = judged_on(connection, tile, asked)
+    def look(electorate: Electorate) -> tuple[Electorate, Sequence[Vote], Mapping[int, Vote]]:
+        judged = judged_on(connection, tile, electorate)
         readable = [vote for vote in judged if vote.why != "damaged"]
-        return asked, judged, {vote.ballot: vote for vote in read_votes(connection, tile.index, readable)}
+        return electorate, judged, {vote.ballot: vote for vote in read_votes(connection, tile.index, readable)}
 
-    asked, judged, said = from_sound_ballots(connection, asked, look)
-    policy = asked.policy
+    electorate, judged, said = from_sound_ballots(connection, electorate, look)
+    policy = electorate.policy
     counting = [vote for vote in judged if not vote.why]
 
     def history() -> Sequence[Vote]:
-        return recent_votes(connection, tile, asked)
+        return recent_votes(connection, tile, electorate)
 
     past = history if policy.round.stage == "two-stage" else None
     decided = decide_tile(tile, counting, rule_named(policy.round.method), policy.fuse, past)
     standings = standings_of(judged, decided.copies, decided.heard, policy.fuse)
-    return _Now(tile, cell, asked, standings, said, decided)
+    return _Now(tile, cell, electorate, standings, said, decided)
 
 
-def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], known: bool) -> list[CellVote]:
+def _votes(connection: sa.Connection, present: _Now, records: Sequence[Record], with_names: bool) -> list[CellVote]:
     """Every standing vote, then those that some version counted on the cell and that stand no more."""
-    flat = now.cell[0] * TILE_CELLS + now.cell[1]
-    past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
-    said = {**now.said, **past}
+    flat = present.cell[0] * TILE_CELLS + present.cell[1]
+    past = sound_votes(
+        connection, present.tile.index, {s.ballot for r in records for s in _standings(r)} - present.said.keys()
+    )
+    said = {**present.said, **past}
     counted = defaultdict[int, list[int]](list)
     left_out = defaultdict[int, list[LeftOut]](list)
     for record in records:
         for standing in _standings(record):
-            if standing.ballot in said and said[standing.ballot].spoken()[now.cell]:
-                why = standing.why_not(flat)
-                if why:
-                    left_out[standing.ballot].append(LeftOut(record.version, REASONS[why]))
+            if standing.ballot in said and said[standing.ballot].spoken()[present.cell]:
+                reason_code = standing.why_not(flat)
+                if reason_code:
+                    left_out[standing.ballot].append(LeftOut(record.version, REASONS[reason_code]))
                 else:
                     counted[standing.ballot].append(record.version)
     gone = sorted(past.keys() & counted.keys())
     ended = _ended(connection, gone)
-    everyone = [(standing, _why_not(standing, now)) for standing in now.standings]
+    everyone = [(standing, _why_not(standing, present)) for standing in present.standings]
     everyone += [(past[ballot], ended.get(ballot, "stands no more")) for ballot in gone]
     cell_votes = []
     for standing, reason in everyone:
@@ -264,11 +266,16 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], know
         vote = said.get(ballot)
         text: tuple[str, int | None, float | None, str] = UNREADABLE, None, None, ""
         if vote is not None:
-            row, col = now.tile.index
+            row, col = present.tile.index
             clouds = f"{standing.drive}_{row}_{col}.mcap" if vote.clouds else ""
-            text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell), clouds
+            text = (
+                state_name(int(said_by(vote)[present.cell])),
+                _marks(vote, present.cell),
+                _sure(vote, present.cell),
+                clouds,
+            )
         whose = (standing.vehicle, standing.drive, standing.version)
-        end = utc(seen(standing.end_ns, known))
+        end = utc(seen(standing.end_ns, with_names))
         versions = tuple(counted[ballot]), tuple(left_out[ballot])
         state, marks, sure, clouds = text
         cell_votes.append(CellVote(*whose, state, marks, sure, clouds, end, not reason, reason, *versions))
@@ -283,18 +290,18 @@ def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str
     return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
 
 
-def _why_not(standing: Vote, now: _Now) -> str:
+def _why_not(standing: Vote, present: _Now) -> str:
     """Why the next version would not count a standing ballot on the cell; "" if it would."""
-    if not standing.why and not now.said[standing.ballot].spoken()[now.cell]:
+    if not standing.why and not present.said[standing.ballot].spoken()[present.cell]:
         return "says nothing here"
-    why: Why = standing.why_not(now.cell[0] * TILE_CELLS + now.cell[1])
-    fuse = now.asked.settings
-    memory = now.tile.memory
-    if why == "window":
+    reason_code: Why = standing.why_not(present.cell[0] * TILE_CELLS + present.cell[1])
+    fuse = present.electorate.settings
+    memory = present.tile.memory
+    if reason_code == "window":
         return f"older than {fuse.max_age_days:g} days or not among the last {fuse.latest_vehicles} vehicles"
-    if why == "spent" and memory is not None:
-        return f"spent: version {memory.changed[now.cell]} has changed the cell since"
-    return REASONS[why] if why else ""
+    if reason_code == "spent" and memory is not None:
+        return f"spent: version {memory.changed[present.cell]} has changed the cell since"
+    return REASONS[reason_code] if reason_code else ""
 
 
 def _standings(record: Record) -> Sequence[Vote]:
@@ -342,28 +349,30 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     rows, cols = np.nonzero(states == state)
     beside = alike_beside(rows, cols, np.zeros(len(rows), np.int64))[(rows == cell[0]) & (cols == cell[1])]
     against = counted[: CellState.UNDETERMINED].sum() - counted[state]
-    asked = np.array([counted[state]]), np.array([against])
-    return round(float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0]), 3)
+    counts = np.array([counted[state]]), np.array([against])
+    return round(float(change_probability(states[cell].reshape(1), *counts, beside, odds)[0]), 3)
 
 
-def _lacks(now: _Now, votes: Sequence[CellVote]) -> list[str]:
+def _lacks(present: _Now, votes: Sequence[CellVote]) -> list[str]:
     """Text: the change that lacks only the quorum, and the drives among ``votes`` that say so."""
-    states = [vote.states for vote in now.decided.votes if vote.states is not None]
+    states = [vote.states for vote in present.decided.votes if vote.states is not None]
     if not states:
         return []
-    change = int(lacks_quorum_only([plane[now.cell].reshape(1, 1) for plane in states], now.decided.quorum)[0, 0])
+    change = int(
+        lacks_quorum_only([plane[present.cell].reshape(1, 1) for plane in states], present.decided.quorum)[0, 0]
+    )
     drives = [vote for vote in votes if vote.counts and vote.state == state_name(change)]
     if change == NO_VOTE or not drives:
         return []
-    return [str(Waiting(1, len(drives), sorted({vote.vehicle for vote in drives}), now.decided.quorum))]
+    return [str(Waiting(1, len(drives), sorted({vote.vehicle for vote in drives}), present.decided.quorum))]
 
 
-def _thing(now: _Now) -> list[str]:
+def _thing(present: _Now) -> list[str]:
     """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
-    tile = now.tile
-    cell = now.cell
-    fuse = now.asked.settings
-    text = _waits(now)
+    tile = present.tile
+    cell = present.cell
+    fuse = present.electorate.settings
+    text = _waits(present)
     if tile.obstacle_words[cell]:
         brought = tile.memory is not None and tile.memory.came_s[cell] > 0
         text.append("stands: brought by vehicles" if brought else "stands: surveyed")
@@ -378,28 +387,32 @@ def _thing(now: _Now) -> list[str]:
     return text
 
 
-def _waits(now: _Now) -> list[str]:
+def _waits(present: _Now) -> list[str]:
     """Decisions that do not change the map yet, or change it otherwise than voted, with the reason."""
-    found = now.decided
-    cell = now.cell
+    decided = present.decided
+    cell = present.cell
     text = []
-    if found.passing is not None and found.passing[cell]:
+    if decided.passing is not None and decided.passing[cell]:
         text.append("temporary: a new object here is not expected to stay, so the map does not take it")
-    elif found.denied is not None and found.denied[cell]:
+    elif decided.denied is not None and decided.denied[cell]:
         text.append("waits: the last vehicle that looked says otherwise")
-    if found.edits[cell] != found.states[cell]:
+    if decided.edits[cell] != decided.states[cell]:
         text.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
-    trim = _edit_in(deletions(now.tile, found)[1], cell) if found.edits[cell] == CellState.UNCHANGED_OCCUPIED else None
+    trim = (
+        _edit_in(deletions(present.tile, decided)[1], cell)
+        if decided.edits[cell] == CellState.UNCHANGED_OCCUPIED
+        else None
+    )
     if trim is not None:
         text.append(
             f"trimmed: the cell stands, and {trim.votes} of {trim.votes + trim.against} vehicles say that voxels of it "
             "are gone; a publish deletes these"
         )
-    likely = found.pending.at(cell)
+    likely = decided.pending.at(cell)
     if likely is not None:
         text.append(
             f"pending: the probability that emptying it deletes something that stands is {likely:.2g}, and the policy "
-            f"allows {now.asked.settings.false_deletions:g}; the cell is emptied once further votes lower it"
+            f"allows {present.electorate.settings.false_deletions:g}; the cell is emptied once further votes lower it"
         )
     return text
 
@@ -407,8 +420,8 @@ def _waits(now: _Now) -> list[str]:
 def _marks(vote: Vote, cell: tuple[int, int]) -> int | None:
     if vote.gone is None:
         return None
-    mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
-    return int(mine[0]).bit_count() if len(mine) else 0
+    words = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
+    return int(words[0]).bit_count() if len(words) else 0
 
 
 def _sure(vote: Vote, cell: tuple[int, int]) -> float | None:
@@ -422,8 +435,8 @@ def _sure(vote: Vote, cell: tuple[int, int]) -> float | None:
 def _said_on(connection: sa.Connection, index: TileIndex, policy: Policy, wanted: Callable[[Vote], bool]) -> list[Vote]:
     """The standing votes on a tile, of any age, that are ``wanted``; without damaged ones."""
 
-    def read(asked: Electorate) -> list[Vote]:
-        return read_votes(connection, index, [*filter(wanted, judged_votes(connection, index, asked))])
+    def read(electorate: Electorate) -> list[Vote]:
+        return read_votes(connection, index, [*filter(wanted, judged_votes(connection, index, electorate))])
 
     return from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), read)
 

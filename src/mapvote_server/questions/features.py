@@ -45,22 +45,22 @@ class Collection:
     """Whether it compares two versions."""
 
 
-def _changes(store: Store, known: bool, old: int, new: int) -> Features:
-    features: Features = msgspec.to_builtins(changes_between(store, old, new, known=known).features)
+def _changes(store: Store, with_names: bool, old: int, new: int) -> Features:
+    features: Features = msgspec.to_builtins(changes_between(store, old, new, with_names=with_names).features)
     return features
 
 
-def _tiles(store: Store, known: bool, old: int, new: int) -> Features:
-    rows = [asdict(tile) for tile in tiles_seen(store, known)]
+def _tiles(store: Store, with_names: bool, old: int, new: int) -> Features:
+    rows = [asdict(tile) for tile in tiles_seen(store, with_names)]
     squares: Features = msgspec.to_builtins(tile_squares(rows, store.lattice).features)
     return [square | {"id": f"{row['row']},{row['col']}"} for square, row in zip(squares, rows, strict=True)]
 
 
-def _seen(store: Store, known: bool, old: int, new: int) -> Features:
-    return [tile for tile in _tiles(store, known, old, new) if tile["properties"]["vehicles"]]
+def _seen(store: Store, with_names: bool, old: int, new: int) -> Features:
+    return [tile for tile in _tiles(store, with_names, old, new) if tile["properties"]["vehicles"]]
 
 
-def _passes(store: Store, known: bool, old: int, new: int) -> Features:
+def _passes(store: Store, with_names: bool, old: int, new: int) -> Features:
     lines: Features = msgspec.to_builtins(wanted_passes(store).features)
     return [line | {"id": str(number)} for number, line in enumerate(lines, 1)]
 

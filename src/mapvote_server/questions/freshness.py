@@ -31,14 +31,14 @@ class CoveredTile:
     last_seen: str | None
 
 
-def tiles_seen(store: Store, known: bool) -> list[CoveredTile]:
+def tiles_seen(store: Store, exactly: bool) -> list[CoveredTile]:
     """Per tile of the map or of a standing ballot: number of vehicles, end of the last drive past it as far as may be
-    ``known``, see :func:`mapvote_server.questions.explain.seen`."""
+    ``exactly``, see :func:`mapvote_server.questions.explain.seen`."""
     kept = _kept.of(store)
     with kept.lock:
         with store.database.reading() as connection:
             kept.refresh(connection)
-        return kept.told(known)
+        return kept.told(exactly)
 
 
 class _Seen:
@@ -98,12 +98,12 @@ class _Seen:
         if len(self._tiles) != count:
             self._tiles = dict(sorted(self._tiles.items()))
 
-    def told(self, known: bool) -> list[CoveredTile]:
+    def told(self, exactly: bool) -> list[CoveredTile]:
         """All of them, in ascending order."""
-        rows = self._rows[known]
+        rows = self._rows[exactly]
         for index, (vehicles, last_ns) in self._tiles.items():
             if index not in rows:
-                rows[index] = CoveredTile(*index, vehicles, utc(seen(last_ns, known)))
+                rows[index] = CoveredTile(*index, vehicles, utc(seen(last_ns, exactly)))
         return [rows[index] for index in self._tiles]
 
 

@@ -178,13 +178,13 @@ def _origin_of(version: Version) -> dict[str, Any]:
     return {member.name: getattr(version, member.name) for member in fields(VersionEntry)}
 
 
-def dated_versions(store: Store, known: bool) -> list[DatedVersion]:
-    """The versions, oldest first. The name of the policy's gate drive is left out unless the asker is ``known``."""
+def dated_versions(store: Store, with_names: bool) -> list[DatedVersion]:
+    """The versions, oldest first. Without ``with_names`` the name of the policy's gate drive is left out."""
     return [
         DatedVersion(
             **_origin_of(version),
             created=utc(version.created_ns),
-            policy=dict(version.policy if known else without_drive(version.policy)),
+            policy=dict(version.policy if with_names else without_drive(version.policy)),
         )
         for version in store.versions()
     ]
@@ -264,15 +264,15 @@ class Feed:
     def after(self, seq: int) -> list[Event]:
         """The events after ``seq``, oldest first, at most 500. Older events than those kept are read from the log."""
         with self._lock:
-            now = self._seconds()
+            now_s = self._seconds()
             if self._newest is None:
                 self._newest = newest_event(self._store)
-                self._polled_s = now
-            elif now - self._polled_s >= self._poll_s:
-                found = events_after(self._store, self._newest)
-                self._recent.extend(found)
-                self._newest = found[-1].seq if found else self._newest
-                self._polled_s = now
+                self._polled_s = now_s
+            elif now_s - self._polled_s >= self._poll_s:
+                events = events_after(self._store, self._newest)
+                self._recent.extend(events)
+                self._newest = events[-1].seq if events else self._newest
+                self._polled_s = now_s
             if seq >= self._newest:
                 return []
             if self._recent and self._recent[0].seq <= seq + 1:

@@ -57,14 +57,14 @@ class KeptTiles(Generic[Found]):
         self._moment: _Moment | None = None
 
     def refresh(
-        self, connection: sa.Connection, asked: Electorate, now_ns: int, look: Callable[[TileIndex], Found | None]
+        self, connection: sa.Connection, electorate: Electorate, now_ns: int, look: Callable[[TileIndex], Found | None]
     ) -> None:
         """Look at every tile that an event touched since the last time; at all of them at first, under another policy,
         and once ballots were cleared away."""
         last = self._moment
         newest = version_of(connection).number
-        rules = asked.policy.fuse, asked.policy.round
-        moment = _Moment(newest_seq(connection), newest, rules, next_ripe_ns(connection, asked))
+        rules = electorate.policy.fuse, electorate.policy.round
+        moment = _Moment(newest_seq(connection), newest, rules, next_ripe_ns(connection, electorate))
         ripe = last is not None and last.until_ns is not None and now_ns >= last.until_ns
         if last is None or last.rules != moment.rules or ripe or cleared_since(connection, last.mark):
             self._unread = {*self.found, *standing_tiles(connection, moment.mark)}
@@ -78,11 +78,11 @@ class KeptTiles(Generic[Found]):
             self._put(index, look(index))
             self._unread.discard(index)
 
-    def _put(self, index: TileIndex, found: Found | None) -> None:
+    def _put(self, index: TileIndex, answer: Found | None) -> None:
         before = self.found.pop(index, None)
         if before is not None and self._went is not None:
             self._went(before)
-        if found is not None:
-            self.found[index] = found
+        if answer is not None:
+            self.found[index] = answer
             if self._came is not None:
-                self._came(found)
+                self._came(answer)

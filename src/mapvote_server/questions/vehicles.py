@@ -77,12 +77,12 @@ def vehicle_standings(store: Store) -> list[VehicleStanding]:
     kept = _compared.of(store)
     with kept.tiles.lock:
         with store.database.reading() as connection:
-            asked = Electorate(FOREVER, policy_in(connection), FOREVER)
+            electorate = Electorate(FOREVER, policy_in(connection), FOREVER)
 
             def look(index: TileIndex) -> Sequence[Compared] | None:
-                return compare(index, votes_on(connection, store.lattice, index, asked.policy)) or None
+                return compare(index, votes_on(connection, store.lattice, index, electorate.policy)) or None
 
-            kept.tiles.refresh(connection, asked, store.clock(), look)
+            kept.tiles.refresh(connection, electorate, store.clock(), look)
         if kept.standings is None:
             kept.standings = standings_of(kept.entries(), store.lattice)
         return kept.standings
@@ -159,32 +159,34 @@ def standings_of(
     threshold = significance / max(1, sum(n > 0 for n in cells.values()))
     out = []
     for name in names:
-        mine = cells[name]
-        found = objects[name]
-        others = all_cells - mine
-        others_found = all_objects - found
-        p_value = _tail(found, others_found, tolerated * mine, others)
+        own_cells = cells[name]
+        own_objects = objects[name]
+        others = all_cells - own_cells
+        others_found = all_objects - own_objects
+        p_value = _tail(own_objects, others_found, tolerated * own_cells, others)
         verdict: Stance = "undecidable"
-        if mine and p_value < threshold:
+        if own_cells and p_value < threshold:
             verdict = "contradicts"
-        elif mine and (others or not found) and found * others <= tolerated * mine * others_found:
+        elif own_cells and (others or not own_objects) and own_objects * others <= tolerated * own_cells * others_found:
             verdict = "consistent"
         evidence = _evidence([spread[name], *(entry.largest for entry in by_vehicle[name])], lattice)
-        out.append(VehicleStanding(name, verdict, mine, found, others, others_found, p_value, threshold, evidence))
+        out.append(
+            VehicleStanding(name, verdict, own_cells, own_objects, others, others_found, p_value, threshold, evidence)
+        )
     return out
 
 
-def _tail(mine: int, others: int, my_exposure: float, others_exposure: float) -> float:
+def _tail(own: int, others: int, my_exposure: float, others_exposure: float) -> float:
     """P(X >= mine), X binomial of mine + others objects, each mine by my share of the exposure."""
-    if mine == 0 or others_exposure == 0:
+    if own == 0 or others_exposure == 0:
         return 1.0
     share = my_exposure / (my_exposure + others_exposure)
-    return float(scipy.special.betainc(mine, others + 1, share))
+    return float(scipy.special.betainc(own, others + 1, share))
 
 
-def _evidence(found: Sequence[Objects], lattice: Lattice) -> tuple[Contradiction, ...]:
+def _evidence(compared: Sequence[Objects], lattice: Lattice) -> tuple[Contradiction, ...]:
     """The largest of the objects."""
-    largest = Objects.all_of(found).largest(CONTRADICTIONS.told)
+    largest = Objects.all_of(compared).largest(CONTRADICTIONS.told)
     x, y = (np.round(metres, 2).tolist() for metres in largest.places_m(lattice))
     claims: list[Claim] = ["occupied" if says else "empty" for says in largest.occupied.tolist()]
     return tuple(map(Contradiction, x, y, largest.cells.tolist(), claims))
@@ -227,11 +229,11 @@ def paths(store: Store, vehicle: str | None = None) -> Places:
         rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
         driven = [unpack_path(row.path) for row in rows]
         touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
-        known = tiles_of(connection, version_of(connection).number, sorted(touched)) if touched else {}
+        mapped = tiles_of(connection, version_of(connection).number, sorted(touched)) if touched else {}
 
         @cache
         def ground(index: TileIndex) -> F32:
-            plane = known[index].ground if index in known else None
+            plane = mapped[index].ground if index in mapped else None
             return _NO_GROUND if plane is None else unpack_ground_plane(load_blob(connection, plane), plane)
 
         lines = [_line(store, path, ground) for path in driven]
@@ -264,9 +266,9 @@ def _line(store: Store, path: I64, ground: Callable[[TileIndex], F32]) -> list[l
     for k, (row, col) in enumerate(tiles.tolist()):
         here = which.reshape(-1) == k
         z[here] = ground((row, col))[rows[here] % TILE_CELLS, cols[here] % TILE_CELLS]
-    known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
+    last_finite = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
     first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
-    height = np.where(known >= 0, z[known], first)
+    height = np.where(last_finite >= 0, z[last_finite], first)
     x = store.lattice.x0 + (cols + 0.5) * CELL_SIZE
     y = store.lattice.y0 + (rows + 0.5) * CELL_SIZE
     line: list[list[float]] = np.round(np.column_stack([x, y, height]), 2).tolist()

@@ -110,13 +110,13 @@ class RoundNow:
     def refusal(self, one: Examination, now_ns: int) -> MapvoteError | None:
         """The reason why an envelope does not fit the round, the clock or the map; None if it does."""
         ballot = one.ballot
-        asked = self._asked
+        round_policy = self._asked
         mend = "Vote again with the fleet's configuration (mapvote config)"
         if self._cast_by != one.cast_by:
             accepted = f"the current round accepts only {self._cast_by}"
             return Conflict(f"This ballot uses method {one.cast_by}; {accepted}. {mend}")
-        if not ballot.settings_hash.startswith(asked.settings_hash):
-            accepted = f"the current round accepts only {asked.settings_hash[:16]}"
+        if not ballot.settings_hash.startswith(round_policy.settings_hash):
+            accepted = f"the current round accepts only {round_policy.settings_hash[:16]}"
             return Conflict(f"This ballot uses settings {ballot.settings_hash[:16]}; {accepted}. {mend}")
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
@@ -172,18 +172,18 @@ class Intake:
 
         Thread-safe. The store is read only before a refusal; :meth:`write` checks everything again.
         """
-        now = self._store.clock()
+        now_ns = self._store.clock()
         with self._early_lock:
             used = self._used.get(one.ballot.vehicle)
-            fits = self._early.newest and self._early.refusal(one, now) is None
+            fits = self._early.newest and self._early.refusal(one, now_ns) is None
             if fits and self._over_quota(one, used) is None:
                 return None
             with self._store.database.reading() as connection:
                 newest, policy, _ = connection.execute(_HEAD).one()
                 self._early.catch_up(connection, newest, policy)
-                refused = self._early.refusal(one, now)
+                refused = self._early.refusal(one, now_ns)
                 if refused is None and self._quota is not None:
-                    refused = self._over_quota(one, _count(connection, one.ballot.vehicle, now))
+                    refused = self._over_quota(one, _count(connection, one.ballot.vehicle, now_ns))
                 if refused is None:
                     return None
                 _, standing = _heard_of(connection, [one])
@@ -199,14 +199,14 @@ class Intake:
         """
         if not ballots:
             return []
-        now = self._store.clock()
+        now_ns = self._store.clock()
         results: list[Receipt | MapvoteError] = []
         replaced: list[dict[str, int]] = []
         with self._store.database.writing() as connection:
             newest, policy, seq = connection.execute(_HEAD).one()
             self._round.catch_up(connection, newest, policy)
             came_with = {ballot.key_hash for ballot in ballots if ballot.key_hash is not None}
-            valid = keys.of(connection, came_with, now) if came_with else {}
+            valid = keys.of(connection, came_with, now_ns) if came_with else {}
             first, standing = _heard_of(connection, ballots)
             rows: Rows = defaultdict(list)
             admitted: list[Examination] = []
@@ -215,32 +215,32 @@ class Intake:
                 if old is not None and old_digest == one.digest:
                     results.append(Receipt(*one.drive, "repeated", old))
                     continue
-                known = one.key_hash is None or one.key_hash in valid
-                why = self._refusal(connection, one, now) if known else Unauthorised(keys.UNKNOWN)
-                if why is not None:
-                    results.append(why)
+                has_valid_key = one.key_hash is None or one.key_hash in valid
+                refused = self._refusal(connection, one, now_ns) if has_valid_key else Unauthorised(keys.UNKNOWN)
+                if refused is not None:
+                    results.append(refused)
                     continue
                 seq += 1
-                _enter(rows, one, seq, first.setdefault(one.drive, seq), now)
+                _enter(rows, one, seq, first.setdefault(one.drive, seq), now_ns)
                 if old is not None:
                     replaced.append({"old": old, "by": seq})
                 standing[one.drive] = seq, one.digest
                 for warning in elsewhere(connection, one, admitted):
                     seq += 1
-                    rows[schema.events].append((seq, now, "two places", one.ballot.vehicle, warning))
+                    rows[schema.events].append((seq, now_ns, "two places", one.ballot.vehicle, warning))
                 admitted.append(one)
                 results.append(Receipt(*one.drive, "created" if old is None else "replaced", seq))
-            for table, some in rows.items():
-                insert_rows(connection, table, some)
+            for table, new_rows in rows.items():
+                insert_rows(connection, table, new_rows)
             if replaced:
                 connection.execute(_REPLACED, replaced)
         return results
 
-    def _refusal(self, connection: sa.Connection, one: Examination, now: int) -> MapvoteError | None:
+    def _refusal(self, connection: sa.Connection, one: Examination, now_ns: int) -> MapvoteError | None:
         """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
         ballot = one.ballot
         tiles = self._round.tiles
-        refused = self._round.refusal(one, now) or refuse_out_of_reach(one.spoken, tiles.keys())
+        refused = self._round.refusal(one, now_ns) or refuse_out_of_reach(one.spoken, tiles.keys())
         refused = refused or self._out_of_height(connection, one.heights_m)
         if refused is not None:
             return refused
@@ -256,7 +256,7 @@ class Intake:
             return Conflict(
                 f"every cell voted on has changed since version {ballot.version}: fetch tiles {stale} and vote again"
             )
-        return self._count_in(connection, one, now)
+        return self._count_in(connection, one, now_ns)
 
     def _out_of_height(
         self, connection: sa.Connection, heights_m: Mapping[TileIndex, tuple[float, float]]
@@ -301,7 +301,7 @@ class Intake:
             return MapvoteError(f"{limit}: send each part of it as a drive of its own")
         return None if used is None else _exceeded(self._quota, used, one)
 
-    def _count_in(self, connection: sa.Connection, one: Examination, now: int) -> MapvoteError | None:
+    def _count_in(self, connection: sa.Connection, one: Examination, now_ns: int) -> MapvoteError | None:
         """The refusal of a ballot that exceeds its vehicle's budget; None admits and counts it. A vehicle's use is
         counted in the store once an hour and before a refusal; in between, admitted ballots are added."""
         if self._quota is None:
@@ -310,10 +310,10 @@ class Intake:
         used = self._used.get(vehicle)
         if (
             used is None
-            or used.since_ns < now - ADMISSION_RULE.counted_again_ns
+            or used.since_ns < now_ns - ADMISSION_RULE.counted_again_ns
             or self._over_quota(one, used) is not None
         ):
-            used = self._used[vehicle] = _count(connection, vehicle, now)
+            used = self._used[vehicle] = _count(connection, vehicle, now_ns)
         refused = self._over_quota(one, used)
         if refused is None:
             used.ballots = used.ballots + 1
@@ -353,11 +353,11 @@ Rows = dict[sa.Table, list[tuple[Any, ...]]]
 """Rows to insert, each in the order of its table's columns."""
 
 
-def _enter(rows: Rows, examined: Examination, seq: int, first_seq: int, now: int) -> None:
+def _enter(rows: Rows, examined: Examination, seq: int, first_seq: int, now_ns: int) -> None:
     """Add those of a ballot."""
     ballot = examined.ballot
-    rows[schema.events].append((seq, now, "ballot", *examined.drive))
-    times = ballot.start_ns, ballot.end_ns, now
+    rows[schema.events].append((seq, now_ns, "ballot", *examined.drive))
+    times = ballot.start_ns, ballot.end_ns, now_ns
     how = ballot.settings_hash[:128], examined.cast_by, examined.size, ballot.version
     rows[schema.ballots].append((seq, first_seq, None, *examined.drive, examined.digest, *times, *how))
     for tile in ballot.tiles:
@@ -454,8 +454,8 @@ def _exceeded(quota: Quota, used: _Used, one: Examination) -> TooMany | None:
     return None
 
 
-def _count(connection: sa.Connection, vehicle: str, now: int) -> _Used:
+def _count(connection: sa.Connection, vehicle: str, now_ns: int) -> _Used:
     b = schema.ballots
-    today = sa.func.sum(sa.case((b.c.received_ns > now - DAY_NS, 1), else_=0))
+    today = sa.func.sum(sa.case((b.c.received_ns > now_ns - DAY_NS, 1), else_=0))
     row = connection.execute(sa.select(today, sa.func.sum(b.c.bytes)).where(b.c.vehicle == vehicle)).one()
-    return _Used(now, int(row[0] or 0), int(row[1] or 0))
+    return _Used(now_ns, int(row[0] or 0), int(row[1] or 0))

@@ -270,10 +270,10 @@ class Remembered:
     def get(self, sums: Iterable[str]) -> dict[str, Planes]:
         """Those that are known, by sum."""
         with self._lock:
-            found = {digest: planes for digest in sums if (planes := self._planes.get(digest)) is not None}
-            for digest in found:
+            planes_of = {digest: planes for digest in sums if (planes := self._planes.get(digest)) is not None}
+            for digest in planes_of:
                 self._planes.move_to_end(digest)
-        return found
+        return planes_of
 
     def put(self, digest: str, planes: Planes) -> None:
         """Remember these too."""

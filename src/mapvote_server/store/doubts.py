@@ -50,8 +50,8 @@ class Doubts:
 
     def holding(self, settings: FuseSettings) -> list[str]:
         """Those for which the policy holds the version."""
-        asked = ((settings.hold_overturned, self._overturns()), (settings.hold_newcomers, self._rests(settings)))
-        return [text for held, text in asked if held and text]
+        reasons = ((settings.hold_overturned, self._overturns()), (settings.hold_newcomers, self._rests(settings)))
+        return [text for held, text in reasons if held and text]
 
     def _overturns(self) -> str:
         if not self.overturned:
@@ -76,28 +76,30 @@ class Doubts:
 
 
 def doubts_about(
-    store: Store, newest: int, asked: Electorate, changed: Sequence[Fused], decided: Sequence[Fused]
+    store: Store, newest: int, electorate: Electorate, changed: Sequence[Fused], decided: Sequence[Fused]
 ) -> Doubts:
     """The doubts about a round on version ``newest``. ``changed``: the tiles that a publish would change; ``decided``:
     all that the round decided. Tiles and ballots that are damaged are left out here; the round names them."""
-    found = []
+    by_tile = []
     with store.database.reading() as connection:
-        known = _KnownVehicles(connection, asked)
-        for fused in changed if asked.policy.round.stage == "two-stage" else ():
+        veterans = _KnownVehicles(connection, electorate)
+        for fused in changed if electorate.policy.round.stage == "two-stage" else ():
             try:
                 tile = tile_as_of(connection, store.lattice.tile(fused.index), newest)
-                found.append(_on_tile(fused, tile, recent_votes(connection, tile, asked), asked.settings, known))
+                by_tile.append(
+                    _on_tile(fused, tile, recent_votes(connection, tile, electorate), electorate.settings, veterans)
+                )
             except Unavailable:
                 raise
             except MapvoteError:
                 continue
-    overturned = [one for one in found if one.overturned]
-    names = sorted({name for one in found for name in one.newcomers})
+    overturned = [one for one in by_tile if one.overturned]
+    names = sorted({name for one in by_tile for name in one.newcomers})
     return Doubts(
         overturned=sum(one.overturned for one in overturned),
         votes_for=min((one.votes_for for one in overturned), default=0),
         said_otherwise=max((one.said_otherwise for one in overturned), default=0),
-        by_newcomers=sum(one.by_newcomers for one in found),
+        by_newcomers=sum(one.by_newcomers for one in by_tile),
         newcomers=tuple(names),
         copies=_copies_in(decided),
     )
@@ -106,13 +108,13 @@ def doubts_about(
 class _KnownVehicles:
     """Which vehicles voted before the newcomers did."""
 
-    def __init__(self, connection: sa.Connection, asked: Electorate) -> None:
+    def __init__(self, connection: sa.Connection, electorate: Electorate) -> None:
         self._connection = connection
-        self._since_ns = asked.received_by_ns - round(asked.settings.newcomer_days * DAY_NS)
+        self._since_ns = electorate.received_by_ns - round(electorate.settings.newcomer_days * DAY_NS)
         b = schema.ballots.c
         older = sa.select(b.seq).where(b.received_ns <= self._since_ns).limit(1)
         # Where nobody has voted for longer, all are new, and nobody stands out.
-        self.any = asked.settings.newcomer_days > 0 and connection.execute(older).first() is not None
+        self.any = electorate.settings.newcomer_days > 0 and connection.execute(older).first() is not None
         self._known: dict[str, bool] = {}
 
     def __contains__(self, vehicle: str) -> bool:
@@ -123,7 +125,9 @@ class _KnownVehicles:
         return self._known[vehicle]
 
 
-def _on_tile(fused: Fused, tile: Tile, drives: Sequence[Vote], settings: FuseSettings, known: _KnownVehicles) -> Doubts:
+def _on_tile(
+    fused: Fused, tile: Tile, drives: Sequence[Vote], settings: FuseSettings, veterans: _KnownVehicles
+) -> Doubts:
     """The doubts about one tile. ``drives``: all that count there, of every vehicle and of a longer time."""
     record = fused.record
     assert record is not None
@@ -140,7 +144,7 @@ def _on_tile(fused: Fused, tile: Tile, drives: Sequence[Vote], settings: FuseSet
     otherwise = ((said < CellState.UNDETERMINED) & ~agrees).sum(axis=0)
     overturned = otherwise >= votes_for
     # Without newcomers the quorum would be missing.
-    new = np.array([vehicle_of[vote.vehicle] not in known for vote in voters], dtype=np.bool_) & known.any
+    new = np.array([vehicle_of[vote.vehicle] not in veterans for vote in voters], dtype=np.bool_) & veterans.any
     rests = (agrees[new].any(axis=0)) & (agrees[~new].sum(axis=0) < settings.min_votes)
     resting = np.flatnonzero((agrees & rests).any(axis=1) & new)
     names = {vehicle_of[voters[i].vehicle] for i in resting.tolist()}

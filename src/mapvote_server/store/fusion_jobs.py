@@ -78,7 +78,7 @@ class Task:
     """Number of the version to be made."""
     tile: TileHashes | Tile | None
     """The tile of the newest version: its hashes in the store, the tile itself, or None if there is none."""
-    asked: Electorate
+    electorate: Electorate
     misread: Mapping[int, Bool] | None = None
     """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
     fallen: Fallen | None = None
@@ -189,7 +189,7 @@ def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list
     """
     with (database or _database(tasks[0].url)).reading() as connection:
         tiles = [task.window.tile_index for task in tasks]
-        polled = poll(connection, tiles[0][0], [col for _, col in tiles], tasks[0].asked)
+        polled = poll(connection, tiles[0][0], [col for _, col in tiles], tasks[0].electorate)
         return [_fuse_sound(connection, task, polled) for task in tasks]
 
 
@@ -201,7 +201,7 @@ def _fuse_sound(connection: sa.Connection, task: Task, polled: Polled) -> Fused 
             return replace(_fuse(connection, task, polled), damaged=damaged)
         except DamagedBallots as error:
             damaged += error.found
-            task = replace(task, asked=task.asked.leaving_out(error.found))
+            task = replace(task, electorate=task.electorate.leaving_out(error.found))
         except Unavailable:
             raise
         except MapvoteError as error:
@@ -218,21 +218,21 @@ def _plane_of(task: Task, error: str) -> str:
 
 def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused | Open:
     tile = _tile(connection, task)
-    judged = judged_on(connection, tile, task.asked, task.misread, polled)
+    judged = judged_on(connection, tile, task.electorate, task.misread, polled)
     votes = [vote for vote in judged if not vote.why]
-    cast = task.asked.policy.round
+    cast = task.electorate.policy.round
 
     def history() -> list[Vote]:
-        return recent_votes(connection, tile, task.asked, task.misread, polled)
+        return recent_votes(connection, tile, task.electorate, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
     rule = rule_named(cast.method)
-    settings = task.asked.settings
+    settings = task.electorate.settings
     barred = [cells for _, cells in polled.bars[tile.index]]
     reviewed = np.logical_or.reduce(barred) if barred else None
     falling = Falling(reviewed, task.fallen)
     decision, edited = fuse_tile(tile, votes, rule, settings, task.version, recent, falling)
-    standings = pack_standings(standings_of(judged, decision.copies, decision.heard, task.asked.settings))
+    standings = pack_standings(standings_of(judged, decision.copies, decision.heard, task.electorate.settings))
     if decision.undecided is not None:
         return Open(task, tile, edited, decision, standings)
     return _packed(task, tile, edited, decision, standings)
@@ -316,7 +316,7 @@ class Watched(Executor):
         self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
     ) -> Iterator[Any]:
         """Results of the other executor, in order; the first of ``iterables`` holds groups of tiles."""
-        groups = [list(some) for some in iterables]
+        groups = [list(tasks) for tasks in iterables]
         sizes = [len(group) for group in groups[0]]
         self._report(0, sum(sizes))
         results = self.within.map(fn, *groups, timeout=timeout, chunksize=chunksize)
@@ -332,16 +332,16 @@ def fuse_round(
 
     The first ``JobSizes.sites`` tiles stay in memory whole, the large parts of all others lie on disk.
     """
-    where = executor.within if isinstance(executor, Watched) else executor
+    pool = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
     rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
     size = min(sizes.group, max(1, len(tasks) // sizes.round_groups)) if executor else sizes.group
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
-    work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
+    work = here if executor is None or isinstance(pool, ThreadPoolExecutor) else fuse_stored
     file = RoundFile() if len(tasks) > sizes.sites else None
     done: list[Fused | Open] = []
     unpacked = 0
-    for fused in (one for some in (executor.map if executor else map)(work, groups) for one in some):
+    for fused in (one for results in (executor.map if executor else map)(work, groups) for one in results):
         if isinstance(fused, Open):
             unpacked += 1
         small = fused.packed() if isinstance(fused, Open) and unpacked > sizes.sites else fused

@@ -28,13 +28,13 @@ from mapvote_server.store.store import Store
 def check(store: Store, *, mend: bool = False, by: str = "operator") -> list[Damage]:
     """Everything that is damaged; with ``mend`` it is set aside."""
     with store.database.reading() as connection:
-        found = [*_database(connection, store), *_planes(connection), *_chain(connection)]
-        found += [*_rows(connection), *_ends(connection)]
-    if mend and found:
+        damaged = [*_database(connection, store), *_planes(connection), *_chain(connection)]
+        damaged += [*_rows(connection), *_ends(connection)]
+    if mend and damaged:
         with store.database.writing() as connection:
-            quarantine(connection, found, store.clock(), by)
-        return [replace(damage, mended="set aside") for damage in found]
-    return found
+            quarantine(connection, damaged, store.clock(), by)
+        return [replace(damage, mended="set aside") for damage in damaged]
+    return damaged
 
 
 def restore_plane(store: Store, digest: str, raw: bytes, *, by: str) -> bool:
@@ -72,9 +72,9 @@ def _database(connection: sa.Connection, store: Store) -> Iterator[Damage]:
 
 def _planes(connection: sa.Connection) -> Iterator[Damage]:
     for row in _in_batches(connection, sa.select(schema.blobs).order_by(schema.blobs.c.hash)):
-        why = _wrong(row.hash, row.data)
-        if why:
-            yield Damage("plane", row.hash, why)
+        defect = _wrong(row.hash, row.data)
+        if defect:
+            yield Damage("plane", row.hash, defect)
 
 
 def _wrong(digest: str, data: bytes) -> str:
@@ -162,9 +162,9 @@ class Damage:
 class DamagedBallots(MapvoteError):
     """Votes that are not what was sent."""
 
-    def __init__(self, found: list[Damage]) -> None:
-        super().__init__("; ".join(map(str, found)))
-        self.found = found
+    def __init__(self, damaged: list[Damage]) -> None:
+        super().__init__("; ".join(map(str, damaged)))
+        self.found = damaged
 
 
 def ballot_name(seq: int, row: int, col: int) -> str:
@@ -178,15 +178,15 @@ def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:
     return {(row.kind, row.name): row.why for row in connection.execute(sa.select(q.c.kind, q.c.name, q.c.why))}
 
 
-def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, by: str) -> None:
+def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now_ns: int, by: str) -> None:
     """Quarantine items that are not quarantined yet; each is named in the log."""
-    known = set(set_aside(connection))
+    in_quarantine = set(set_aside(connection))
     for damage in damaged:
-        if (damage.kind, damage.name) not in known:
-            seq = log_event(connection, now, "quarantine", by, str(damage))
+        if (damage.kind, damage.name) not in in_quarantine:
+            seq = log_event(connection, now_ns, "quarantine", by, str(damage))
             row = {"kind": damage.kind, "name": damage.name[:160], "seq": seq, "why": damage.why[:200]}
             connection.execute(schema.quarantine.insert().values(**row))
-            known.add((damage.kind, damage.name))
+            in_quarantine.add((damage.kind, damage.name))
 
 
 def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex]:

@@ -52,7 +52,7 @@ def issue(store: Store, name: str, role: Role, *, by: str = "operator", days: fl
         return put_in(connection, store.clock(), name, role, by, days)
 
 
-def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, days: float | None = None) -> str:
+def put_in(connection: sa.Connection, now_ns: int, name: str, role: Role, by: str, days: float | None = None) -> str:
     """:func:`issue` within a transaction."""
     if not _NAME.fullmatch(name):
         raise MapvoteError(f"{name!r} is no name: 1-64 of letters, digits, dot, underscore, dash")
@@ -60,14 +60,14 @@ def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, 
         raise MapvoteError(f"{role!r} is no role; choose one of {', '.join(ROLES)}")
     if days is not None and not 0 < days <= MOST_DAYS:
         raise MapvoteError(f"a key for {days:g} days: give more than 0 and at most {MOST_DAYS}, or leave it out")
-    others = {key.role for key in _keys_of(connection, name) if key.valid_at(now)} - {role}
+    others = {key.role for key in _keys_of(connection, name) if key.valid_at(now_ns)} - {role}
     if others:
         raise Conflict(f"{name!r} has a valid key of a {others.pop()}: a name has one role; revoke that one first")
     secret = secrets.token_urlsafe(32)
-    end = None if days is None else now + round(days * DAY_NS)
-    row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now, "expires_ns": end}
+    end = None if days is None else now_ns + round(days * DAY_NS)
+    row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now_ns, "expires_ns": end}
     connection.execute(schema.keys.insert().values(**row))
-    log_event(connection, now, "key issued", by, f"{role} {name}" + ("" if days is None else f" for {days:g} days"))
+    log_event(connection, now_ns, "key issued", by, f"{role} {name}" + ("" if days is None else f" for {days:g} days"))
     return secret
 
 
@@ -78,16 +78,16 @@ def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float
     """
     k = schema.keys
     with store.database.writing() as connection:
-        now = store.clock()
-        valid = [key for key in _keys_of(connection, name) if key.valid_at(now)]
+        now_ns = store.clock()
+        valid = [key for key in _keys_of(connection, name) if key.valid_at(now_ns)]
         if not valid:
             raise NotFound(f"{name!r} has no valid key to take the place of; issue one")
         last = valid[-1]
-        end = now + round(overlap_days * DAY_NS)
+        end = now_ns + round(overlap_days * DAY_NS)
         later = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > end))
         connection.execute(k.update().where(later).values(expires_ns=end))
         days = None if last.expires_ns is None else (last.expires_ns - last.created_ns) / DAY_NS
-        return put_in(connection, now, name, last.role, by, days)  # type: ignore[arg-type]
+        return put_in(connection, now_ns, name, last.role, by, days)  # type: ignore[arg-type]
 
 
 def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = False) -> tuple[int, int]:
@@ -97,13 +97,13 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
     (:func:`mapvote_server.store.rollback.replay` removes them too).
     """
     k = schema.keys
-    now = store.clock()
-    valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
+    now_ns = store.clock()
+    valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now_ns))
     with store.database.writing() as connection:
-        done = connection.execute(k.update().where(valid).values(revoked_ns=now))
+        done = connection.execute(k.update().where(valid).values(revoked_ns=now_ns))
         if not done.rowcount:
             raise NotFound(f"{name!r} has no valid key")
-        seq = log_event(connection, now, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
+        seq = log_event(connection, now_ns, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
         return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
 
 
@@ -154,13 +154,13 @@ def check(store: Store, hashes: Sequence[str]) -> list[Key | Exception]:
     return [valid[digest] if digest in valid else Unauthorised(UNKNOWN) for digest in hashes]
 
 
-def of(connection: sa.Connection, hashes: Collection[str], now: int) -> dict[str, Key]:
-    """The keys among these that are valid ``now``, by :func:`hash_of`."""
+def of(connection: sa.Connection, hashes: Collection[str], now_ns: int) -> dict[str, Key]:
+    """The keys among these that are valid ``now_ns``, by :func:`hash_of`."""
     if not hashes:
         return {}
     k = schema.keys
-    found = connection.execute(sa.select(k.c.hash, *_COLUMNS).where(k.c.hash.in_(hashes)))
-    return {digest: key for digest, *columns in found if (key := Key(*columns)).valid_at(now)}
+    rows = connection.execute(sa.select(k.c.hash, *_COLUMNS).where(k.c.hash.in_(hashes)))
+    return {digest: key for digest, *columns in rows if (key := Key(*columns)).valid_at(now_ns)}
 
 
 def hash_of(secret: str) -> str:

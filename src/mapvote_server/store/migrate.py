@@ -40,19 +40,21 @@ def revision_of(connection: sa.Connection) -> str | None:
 def check(connection: sa.Connection, history: History = HISTORY) -> None:
     """MapvoteError, with the way out, unless the database holds a store of exactly this program's schema."""
     revision = revision_of(connection)
-    where = connection.engine.url.render_as_string()
+    address = connection.engine.url.render_as_string()
     if revision is None:
         copied = f" ({COPIED})" if connection.dialect.name == "sqlite" else ""
-        raise MapvoteError(f"{where}: holds no map yet; create the store with `mapvote serve STORE --map MAP`{copied}")
+        raise MapvoteError(
+            f"{address}: holds no map yet; create the store with `mapvote serve STORE --map MAP`{copied}"
+        )
     if revision == history.head:
         return
     if revision in _revisions(history):
         raise MapvoteError(
-            f"{where}: schema {revision} of an older mapvote, this one works with {history.head}: stop the server, "
+            f"{address}: schema {revision} of an older mapvote, this one works with {history.head}: stop the server, "
             "make a backup, then run `mapvote serve STORE --upgrade`"
         )
     raise MapvoteError(
-        f"{where}: schema {revision} of a newer mapvote, this one knows up to {history.head}: install that one"
+        f"{address}: schema {revision} of a newer mapvote, this one knows up to {history.head}: install that one"
     )
 
 

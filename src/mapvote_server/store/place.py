@@ -106,9 +106,9 @@ def _first_apart(tiles: list[TileIndex]) -> tuple[TileIndex, TileIndex] | None:
     left = set(tiles[1:]) - {tiles[0]}
     reached = [tiles[0]]
     while reached and left:
-        found = [index for index in around(reached.pop()) if index in left]
-        left.difference_update(found)
-        reached += found
+        neighbours = [index for index in around(reached.pop()) if index in left]
+        left.difference_update(neighbours)
+        reached += neighbours
     return (tiles[0], min(left)) if left else None
 
 

@@ -78,8 +78,8 @@ class Policy(Section):
         """The first policy of a store made by these settings: its fleet votes as they say."""
         voting = settings.voting
         stage: Literal["one-stage", "two-stage"] = "two-stage" if voting.two_stage else "one-stage"
-        asked = RoundPolicy(method=voting.method, stage=stage, settings_hash=settings.digest())
-        return cls(round=asked, fuse=settings.fuse, gate=GatePolicy.model_validate(settings.gate.model_dump()))
+        round_policy = RoundPolicy(method=voting.method, stage=stage, settings_hash=settings.digest())
+        return cls(round=round_policy, fuse=settings.fuse, gate=GatePolicy.model_validate(settings.gate.model_dump()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +109,9 @@ def without_drive(policy: Mapping[str, Any]) -> dict[str, Any]:
     return {**policy, "gate": {**gate, "drive": HIDDEN}} if gate.get("drive") else dict(policy)
 
 
-def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, reason: str) -> int:
+def write_policy(connection: sa.Connection, policy: Policy, now_ns: int, by: str, reason: str) -> int:
     """Let another policy hold from now on; the number of the event."""
-    seq = log_event(connection, now, "policy", by, reason)
+    seq = log_event(connection, now_ns, "policy", by, reason)
     connection.execute(schema.policies.insert().values(seq=seq, policy=policy.model_dump(mode="json")))
     return seq
 
@@ -127,15 +127,15 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
     MapvoteError naming the key, and the nearest one that exists.
     """
     sections = policy.model_dump()
-    known = names_in(policy)
+    settings = names_in(policy)
     for name, value in values.items():
-        if name not in known:
-            raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")
+        if name not in settings:
+            raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, settings)}")
         section, _, key = name.partition(".")
         sections[section][key] = value
     try:
         return Policy.model_validate(sections)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"][:2])
-        raise MapvoteError(f"policy: {where} = {first['input']!r}: {wanted_of(first)}") from error
+        setting = ".".join(str(part) for part in first["loc"][:2])
+        raise MapvoteError(f"policy: {setting} = {first['input']!r}: {wanted_of(first)}") from error

@@ -116,26 +116,28 @@ def publish(
     with the reasons, Conflict if another version was published first, MapvoteError if the policy names a reference
     drive and there is no ``gate``.
     """
-    now = store.clock()
-    found, outcome = _outcome(store, now, settings, parent, gate, executor)
+    now_ns = store.clock()
+    fused_round, outcome = _outcome(store, now_ns, settings, parent, gate, executor)
     damaged = [damage for one in outcome.fused for damage in one.damaged]
     copies = {str(copy) for one in outcome.fused for copy in one.copies}
     if damaged or copies:
         with store.database.writing() as connection:
-            quarantine(connection, damaged, now, by)
-            _log_copies(connection, copies, now, by)
-    policy = found.asked.policy
+            quarantine(connection, damaged, now_ns, by)
+            _log_copies(connection, copies, now_ns, by)
+    policy = fused_round.electorate.policy
     if gate is None and policy.gate.drive:
-        asked = policy.gate.drive
-        raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
+        gate_drive = policy.gate.drive
+        raise MapvoteError(f"the policy judges versions by {gate_drive}: publish by the server or mapvote publish")
     if not outcome.tiles:
         return outcome
     if outcome.held and not override:
         raise Held(outcome.held)
-    why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
-    newest = found.newest.number
+    full_reason = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
+    newest = fused_round.newest.number
     made_by = policy.model_dump(mode="json")
-    version = Version(newest + 1, newest, "publish", None, now, by, why[:400], found.asked.mark, made_by)
+    version = Version(
+        newest + 1, newest, "publish", None, now_ns, by, full_reason[:400], fused_round.electorate.mark, made_by
+    )
     tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
     write_version(store, version, tiles, (f.planes for f in outcome.fused), outcome.fused, doubts=outcome.doubts)
     if policy.keep.automatic:
@@ -145,16 +147,16 @@ def publish(
 
 def _outcome(
     store: Store,
-    now: int,
+    now_ns: int,
     settings: FuseSettings | None,
     parent: int | None,
     gate: Gate | None,
     executor: Executor | None,
 ) -> tuple[Round, Outcome]:
     """The round, and what a publish of it would be."""
-    found = round_at(store, now, settings, executor)
-    newest = found.newest.number
-    changed = found.changed
+    fused_round = round_at(store, now_ns, settings, executor)
+    newest = fused_round.newest.number
+    changed = fused_round.changed
     if parent is not None and parent != newest:
         raise Conflict(f"the newest version is {newest}, not {parent}: look at it, then publish")
     outcome = Outcome(
@@ -163,19 +165,19 @@ def _outcome(
         tiles=[tile_key(fused.index) for fused in changed],
         points_added=sum(fused.added for fused in changed),
         points_deleted=sum(fused.deleted for fused in changed),
-        held=list(reasons_to_hold(store, found, gate)),
-        doubts=list(doubts_of(store, found).told(found.asked.settings)),
-        fused=list(found.decided.values()),
+        held=list(reasons_to_hold(store, fused_round, gate)),
+        doubts=list(doubts_of(store, fused_round).told(fused_round.electorate.settings)),
+        fused=list(fused_round.decided.values()),
     )
-    return found, outcome
+    return fused_round, outcome
 
 
-def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:
+def _log_copies(connection: sa.Connection, copies: Iterable[str], now_ns: int, by: str) -> None:
     """Each is named once."""
     e = schema.events.c
-    known = set(connection.execute(sa.select(e.detail).where(e.kind == "copy")).scalars())
-    for copy in sorted(set(copies) - known):
-        log_event(connection, now, "copy", by, copy)
+    logged = set(connection.execute(sa.select(e.detail).where(e.kind == "copy")).scalars())
+    for copy in sorted(set(copies) - logged):
+        log_event(connection, now_ns, "copy", by, copy)
 
 
 def write_version(
@@ -204,11 +206,11 @@ def write_version(
             if version.kind != "publish":
                 version = replace(version, mark=seq)
             for doubt in doubts:
-                told = f"v{version.number}: {doubt}"
-                log_event(connection, version.created_ns, "doubt", version.published_by, told[:_MOST_DETAIL])
+                message = f"v{version.number}: {doubt}"
+                log_event(connection, version.created_ns, "doubt", version.published_by, message[:_MOST_DETAIL])
             connection.execute(schema.versions.insert().values(**asdict(version)))
-            for some in _parts(planes):
-                add_blobs(connection, {digest: data for one in some for digest, data in one.items()})
+            for part in _parts(planes):
+                add_blobs(connection, {digest: data for one in part for digest, data in one.items()})
             set_tiles(connection, version.number, tiles)
             for fused in _parts(decided):
                 rows = [_decision_row(version.number, one, record) for one in fused if (record := one.record)]
@@ -224,8 +226,8 @@ def write_version(
 def _parts(items: Iterable[Part]) -> Iterator[list[Part]]:
     """The items, ``JobSizes.sites`` at a time."""
     rest = iter(items)
-    while some := list(islice(rest, JOB_SIZES.sites)):
-        yield some
+    while part := list(islice(rest, JOB_SIZES.sites)):
+        yield part
 
 
 def _decision_row(number: int, fused: Fused, record: Record) -> tuple[object, ...]:
@@ -246,7 +248,7 @@ class Round:
     """The decision of every tile, as of one event."""
 
     newest: Version
-    asked: Electorate
+    electorate: Electorate
     until_ns: int | None
     """Time at which the next vote reaches the minimum age; None: there is no minimum, or all votes have reached it."""
     decided: Mapping[TileIndex, Fused]
@@ -268,12 +270,14 @@ class Round:
 _doubts: WeakKeyDictionary[Round, Doubts] = WeakKeyDictionary()
 
 
-def doubts_of(store: Store, found: Round) -> Doubts:
+def doubts_of(store: Store, fused_round: Round) -> Doubts:
     """Warnings on the voters of a round; computed once."""
-    if found not in _doubts:
-        every = [*found.decided.values(), *found.beside.values()]
-        _doubts[found] = doubts_about(store, found.newest.number, found.asked, found.changed, every)
-    return _doubts[found]
+    if fused_round not in _doubts:
+        every = [*fused_round.decided.values(), *fused_round.beside.values()]
+        _doubts[fused_round] = doubts_about(
+            store, fused_round.newest.number, fused_round.electorate, fused_round.changed, every
+        )
+    return _doubts[fused_round]
 
 
 @dataclass(slots=True)
@@ -290,78 +294,82 @@ _latest = PerStore(_Latest)
 
 
 def round_at(
-    store: Store, now: int, settings: FuseSettings | None = None, executor: Executor | None = None, every: bool = False
+    store: Store,
+    now_ns: int,
+    settings: FuseSettings | None = None,
+    executor: Executor | None = None,
+    every: bool = False,
 ) -> Round:
-    """The round as of ``now``, by the store's clock. One thread decides it; other threads wait for the result.
+    """The round as of ``now_ns``, by the store's clock. One thread decides it; other threads wait for the result.
 
     ``settings`` take the place of the policy's ``fuse``, in simulations; such a round is not kept. ``every``: fuse all
     tiles with votes, for what waits there.
     """
     if settings is not None:
-        return _decide(store, now, settings, executor, every, None)
+        return _decide(store, now_ns, settings, executor, every, None)
     latest = _latest.of(store)
     with latest.deciding:
-        known = latest.round
-        if known is None or not _holds(store, known, now) or (every and not known.every):
-            known = latest.round = _decide(store, now, None, executor, every, known)
-        return known
+        last_round = latest.round
+        if last_round is None or not _holds(store, last_round, now_ns) or (every and not last_round.every):
+            last_round = latest.round = _decide(store, now_ns, None, executor, every, last_round)
+        return last_round
 
 
 def _decide(
-    store: Store, now: int, settings: FuseSettings | None, executor: Executor | None, every: bool, last: Round | None
+    store: Store, now_ns: int, settings: FuseSettings | None, executor: Executor | None, every: bool, last: Round | None
 ) -> Round:
     """Fuse every tile that the ``last`` round does not answer."""
     with store.database.reading() as connection:
         newest = version_of(connection)
         mark = newest_seq(connection)
-        asked = electorate_now(connection, now, mark, settings)
-        dirty = _dirty(connection, newest, asked)
+        electorate = electorate_now(connection, now_ns, mark, settings)
+        dirty = _dirty(connection, newest, electorate)
         wanted = (
             sorted({*dirty, *standing_tiles(connection, mark)})
-            if every and asked.settings.false_deletions < 1.0
+            if every and electorate.settings.false_deletions < 1.0
             else dirty
         )
-        found = _still_true(connection, last, newest, asked)
-        missing = [index for index in wanted if index not in found]
+        kept = _still_true(connection, last, newest, electorate)
+        missing = [index for index in wanted if index not in kept]
         hashes = tiles_of(connection, newest.number, missing)
-        until = next_ripe_ns(connection, asked)
+        until = next_ripe_ns(connection, electorate)
     made = newest.number + 1
     url = address_of(store.database.url)
-    tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
-    alone = found | {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
+    tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), electorate) for i in missing]
+    alone = kept | {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
 
     def task_of(index: TileIndex) -> Task:
         with store.database.reading() as connection:
-            return Task(url, store.lattice.tile(index), made, tile_of(connection, newest.number, index), asked)
+            return Task(url, store.lattice.tile(index), made, tile_of(connection, newest.number, index), electorate)
 
     done = settled(alone, task_of, store.database)
     decided = {index: done.tiles[index] for index in sorted({*dirty, *done.fell})}
     beside = {index: done.tiles[index] for index in wanted if index not in decided}
-    return Round(newest, asked, until, decided, beside, done.alone, every)
+    return Round(newest, electorate, until, decided, beside, done.alone, every)
 
 
-def _holds(store: Store, known: Round, now: int) -> bool:
+def _holds(store: Store, last_round: Round, now_ns: int) -> bool:
     """Whether no event that can change the round has come since, and no vote has reached the minimum age."""
-    if known.until_ns is not None and now >= known.until_ns:
+    if last_round.until_ns is not None and now_ns >= last_round.until_ns:
         return False
     e = schema.events.c
-    came = sa.select(e.seq).where(e.seq > known.asked.mark, e.kind.not_in(_WITHOUT_EFFECT)).limit(1)
+    came = sa.select(e.seq).where(e.seq > last_round.electorate.mark, e.kind.not_in(_WITHOUT_EFFECT)).limit(1)
     with store.database.reading() as connection:
         return connection.execute(came).first() is None
 
 
-def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
+def _dirty(connection: sa.Connection, newest: Version, electorate: Electorate) -> list[TileIndex]:
     """Tiles that may come to something else than when they were last fused.
 
     Where the newest version changed something, votes are spent that decided together with others. With another policy,
     or after a version that was not fused, every tile may differ; with a minimum age votes ripen without any event.
     """
-    policy = asked.policy
+    policy = electorate.policy
     fused = newest.kind == "publish" and newest.policy == policy.model_dump(mode="json")
     if not fused or policy.fuse.min_age_s > 0:
-        return standing_tiles(connection, asked.mark)
+        return standing_tiles(connection, electorate.mark)
     edited = tiles_set_between(connection, newest.number - 1, newest.number)
-    return sorted({*_touched(connection, asked.mark, newest.mark), *edited})
+    return sorted({*_touched(connection, electorate.mark, newest.mark), *edited})
 
 
 def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:
@@ -370,30 +378,30 @@ def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]
 
 
 def _still_true(
-    connection: sa.Connection, last: Round | None, newest: Version, asked: Electorate
+    connection: sa.Connection, last: Round | None, newest: Version, electorate: Electorate
 ) -> dict[TileIndex, Fused]:
     """The tiles of the last round on which nothing has changed since."""
-    if last is None or last.newest.number != newest.number or last.asked.policy != asked.policy:
+    if last is None or last.newest.number != newest.number or last.electorate.policy != electorate.policy:
         return {}
-    if asked.policy.fuse.min_age_s > 0:
+    if electorate.policy.fuse.min_age_s > 0:
         return {}
-    touched = _touched(connection, asked.mark, last.asked.mark)
+    touched = _touched(connection, electorate.mark, last.electorate.mark)
     return {index: fused for index, fused in last.alone.items() if index not in touched}
 
 
-def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
+def reasons_to_hold(store: Store, fused_round: Round, gate: Gate | None) -> list[str]:
     """The reasons of the policy, and of its gate, against the version that a round would make."""
-    changed = found.changed
-    asked = found.asked.policy.gate
-    held = hold_reasons(changed, found.asked.settings)
-    held += doubts_of(store, found).holding(found.asked.settings)
-    if gate is None or not asked.drive or not changed:
+    changed = fused_round.changed
+    gate_policy = fused_round.electorate.policy.gate
+    held = hold_reasons(changed, fused_round.electorate.settings)
+    held += doubts_of(store, fused_round).holding(fused_round.electorate.settings)
+    if gate is None or not gate_policy.drive or not changed:
         return held
     latest = _latest.of(store)
     with latest.judging:
-        if latest.judged is None or latest.judged[0] is not found:
-            old = store.point_map(found.newest.number)
-            latest.judged = found, gate(asked, old, _after(store, old, changed))
+        if latest.judged is None or latest.judged[0] is not fused_round:
+            old = store.point_map(fused_round.newest.number)
+            latest.judged = fused_round, gate(gate_policy, old, _after(store, old, changed))
         return [*held, *latest.judged[1]]
 
 
@@ -419,20 +427,20 @@ def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
         if fused.freed > settings.max_freed_share * CELLS:
             freed = fused.freed / CELLS
             reasons.append(f"learns free space in {freed:.0%} of {name}, more than {settings.max_freed_share:.0%}")
-    for what, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
+    for verb, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
         rows, cols = lattice_cells([(f, getattr(f, cells)) for f in changed])
         areas = areas_m2(rows, cols)
         largest = int(np.argmax(areas)) if len(areas) else 0
         if len(areas) and areas[largest] > settings.max_change_m2:
-            about = f"{what} one connected thing of {areas[largest]:.0f} m2"
+            about = f"{verb} one connected thing of {areas[largest]:.0f} m2"
             reasons.append(f"{about}, more than {settings.max_change_m2:.0f} m2")
     return reasons
 
 
-def lattice_cells(found: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
+def lattice_cells(cells_by_tile: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
     """(rows, cols) on the lattice of flat cells of some tiles."""
-    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in found]
-    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in found]
+    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in cells_by_tile]
+    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in cells_by_tile]
     nothing = np.empty(0, dtype=np.int64)
     return np.concatenate([nothing, *rows]), np.concatenate([nothing, *cols])
 

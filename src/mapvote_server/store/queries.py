@@ -33,8 +33,8 @@ def version_of(connection: sa.Connection, number: int | None = None, *, cleared:
     """One version, the newest by default; NotFound, naming the newest, if there is none of that number, or (unless
     ``cleared`` will do) it was cleared away."""
     v = schema.versions.c.number
-    asked = sa.select(*VERSION_COLUMNS).order_by(v.desc()).limit(1)
-    row = connection.execute(asked if number is None else asked.where(v == number)).one_or_none()
+    query = sa.select(*VERSION_COLUMNS).order_by(v.desc()).limit(1)
+    row = connection.execute(query if number is None else query.where(v == number)).one_or_none()
     if row is None:
         newest = current_number(connection)
         raise NotFound(f"there is no version {number}; the newest is {newest}")
@@ -77,8 +77,8 @@ def tiles_of(
 ) -> dict[TileIndex, TileHashes]:
     """Hashes of a version's tiles (``only`` these), in ascending order: of each, the last row up to that version."""
     if only is not None and len(only) <= DATABASE_SIZES.one_by_one:
-        found = {index: tile_of(connection, number, index) for index in sorted(only)}
-        return {index: hashes for index, hashes in found.items() if hashes is not None}
+        hashes_of = {index: tile_of(connection, number, index) for index in sorted(only)}
+        return {index: hashes for index, hashes in hashes_of.items() if hashes is not None}
     t = schema.version_tiles
     newest = sa.select(t.c.row, t.c.col, sa.func.max(t.c.version).label("version")).where(t.c.version <= number)
     last = newest.group_by(t.c.row, t.c.col).subquery()
@@ -102,13 +102,13 @@ def _hashes(row: Any) -> TileHashes:
 def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) -> dict[TileIndex, int]:
     """Number of points of each tile, read from the head of its plane: no plane is unpacked."""
     b = schema.blobs.c
-    found = dict[str, int]()
+    n_points = dict[str, int]()
     digests = sorted({hashes.points for hashes in tiles.values()})
     for start in range(0, len(digests), DATABASE_SIZES.variables):
-        some = b.hash.in_(digests[start : start + DATABASE_SIZES.variables])
-        heads = sa.select(b.hash, sa.func.substr(b.data, 1, FRAME_HEAD)).where(some)
-        found |= {digest: points_in_plane(bytes(head), digest) for digest, head in connection.execute(heads)}
-    return {index: found.get(hashes.points, 0) for index, hashes in tiles.items()}
+        in_batch = b.hash.in_(digests[start : start + DATABASE_SIZES.variables])
+        heads = sa.select(b.hash, sa.func.substr(b.data, 1, FRAME_HEAD)).where(in_batch)
+        n_points |= {digest: points_in_plane(bytes(head), digest) for digest, head in connection.execute(heads)}
+    return {index: n_points.get(hashes.points, 0) for index, hashes in tiles.items()}
 
 
 def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memory | None:
@@ -120,8 +120,8 @@ def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memor
 def tiles_set_between(connection: sa.Connection, old: int, new: int) -> list[TileIndex]:
     """The tiles that versions after ``old`` up to ``new`` set, ascending: all others are the same in both."""
     t = schema.version_tiles
-    found = sa.select(t.c.row, t.c.col).distinct().where(t.c.version > old, t.c.version <= new)
-    return sorted((row.row, row.col) for row in connection.execute(found))
+    query = sa.select(t.c.row, t.c.col).distinct().where(t.c.version > old, t.c.version <= new)
+    return sorted((row.row, row.col) for row in connection.execute(query))
 
 
 def tiles_that_differ(
@@ -145,8 +145,8 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     if hashes is None:
         return Tile.empty(window)
     named = hashes.planes()
-    found = {row.hash: row.data for row in _PLANES.ask(connection, **dict.fromkeys(schema.TILE_PLANES) | named)}
-    return unpack_tile(window, hashes, {p: _there(found.get(digest), digest) for p, digest in named.items()})
+    planes = {row.hash: row.data for row in _PLANES.ask(connection, **dict.fromkeys(schema.TILE_PLANES) | named)}
+    return unpack_tile(window, hashes, {p: _there(planes.get(digest), digest) for p, digest in named.items()})
 
 
 def tile_as_of(connection: sa.Connection, window: Grid, number: int) -> Tile:
@@ -197,9 +197,9 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
     """Store planes that are not there yet."""
     digests = list(planes)
     for start in range(0, len(digests), DATABASE_SIZES.variables):
-        some = digests[start : start + DATABASE_SIZES.variables]
-        known = set(connection.execute(_KNOWN_BLOBS, {"digests": some}).scalars())
-        new = [(digest, planes[digest]) for digest in some if digest not in known]
+        batch = digests[start : start + DATABASE_SIZES.variables]
+        stored = set(connection.execute(_KNOWN_BLOBS, {"digests": batch}).scalars())
+        new = [(digest, planes[digest]) for digest in batch if digest not in stored]
         if new:
             insert_rows(connection, schema.blobs, new)
 

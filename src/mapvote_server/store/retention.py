@@ -65,9 +65,9 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         gone = (v.c.number < oldest) & v.c.cleared_seq.is_(None)
         versions = int(connection.execute(sa.select(sa.func.count()).where(gone)).scalar_one())
         size = sum(row.size for row in (*old_planes, *old_ballots, *old_decisions))
-        found = Cleared(oldest, versions, len(old_planes), len(old_decisions), len(old_ballots), size)
+        cleared = Cleared(oldest, versions, len(old_planes), len(old_decisions), len(old_ballots), size)
         if dry_run or not (versions or old_planes or old_ballots or old_decisions):
-            return found
+            return cleared
         detail = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
         seq = log_event(connection, store.clock(), CLEARED, by, detail)
         connection.execute(v.update().where(gone).values(cleared_seq=seq))
@@ -77,7 +77,7 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         # A ballot of which nothing is left takes no room of its vehicle's quota any more.
         empty = (b.c.bytes > 0) & ~sa.exists().where(t.c.ballot == b.c.seq)
         connection.execute(b.update().where(empty).values(bytes=0))
-    return found
+    return cleared
 
 
 def cleared_since(connection: sa.Connection, seq: int) -> bool:
@@ -123,16 +123,16 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
     window_ns = round(max(history_days(policy.fuse) for policy in policies) * DAY_NS)
     past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
-    found = (
+    query = (
         sa.select(t.c.row, t.c.col, t.c.ballot, sa.func.length(t.c.votes).label("size"))
         .join(b, b.c.seq == t.c.ballot)
         .join(newest, (newest.c.row == t.c.row) & (newest.c.col == t.c.col), isouter=True)
     )
-    return list(connection.execute(found.where(past)).all())
+    return list(connection.execute(query.where(past)).all())
 
 
 def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
     columns = sa.tuple_(*(table.c[name] for name in key))
     for start in range(0, len(rows), DATABASE_SIZES.variables):
-        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + DATABASE_SIZES.variables]]
-        connection.execute(table.delete().where(columns.in_(some)))
+        keys = [tuple(getattr(row, name) for name in key) for row in rows[start : start + DATABASE_SIZES.variables]]
+        connection.execute(table.delete().where(columns.in_(keys)))

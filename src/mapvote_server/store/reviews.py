@@ -67,19 +67,19 @@ def decide(
     """
     with store.database.writing() as connection:
         kind = feature["properties"]["kind"]
-        alike = [found for found in _standing(connection) if found[0].feature["properties"]["kind"] == kind]
+        alike = [earlier for earlier in _standing(connection) if earlier[0].feature["properties"]["kind"] == kind]
         on_it = [r for r, theirs in alike if any((cells[i] & theirs[i]).any() for i in cells.keys() & theirs.keys())]
         others = [review.given for review in on_it if review.given.seq != after]
         if others:
             raise Conflict(f"{others[0].by} has {others[0].verdict} this change meanwhile: look again, then decide")
         if after is not None and not on_it:
             raise Conflict("the verdict that you saw was taken back meanwhile: look again, then decide")
-        now = store.clock()
-        seq = log_event(connection, now, verdict, by, f"{feature['id']} {comment}".strip())
+        now_ns = store.clock()
+        seq = log_event(connection, now_ns, verdict, by, f"{feature['id']} {comment}".strip())
         _take_back(connection, [review.given.seq for review in on_it], seq)
         row = {"seq": seq, "verdict": verdict, "comment": comment, "feature": dict(feature)}
         connection.execute(schema.reviews.insert().values(**row))
-        rows = [{"row": i[0], "col": i[1], "review": seq, "cells": pack_cells(mine)} for i, mine in cells.items()]
+        rows = [{"row": i[0], "col": i[1], "review": seq, "cells": pack_cells(plane)} for i, plane in cells.items()]
         connection.execute(schema.review_cells.insert(), rows)
     return seq
 
@@ -110,6 +110,6 @@ def _standing(connection: sa.Connection) -> list[tuple[Review, dict[TileIndex, B
     about = sa.select(c).join(r, r.c.seq == c.c.review).where(r.c.gone_seq.is_(None))
     for row in connection.execute(about):
         cells.setdefault(row.review, {})[row.row, row.col] = unpack_cells(row.cells)
-    found = sa.select(r.c.seq, r.c.verdict, e.c.actor, r.c.comment, e.c.at_ns, r.c.feature).join(e, e.c.seq == r.c.seq)
-    rows = connection.execute(found.where(r.c.gone_seq.is_(None)).order_by(r.c.seq)).all()
+    query = sa.select(r.c.seq, r.c.verdict, e.c.actor, r.c.comment, e.c.at_ns, r.c.feature).join(e, e.c.seq == r.c.seq)
+    rows = connection.execute(query.where(r.c.gone_seq.is_(None)).order_by(r.c.seq)).all()
     return [(Review(VerdictAnswer(*row[:-1]), row.feature), cells.get(row.seq, {})) for row in rows]

@@ -55,12 +55,12 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
         if to == newest.number:
             raise Conflict(f"version {to} is the newest: there is nothing to roll back")
         number = newest.number + 1
-        now = tiles_of(connection, newest.number)
+        current = tiles_of(connection, newest.number)
         then = tiles_of(connection, to)
         tiles = {}
         planes = []
-        for index in sorted(now.keys() | then.keys()):
-            if now.get(index) != then.get(index):
+        for index in sorted(current.keys() | then.keys()):
+            if current.get(index) != then.get(index):
                 window = store.lattice.tile(index)
                 old = tile_as_of(connection, window, newest.number)
                 new = load_tile(connection, window, then.get(index))
@@ -72,11 +72,11 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
     return write_version(store, version, tiles, planes)
 
 
-def turned_back(version: int, now: Tile, then: Tile) -> Memory:
+def turned_back(version: int, current: Tile, then: Tile) -> Memory:
     """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
-    differ = np.flatnonzero(differing(now, then))
+    differ = np.flatnonzero(differing(current, then))
     none = Memory.none()
-    return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
+    return (current.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
 
 
 class _Content(NamedTuple):
@@ -135,18 +135,18 @@ def replay(
     added = deleted = 0
     last = gone_through.states[newest.number]
     for index, ours, theirs in _pairs(store, last, _State(newest.number)):
-        mine, packed = pack_tile(replace(ours.tile, memory=turned_back(number, theirs.tile, ours.tile)))
-        if (mine if ours.there else None) != (pack_tile(theirs.tile)[0] if theirs.there else None):
-            tiles[index] = mine if ours.there else structs.replace(TileHashes.none(), memory=mine.memory)
+        own_hashes, packed = pack_tile(replace(ours.tile, memory=turned_back(number, theirs.tile, ours.tile)))
+        if (own_hashes if ours.there else None) != (pack_tile(theirs.tile)[0] if theirs.there else None):
+            tiles[index] = own_hashes if ours.there else structs.replace(TileHashes.none(), memory=own_hashes.memory)
             planes.append(packed)
             added += int((~found_among(ours.tile.points, theirs.tile.points)).sum())
             deleted += int((~found_among(theirs.tile.points, ours.tile.points)).sum())
     outcome = Published(newest.number, False, [tile_key(index) for index in sorted(tiles)], added, deleted, [], [])
     if dry_run:
         return outcome
-    why = f"as if {vehicle} had never voted, from version {start} on"
+    reason = f"as if {vehicle} had never voted, from version {start} on"
     policy = {"unvoted": vehicle}
-    version = Version(number, newest.number, "replay", start, store.clock(), by, why, mark, policy)
+    version = Version(number, newest.number, "replay", start, store.clock(), by, reason, mark, policy)
     write_version(store, version, tiles, planes, unvoted=vehicle)
     return replace(outcome, version=number, published=True)
 
@@ -170,9 +170,9 @@ def _again(store: Store, version: Version, history: _History, executor: Executor
 
 def _turned_back(store: Store, number: int, before: _State, target: _State) -> _State:
     edited = dict(before.edited)
-    for index, now, then in _pairs(store, before, target):
-        if now.there != then.there or pack_tile(now.tile)[0] != pack_tile(then.tile)[0]:
-            tile = replace(then.tile, memory=turned_back(number, now.tile, then.tile))
+    for index, current, then in _pairs(store, before, target):
+        if current.there != then.there or pack_tile(current.tile)[0] != pack_tile(then.tile)[0]:
+            tile = replace(then.tile, memory=turned_back(number, current.tile, then.tile))
             edited[index] = _Content(tile, then.there)
     return _State(before.root, edited)
 
@@ -181,14 +181,14 @@ def _fused(store: Store, version: Version, before: _State, history: _History, ex
     without = frozenset(name for name, until in history.out.items() if version.number < until)
     url = address_of(store.database.url)
     with store.database.reading() as connection:
-        asked = Electorate.of(version, without, ballots_aside(connection))
+        electorate = Electorate.of(version, without, ballots_aside(connection))
         standing = standing_tiles(connection, version.mark)
 
     def task_of(index: TileIndex) -> Task:
         with store.database.reading() as connection:
             tile = _content(store, connection, before, index).tile
             misread = history.misread.get(index, {})
-        return Task(url, tile.window, version.number, tile, asked, misread)
+        return Task(url, tile.window, version.number, tile, electorate, misread)
 
     alone = {fused.index: fused for fused in fuse_round(list(map(task_of, standing)), store.database, executor)}
     fused = settled(alone, task_of, store.database).tiles.values()

@@ -113,16 +113,16 @@ class Store:
                 about = {"georeference": dict(point_map.georeference), "secret": secrets.token_hex(32)}
                 origin |= {"surveyed_ns": point_map.surveyed_ns}
                 connection.execute(schema.maps.insert().values(map_id=point_map.map_id, **about, **origin))
-                now = clock()
-                mark = log_event(connection, now, "import", by, point_map.map_id)
-                version = Version(point_map.version or 1, None, "import", None, now, by, "first map", mark, {})
+                now_ns = clock()
+                mark = log_event(connection, now_ns, "import", by, point_map.map_id)
+                version = Version(point_map.version or 1, None, "import", None, now_ns, by, "first map", mark, {})
                 connection.execute(schema.versions.insert().values(**asdict(version)))
                 packed = {}
                 for index, tile in point_map.tiles.items():
                     packed[index], planes = pack_tile(tile)
                     add_blobs(connection, planes)
                 set_tiles(connection, version.number, packed)
-                write_policy(connection, policy or Policy(), now, by, "a new store")
+                write_policy(connection, policy or Policy(), now_ns, by, "a new store")
         except BaseException:
             database.close()
             raise
@@ -156,8 +156,8 @@ class Store:
         e = schema.events
         rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
         with self.database.reading() as connection:
-            found = connection.execute(rows.order_by(p.c.seq)).all()
-        return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]
+            changes = connection.execute(rows.order_by(p.c.seq)).all()
+        return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in changes]
 
     def set_policy(self, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
         """Let another policy hold from now on; the number of the event."""
@@ -223,20 +223,20 @@ class Store:
         """(tiles of ``number`` that are otherwise than in ``since``, tiles that only ``since`` has)."""
         touched = tiles_set_between(connection, min(since, number), max(since, number))
         then = tiles_of(connection, since, touched)
-        now = tiles_of(connection, number, touched)
-        changed = {index: hashes for index, hashes in now.items() if then.get(index) != hashes}
-        return changed, sorted(then.keys() - now.keys())
+        after = tiles_of(connection, number, touched)
+        changed = {index: hashes for index, hashes in after.items() if then.get(index) != hashes}
+        return changed, sorted(then.keys() - after.keys())
 
     def _digest(self, connection: sa.Connection, number: int) -> tuple[int, int]:
         """A version as the last known one before it, and the changes since."""
-        before = max((known for known in self._digests if known <= number), default=None)
+        before = max((kept for kept in self._digests if kept <= number), default=None)
         if before is None:
             self._digests[number] = _digests_of(tiles_of(connection, number))
         elif before < number:
             touched = tiles_set_between(connection, before, number)
-            then, now = (_digests_of(tiles_of(connection, version, touched)) for version in (before, number))
-            known = zip(self._digests[before], then, now, strict=True)
-            tiles, fields = ((whole - old + new) % DIGESTS for whole, old, new in known)
+            then, after = (_digests_of(tiles_of(connection, version, touched)) for version in (before, number))
+            kept = zip(self._digests[before], then, after, strict=True)
+            tiles, fields = ((whole - old + new) % DIGESTS for whole, old, new in kept)
             self._digests[number] = tiles, fields
         return self._digests[number]
 

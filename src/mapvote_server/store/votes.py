@@ -130,33 +130,33 @@ class Polled:
         return self.fresh[key]
 
 
-def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
+def poll(connection: sa.Connection, row: int, cols: Sequence[int], electorate: Electorate) -> Polled:
     """All that :func:`judged_on` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
     then."""
-    standing = _standing_on(connection, row, cols, asked)
+    standing = _standing_on(connection, row, cols, electorate)
     bars = defaultdict[TileIndex, list[Any]](list)
-    reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
+    reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": electorate.mark}).all()
     for col, seq, verdict, cells in reviewed:
         bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
-    counting = [(c, vote) for c in cols for vote in _judged(standing[row, c], (row, c), asked) if not vote.why]
+    counting = [(c, vote) for c in cols for vote in _judged(standing[row, c], (row, c), electorate) if not vote.why]
     return Polled(standing, bars, read_rows(connection, row, counting))
 
 
 def _standing_on(
-    connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate
+    connection: sa.Connection, row: int, cols: Sequence[int], electorate: Electorate
 ) -> Mapping[TileIndex, Sequence[Vote]]:
     """The votes that stand on tiles of a row, without planes, and why the policy does not count them."""
     standing = defaultdict[TileIndex, list[Vote]](list)
-    rows = connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
+    rows = connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": electorate.mark}).all()
     for stored in rows:
-        standing[row, stored.col].append(_vote_of(stored, _unready(stored, asked)))
+        standing[row, stored.col].append(_vote_of(stored, _unready(stored, electorate)))
     return standing
 
 
-def _vote_of(stored: Any, why: Why = "") -> Vote:
+def _vote_of(stored: Any, reason: Why = "") -> Vote:
     """The vote of a row of ``_VOTES``, without its planes."""
     cast = stored.vehicle, stored.end_ns, stored.digest, stored.version
-    return Vote(*cast, ballot=stored.seq, drive=stored.drive, first_seq=stored.first_seq, why=why)
+    return Vote(*cast, ballot=stored.seq, drive=stored.drive, first_seq=stored.first_seq, why=reason)
 
 
 def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> list[Vote]:
@@ -169,64 +169,64 @@ def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collectio
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
     """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review was added or
     removed after it."""
-    asked = {"mark": mark} if since is None else {"mark": mark, "since": since}
-    rows = (_STANDING if since is None else _TOUCHED).ask(connection, **asked)
+    values = {"mark": mark} if since is None else {"mark": mark, "since": since}
+    rows = (_STANDING if since is None else _TOUCHED).ask(connection, **values)
     return sorted({(row.row, row.col) for row in rows})
 
 
-def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[Vote]:
+def judged_votes(connection: sa.Connection, index: TileIndex, electorate: Electorate) -> list[Vote]:
     """Every standing vote on a tile, without planes, and why it does not count there. A vote that counts does so in
     cells where it is not spent (:func:`mapvote.fusion.fuse.unspent`)."""
-    return _judged(_standing_on(connection, index[0], [index[1]], asked)[index], index, asked)
+    return _judged(_standing_on(connection, index[0], [index[1]], electorate)[index], index, electorate)
 
 
-def _judged(standing: Sequence[Vote], index: TileIndex, asked: Electorate) -> list[Vote]:
+def _judged(standing: Sequence[Vote], index: TileIndex, electorate: Electorate) -> list[Vote]:
     """The ``standing`` votes on a tile but those left out, and why each does not count: damaged ones and those outside
     the window too."""
-    judged = [vote for vote in standing if vote.vehicle not in asked.without]
-    if asked.set_aside:
+    judged = [vote for vote in standing if vote.vehicle not in electorate.without]
+    if electorate.set_aside:
         names = [{str(vote.ballot), ballot_name(vote.ballot, *index)} for vote in judged]
-        aside = [not named.isdisjoint(asked.set_aside) for named in names]
+        aside = [not named.isdisjoint(electorate.set_aside) for named in names]
         judged = [replace(vote, why="damaged") if out else vote for vote, out in zip(judged, aside, strict=True)]
-    inside = {vote.ballot for vote in newest_votes([vote for vote in judged if not vote.why], asked.settings)}
+    inside = {vote.ballot for vote in newest_votes([vote for vote in judged if not vote.why], electorate.settings)}
     return [vote if vote.why or vote.ballot in inside else replace(vote, why="window") for vote in judged]
 
 
 def electorate_now(
-    connection: sa.Connection, now: int, mark: int = FOREVER, settings: FuseSettings | None = None
+    connection: sa.Connection, now_ns: int, mark: int = FOREVER, settings: FuseSettings | None = None
 ) -> Electorate:
-    """The votes that count in a publish at ``now``, by the newest policy; ``settings`` replace its ``fuse`` if
+    """The votes that count in a publish at ``now_ns``, by the newest policy; ``settings`` replace its ``fuse`` if
     given."""
     policy = policy_in(connection)
     if settings is not None:
         policy = policy.model_copy(update={"fuse": settings})
-    received_by_ns = now - round(policy.fuse.min_age_s * 1e9)
+    received_by_ns = now_ns - round(policy.fuse.min_age_s * 1e9)
     return Electorate(mark, policy, received_by_ns, set_aside=ballots_aside(connection))
 
 
-def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
+def next_ripe_ns(connection: sa.Connection, electorate: Electorate) -> int | None:
     """Time at which the next standing ballot reaches the policy's minimum age; None if no ballot waits for it."""
-    age_ns = round(asked.settings.min_age_s * 1e9)
+    age_ns = round(electorate.settings.min_age_s * 1e9)
     if age_ns == 0:
         return None
     received = _B.c.received_ns
-    young = sa.select(sa.func.min(received)).where(received > asked.received_by_ns, _stands_at(asked.mark))
+    young = sa.select(sa.func.min(received)).where(received > electorate.received_by_ns, _stands_at(electorate.mark))
     first = connection.execute(young).scalar_one()
     return None if first is None else int(first) + age_ns
 
 
-def _unready(stored: Any, asked: Electorate) -> Why:
+def _unready(stored: Any, electorate: Electorate) -> Why:
     """Why the policy does not count a row of ``_VOTES``, on whatever tile; "" if it does."""
-    round_now = asked.policy.round
+    round_now = electorate.policy.round
     if stored.cast_by != round_now.cast_by or not stored.settings_hash.startswith(round_now.settings_hash):
         return "otherwise"
-    return "young" if stored.received_ns > asked.received_by_ns else ""
+    return "young" if stored.received_ns > electorate.received_by_ns else ""
 
 
 def judged_on(
     connection: sa.Connection,
     tile: Tile,
-    asked: Electorate,
+    electorate: Electorate,
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
 ) -> list[Vote]:
@@ -236,8 +236,8 @@ def judged_on(
     ``misread``: see :func:`mapvote.fusion.fuse.unspent`. ``polled``: what stands there, if it was asked before.
     """
     index = tile.index
-    polled = polled or poll(connection, index[0], [index[1]], asked)
-    judged = _judged(polled.standing[index], index, asked)
+    polled = polled or poll(connection, index[0], [index[1]], electorate)
+    judged = _judged(polled.standing[index], index, electorate)
     votes = iter(read_votes(connection, index, [vote for vote in judged if not vote.why], polled))
     return [vote if vote.why else _where_it_counts(next(votes), tile, misread, polled) for vote in judged]
 
@@ -265,29 +265,29 @@ def _cells_lost(before: Vote, after: Vote) -> I64:
 def recent_votes(
     connection: sa.Connection,
     tile: Tile,
-    asked: Electorate,
+    electorate: Electorate,
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
 ) -> list[Vote]:
     """The votes that count on ``tile``, in the cells where they are not spent, of every vehicle and of the last
     :func:`history_days`: what has come and gone here, and since when?"""
     index = tile.index
-    polled = polled or poll(connection, index[0], [index[1]], asked)
-    judged = _judged(polled.standing[index], index, asked)
+    polled = polled or poll(connection, index[0], [index[1]], electorate)
+    judged = _judged(polled.standing[index], index, electorate)
     ready = [vote for vote in judged if vote.why in ("", "window")]
-    oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
+    oldest = max((vote.end_ns for vote in ready), default=0) - history_days(electorate.settings) * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
     return [polled.unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled)]
 
 
-def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
+def from_sound_ballots(connection: sa.Connection, electorate: Electorate, read: Callable[[Electorate], Read]) -> Read:
     """Result of ``read`` without the ballots that are set aside, and without those found damaged on the way."""
-    asked = replace(asked, set_aside=frozenset({*asked.set_aside, *ballots_aside(connection)}))
+    electorate = replace(electorate, set_aside=frozenset({*electorate.set_aside, *ballots_aside(connection)}))
     while True:
         try:
-            return read(asked)
+            return read(electorate)
         except DamagedBallots as error:
-            asked = asked.leaving_out(error.found)
+            electorate = electorate.leaving_out(error.found)
 
 
 def ballots_aside(connection: sa.Connection) -> frozenset[str]:
@@ -306,14 +306,14 @@ Rows = Mapping[tuple[int, int, int], Any]
 
 def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, Vote]]) -> Rows:
     """The stored votes on tiles of a ``row``, each with its column."""
-    found: dict[tuple[int, int, int], Any] = {}
+    stored_rows: dict[tuple[int, int, int], Any] = {}
     cols = sorted({col for col, _ in votes})
     ballots = sorted({vote.ballot for _, vote in votes})
     for start in range(0, len(ballots), DATABASE_SIZES.variables):
         asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + DATABASE_SIZES.variables]}
         rows = connection.execute(_PLANES_OF, asked_of).all()
-        found |= {(stored.row, stored.col, stored.ballot): stored for stored in rows}
-    return found
+        stored_rows |= {(stored.row, stored.col, stored.ballot): stored for stored in rows}
+    return stored_rows
 
 
 def read_votes(
@@ -350,14 +350,14 @@ def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by:
     """
     b = schema.ballots
     whose = f"{vehicle or '*'}/{drive or '*'}"
-    mine: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
+    wanted: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
     if vehicle is not None:
-        mine &= b.c.vehicle == vehicle
+        wanted &= b.c.vehicle == vehicle
     if drive is not None:
-        mine &= b.c.drive == drive
+        wanted &= b.c.drive == drive
     with store.database.writing() as connection:
-        if connection.execute(sa.select(b.c.seq).where(mine)).first() is None:
+        if connection.execute(sa.select(b.c.seq).where(wanted)).first() is None:
             raise NotFound(f"there is no standing ballot {whose}")
         seq = log_event(connection, store.clock(), "withdraw", by, whose)
-        withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
+        withdrawn = connection.execute(b.update().where(wanted).values(gone_seq=seq)).rowcount
     return int(withdrawn)

@@ -51,7 +51,7 @@ def test_publish_coverage_and_the_cell_tell_what_lacks_only_the_quorum(store: St
     told = wanted_passes(store)
     assert (told.cells, told.without_path, told.waits, told.features) == (3, 3, SENTENCE, [])
     assert "1 cell waits: 2 drives say so, all by car_1" in explain_cell(store, 3.1, 3.1).thing
-    hidden = explain_cell(store, 3.1, 3.1, known=False).thing
+    hidden = explain_cell(store, 3.1, 3.1, with_names=False).thing
     assert "waits" in hidden
     assert "car_1" not in hidden, "readers see pseudonyms"
     store.close()
