@@ -55,7 +55,7 @@ MADE_ELSEWHERE = {"ManifestAnswer", "PolicyChange"}
 reads the changes of its policy."""
 VAGUE_NAMES = {"asked", "found", "known", "mine", "now", "some", "told", "what", "where", "why"}
 """Names of locals and arguments that do not say what they hold, and that cannot be searched."""
-MOST_VAGUE_NAMES = 351
+MOST_VAGUE_NAMES = 46
 """It may only fall."""
 BALLOT_TYPES = {"Ballot", "BallotTile", "Planes", "Vote", "Receipt"}
 """A ballot on the wire, its tile there, that tile's planes unpacked, the vote on a tile and why it counts, and the

@@ -73,7 +73,7 @@ def said_in_order(drives: Sequence[Vote], cells: I64) -> tuple[U8, I64, I64]:
 
 @kernel
 def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, last: I64, turned: Bool) -> None:
-    """Into ``turned`` (n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since.
+    """Into ``turned`` (n,) in which cells every vehicle's last word is ``before`` until a moment and ``after`` since.
     ``last`` (m,): memory for the last word of each vehicle."""
     for cell in range(said.shape[1]):
         for i in range(len(last)):
