@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -33,6 +34,25 @@ def test_a_geopackage_is_read_back_by_gdal_in_the_maps_system(tmp_path: Path) ->
     assert read["kind"].tolist() == ["built", "built"]
     assert np.allclose(read["area_m2"], 9.0)
     assert read["versions"][0] == "2,3"
+
+
+def test_a_geopackage_brings_its_colours_in_the_table_where_qgis_looks_for_them(tmp_path: Path) -> None:
+    import pyogrio
+
+    write_geopackage(tmp_path / "c.gpkg", [feature(kind="built")], MapFrame("EPSG:32654"))
+    about, _, _, columns = pyogrio.raw.read(tmp_path / "c.gpkg", layer="layer_styles")
+    style = {name: column[0] for name, column in zip(about["fields"], columns, strict=True)}
+    geometry_column = pyogrio.read_info(tmp_path / "c.gpkg", layer="changes")["geometry_name"]
+    assert (style["f_table_name"], style["f_geometry_column"]) == ("changes", geometry_column)
+    assert style["useAsDefault"]
+    renderer = ElementTree.fromstring(style["styleQML"]).find("renderer-v2")
+    assert renderer is not None
+    assert renderer.get("attr") == "kind"
+    symbols = {one.get("name") for one in renderer.iter("symbol")}
+    assert {one.get("value"): one.get("symbol") in symbols for one in renderer.iter("category")} == {
+        "built": True,
+        "demolished": True,
+    }
 
 
 def test_a_local_map_gives_a_package_in_local_metres_and_a_plane_none(tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,8 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
     """GeoJSON features (polygons in map metres) as one layer, whole or not at all.
 
     Coordinates are those of the frame's coordinate system (its offset added back). A local map is written in metres
-    under the name "local map metres"; a map in an ENU plane, which no GIS supports, is a MapvoteError.
+    under the name "local map metres"; a map in an ENU plane, which no GIS supports, is a MapvoteError. The file holds
+    the layer's colours in the table ``layer_styles``, where QGIS looks for them.
     """
     shapely = require("shapely", "geo", str(path))
     pyogrio = require("pyogrio.raw", "geo", str(path))
@@ -47,7 +50,45 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
             geometry_type="MultiPolygon",
             crs=local if frame.is_local else frame.crs,
         )
+        _add_style(named)
         os.replace(named, partial)
+
+
+def _add_style(file: Path) -> None:
+    """The table in which QGIS looks for a layer's default style: red for built, blue for demolished, as on the page."""
+    from xml.etree import ElementTree
+
+    qgis = ElementTree.Element("qgis", {"version": "3.22", "styleCategories": "Symbology"})
+    renderer = ElementTree.SubElement(qgis, "renderer-v2", {"type": "categorizedSymbol", "attr": "kind"})
+    categories = ElementTree.SubElement(renderer, "categories")
+    symbols = ElementTree.SubElement(renderer, "symbols")
+    for name, kind, colour in (("0", "built", "194,59,46"), ("1", "demolished", "47,98,196")):
+        about = {"value": kind, "label": kind, "symbol": name, "render": "true"}
+        ElementTree.SubElement(categories, "category", about)
+        symbol = ElementTree.SubElement(symbols, "symbol", {"type": "fill", "name": name, "alpha": "0.65"})
+        layer = ElementTree.SubElement(symbol, "layer", {"class": "SimpleFill", "enabled": "1"})
+        options = ElementTree.SubElement(layer, "Option", {"type": "Map"})
+        values = {"color": f"{colour},255", "outline_color": f"{colour},255", "style": "solid"}
+        for option, value in values.items():
+            ElementTree.SubElement(options, "Option", {"type": "QString", "name": option, "value": value})
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute(
+            "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, "
+            "f_table_catalog TEXT, f_table_schema TEXT, f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, "
+            "useAsDefault BOOLEAN, description TEXT, owner TEXT, ui TEXT, "
+            "update_time DATETIME DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now')))"
+        )
+        database.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES (?, 'attributes', ?)",
+            ("layer_styles", "layer_styles"),
+        )
+        database.execute(
+            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName, "
+            "styleQML, styleSLD, useAsDefault, description) "
+            "SELECT '', '', table_name, column_name, 'changes', ?, '', 1, 'built and demolished' "
+            "FROM gpkg_geometry_columns",
+            (ElementTree.tostring(qgis, encoding="unicode"),),
+        )
 
 
 def _column(values: list[Any]) -> np.ndarray[Any, Any]:
