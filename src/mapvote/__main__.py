@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def _interrupt_again(lost: UnraisableHookArgs) -> None:
-    """Python drops what is raised while it takes an object away: a Ctrl-C that comes just then is sent once more."""
+    """Send a Ctrl-C once more that came while Python deleted an object: Python drops exceptions there."""
     if issubclass(lost.exc_type, KeyboardInterrupt):
         main_thread = threading.main_thread().ident or 0
         soon_s = 0.05  # at once, it would be lost too

@@ -60,7 +60,7 @@ def warm_vehicle(settings: Settings) -> None:
 
 
 def warm_up() -> Iterator[tuple[str, float]]:
-    """(what was compiled, CPU seconds that it took), step by step. With everything in the cache it takes seconds."""
+    """(name of the step, its CPU seconds), step by step. With all kernels in the cache it takes seconds."""
     old = _street(demolished=False)
     new = _street(demolished=True)
     settings = Settings()

@@ -270,7 +270,7 @@ def sound_map(path: Path | str) -> PointMap:
 
 def look_at_points(path: str, *, unchecked: bool = False) -> Look:
     """The check of a map's points before the ground is computed: MapvoteError, with the way past, if they cannot be
-    used; ``unchecked``: what is wrong is only told."""
+    used; ``unchecked``: findings are only printed."""
     from mapvote.doctor import usable
     from mapvote.doctor.maps import check_cloud
 

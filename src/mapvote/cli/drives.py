@@ -339,7 +339,7 @@ def _ballot_of_cloud(
     for line in said.registered.told():
         print(line)
     if said.registered.bent:
-        print("what is bent does not vote")
+        print("bent parts do not vote")
     if not said.by_trajectory:
         print("no trajectory: gone and new by the ground that the cloud shows, and no free space is learned")
     _print_sums(said.changes)

@@ -470,7 +470,7 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
 
 
 def _report_pending(decisions: dict[TileIndex, Decision], lattice: Lattice, budget: float) -> None:
-    """Deletions that wait, the largest first, and where somebody should drive by."""
+    """Deletions that wait, the largest first, and the places where a vehicle should drive by."""
     from mapvote.fusion.loss_budget import waypoints
 
     waiting = waypoints({index: d.pending for index, d in decisions.items()}, lattice)

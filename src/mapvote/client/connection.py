@@ -31,7 +31,7 @@ class Refused(MapvoteError):
 
 
 class Connection:
-    """One server, as one who holds a key."""
+    """Requests to one server with one key."""
 
     def __init__(
         self,

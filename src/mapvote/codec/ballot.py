@@ -188,7 +188,7 @@ def decode(data: bytes) -> Ballot:
 
 
 class Odds(NamedTuple):
-    """How sure a vehicle is, or those who agree are, of some cells of a tile; of all others nothing is stated."""
+    """Confidence of a vehicle, or of the vehicles that agree, in some cells of a tile; other cells have none."""
 
     cells: I64
     """(n,) flat cells of the tile, ascending."""
@@ -491,7 +491,7 @@ def check_path(data: bytes, tiles: Collection[TileIndex]) -> None:
 
 
 def path_near(data: bytes, tiles: Collection[TileIndex]) -> bytes:
-    """The path without what is farther than a tile from ``tiles``."""
+    """The path without its cells that are farther than a tile from ``tiles``."""
     cells = unpack_path(data)
     passed, which = np.unique(cells // TILE_CELLS, axis=0, return_inverse=True)
     near = np.array([_is_near(tile, tiles) for tile in passed], dtype=np.bool_)

@@ -71,7 +71,7 @@ class Field:
         return from_counts(sent, self.full, column) if self.scaled else sent
 
     def _exactly(self, column: Values) -> Values:
-        """(n,) as ``dtype``; what is not finite was not measured."""
+        """(n,) as ``dtype``; values that are not finite count as not measured."""
         kind = np.dtype(self.dtype)
         if np.can_cast(column.dtype, kind):
             return column.astype(kind, copy=False)

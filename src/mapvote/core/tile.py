@@ -79,7 +79,7 @@ class Memory:
         return self.cells[self.values[0] > version]
 
     def at(self, cells: I64) -> U32:
-        """(4, m) what is remembered of flat ``cells`` (m,), in any order."""
+        """(4, m) memory of flat ``cells`` (m,), in any order."""
         values = np.zeros((PLANES, len(cells)), dtype=np.uint32)
         if len(self.cells):
             near = np.minimum(np.searchsorted(self.cells, cells), len(self.cells) - 1)
@@ -151,7 +151,7 @@ class Tile:
         return Tile, (self.window, self.points, self.ground_z, self.free, self.memory, self.fields)
 
     def but(self, **planes: Any) -> Tile:
-        """The tile with other ``planes``; what was worked out of those that stay goes along."""
+        """The tile with other ``planes``; values computed from the planes that stay are kept."""
         # The planes that each computed value follows from.
         sources = {
             "cells": {"points"},

@@ -101,7 +101,7 @@ class TimesTold:
     told: str
     """The field with unit and origin, or the fields that are there."""
     doubtful: bool = False
-    """Whether somebody should state what was assumed."""
+    """Whether the user should state what was assumed."""
     fields: tuple[str, ...] = ()
     """The field that tells them, or those that may."""
     other_clock: bool = False

@@ -61,7 +61,7 @@ def in_order(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def usable(path: str, findings: list[Finding]) -> list[Finding]:
-    """The warnings among what was found at ``path``; MapvoteError with the first error, if there is one."""
+    """The warnings among the findings at ``path``; MapvoteError with the first error, if there is one."""
     errors = [f for f in findings if f.severity == "error"]
     if errors:
         more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""

@@ -63,7 +63,7 @@ def _topics(bag: Bag, times: _Times) -> Iterator[Finding]:
 
 
 def _clocks(bag: Bag, times: _Times, orders: _Orders) -> Iterator[Finding]:
-    """Stamps of the headers: what is out of order, doubled or of another clock than the times of receipt."""
+    """Findings on stamps of the headers: out of order, doubled, or of another clock than the times of receipt."""
     for topic, order in orders.items():
         mend = "the drive is read so; record again with `use_sim_time` alike for all nodes, and one pass a bag"
         yield from (Finding("warning", f"{topic} {problem}", mend) for problem in order.told)

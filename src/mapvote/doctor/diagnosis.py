@@ -114,7 +114,7 @@ def diagnose(
         findings += lidars
         # Scans put together wrongly fit neither each other nor a prior.
         more, T = ([], None) if any_error(lidars) else examine_drive(drive, progress)
-        # That a prior that could not be read is missing goes without saying.
+        # A prior that could not be read has its error: the note that there is none is left out.
         findings += [f for f in more if not (unopened and f == NO_PRIOR)]
     if point_map is not None:
         findings, T = _with_map(findings, drive, T, point_map, progress)
@@ -138,7 +138,7 @@ def _opened(path: Path, options: Mapping[str, Any], point_map: PointMap | None) 
             return drive, findings
         unread = unread or drive
         findings = findings or [Finding("error", refusal)]
-    # Scans that cannot be read in any way are told one by one.
+    # Scans that cannot be read in any way have a finding each.
     return unread, findings if unread is None else [f for f in findings if f.what != _refusal_of_all(unread)]
 
 
@@ -158,7 +158,7 @@ def _refusal_of_all(drive: Drive) -> str:
 def _with_map(
     findings: list[Finding], drive: Drive | None, T: F64 | None, point_map: PointMap, progress: Progress | None
 ) -> tuple[list[Finding], F64 | None]:
-    """(also what is wrong with the map, and with the drive on it; the poses (n, 4, 4) as they lie on the map)."""
+    """(the findings with those on the map and on the drive on it; the poses (n, 4, 4) as they lie on the map)."""
     of_points = [f for f in check_cloud(tile_by_tile(point_map), classified_ground(point_map)) if f.severity != "note"]
     of_map = of_points + [f for f in check_map(point_map) if f.severity != "note"]
     named = [replace(f, what=f"the map: {f.what}") for f in of_map]

@@ -202,7 +202,7 @@ class DriveEvidence:
         return self.readable[chosen]
 
     def _points(self, i: int) -> F32:
-        """(p, 3) of scan i, turned over where the sensor is upside down: what else is wrong shows only then."""
+        """(p, 3) of scan i, turned over where the sensor is upside down: other faults show only then."""
         points = self.drive.read_scan(int(i)).points
         return points @ _TURNED_OVER if self.road.up == "-z" else points
 

@@ -424,7 +424,7 @@ def _differs(d: Similarity, places: int, drive: Drive) -> Finding:
     yaw = f"turned about z by {yaw_deg:.2f} deg (+-{d.yaw_sigma_deg:.2f})"
     tilt = f"tilted by {tilt_deg:.2f} deg (+-{d.tilt_sigma_deg:.2f})"
     scale = f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})"
-    # by how much; what is worth a word; its standard error; what the prior's stated errors explain; what is an error
+    # deviation; least reported; its standard error; the part that the prior's stated errors explain; least error
     rows = [
         (shift, off_m, 0.15, 0.75 * d.sigma_m, MAP_FIT_RULE.shift_sigmas * sigma_m, max(0.3, 4.0 * sigma_m)),
         (

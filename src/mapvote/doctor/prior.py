@@ -355,7 +355,7 @@ class Similarity:
     own_deg: tuple[float, float]
     """(yaw, pitch) of ``own``: by which the sensors of both sets are turned against each other; 0 if not fitted."""
     off_m: F64
-    """(n, 3) what is left of each position."""
+    """(n, 3) residual of each position."""
     sigma_m: float
     yaw_sigma_deg: float
     tilt_sigma_deg: float
@@ -380,7 +380,7 @@ def fit_similarity(
     """The similarity from poses (n, 4, 4) to poses (n, 4, 4) of the same scans, by robust least squares (Umeyama, PAMI
     1991, gives the same for positions without outliers).
 
-    ``position_m`` and ``rotation_rad``: errors of a pose; what is off by more than two of them counts less.
+    ``position_m`` and ``rotation_rad``: errors of a pose; a residual of more than two of them counts less.
     ``scale``: (value, standard error) as known before. ``own_turn``: also fit the yaw and pitch by which the sensors of
     both sets are turned against each other; this needs a drive that moves.
     """

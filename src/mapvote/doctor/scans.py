@@ -404,7 +404,7 @@ def _refused(drive: Drive, looks: Looks) -> Iterator[Finding]:
 
 
 def _beams(drive: Drive, looks: Looks) -> Iterator[Finding]:
-    """The sensor that somebody stated, against the rings of some scans: rays that never were would demolish walls."""
+    """Findings on the stated sensor by the rings of some scans: rays that it never fired would delete walls."""
     if drive.sensor_told.startswith("measured"):
         return
     sample = (drive.read_scan(int(looks["index"][k])) for k in sorted({0, len(looks) // 2, len(looks) - 1}))

@@ -180,7 +180,7 @@ def export_map(
 
     ``crs`` ("EPSG:32654", WKT) or ``projector`` (a map_projector_info.yaml, "MGRS", ...) name another frame than the
     map's. ``offset`` (metres) is subtracted from every point, for formats of float32. Whole or not at all.
-    Returns the format's name and the frame of what was written.
+    Returns the format's name and the frame of the file.
     """
     path = Path(path)
     if path.name.lower().endswith(".copc.las"):

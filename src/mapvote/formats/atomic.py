@@ -26,7 +26,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def whole_file(path: Path | str, *, private: bool = False) -> Iterator[Path]:
-    """Gives a hidden path to write to; on leaving without an error it becomes ``path``, replacing what was there.
+    """Gives a hidden path to write to; on leaving without an error it becomes ``path`` and replaces the file there.
 
     ``private``: only its owner can read and write it, from the first byte.
     """

@@ -13,7 +13,7 @@ from mapvote.core.types import MapvoteError
 
 def plain_name(name: str, said_by: Path) -> str:
     """``name``, which ``said_by`` gives to a file or folder. MapvoteError if it leads elsewhere ("..", "a/b", "C:x"):
-    content never opens a file that nobody handed over."""
+    content never opens a file that the user did not hand over."""
     if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,255}", name) or name in (".", "..") or PureWindowsPath(name).drive:
         raise MapvoteError(f"{said_by}: {name[:80]!r} is not a plain file name; name a file beside this one")
     return name

@@ -18,7 +18,7 @@ class DriveFormat:
     """A layout of recorded drives."""
 
     recognised: Callable[[Path], object]
-    """True, or what was found, by what lies at the path; opens no scan."""
+    """Whether this format lies at the path: True, or its scans; opens no scan."""
     open: Callable[[Path, DriveOptions], Drive]
 
 

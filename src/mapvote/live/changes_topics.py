@@ -24,7 +24,7 @@ log = logging.getLogger("mapvote.live")
 
 class ChangesTopics:
     """Publishes what the open ballot says of the tiles around the vehicle, as each goes to the journal. Nothing is
-    computed while nobody listens."""
+    computed without a subscriber."""
 
     def __init__(self, network: Network, names: RosNames, view: BallotView = BALLOT_VIEW) -> None:
         self._view = view

@@ -24,7 +24,7 @@ class Waits:
     """How long a vehicle waits for its topics."""
 
     first_word_s: float = 5.0
-    """Until the first sentence on what is missing, seconds."""
+    """Time until the first sentence on a missing topic, seconds."""
     each_s: float = 60.0
     """Between two sentences on the same lack, seconds."""
     settle_s: float = 2.0
@@ -59,7 +59,7 @@ class Voice:
         self._said = ""
 
     def lacks(self, text: str) -> None:
-        """Called each round with what is missing now; "" if nothing is."""
+        """Called each round with the sentence on the missing topic; "" if none is missing."""
         now_s = time.monotonic()
         if not text:
             self._since_s = None

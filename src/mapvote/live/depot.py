@@ -1,4 +1,4 @@
-"""A depot: ballots in files are sent to a server, one by one, and each is told."""
+"""A depot: ballots in files are sent to a server one by one, with a line for each."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Counts:
 
 
 class FirstSeconds:
-    """Some scans of the first ten seconds, and what is wrong with them."""
+    """Some scans of the first ten seconds, and the findings on them."""
 
     def __init__(self, sensor_told: str) -> None:
         self._told = sensor_told
@@ -225,7 +225,7 @@ class LiveDrive:
         self.fixes: deque[Fixed] = deque(maxlen=LIVE_RULE.fixes)
         """Fixes of the scans that voted last. The publisher of a fix removes it."""
         self.kept: deque[Ballot] = deque(maxlen=LIVE_RULE.shown)
-        """The last votes on single tiles that went to the journal. Whoever shows them removes them."""
+        """The last votes on single tiles that went to the journal. The reader that shows them removes them."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0

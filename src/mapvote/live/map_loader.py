@@ -122,7 +122,7 @@ class MapLoader:
             seen = state.st_mtime_ns, state.st_ino, state.st_size
             if seen == self._read:
                 return False
-            self._read = seen  # a table that is none is said once, and read again once it was replaced
+            self._read = seen  # an unreadable table is reported once, and read again after it was replaced
             cells = _read_table(file)
             check_followed(self.folder)
             self.cells = cells

@@ -52,7 +52,7 @@ class Priors:
         return back_s
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether no later message changes what is known of this time."""
+        """Whether no later message changes the pose of this time."""
         if len(self.fixes.times_ns):
             return bool(self.fixes.times_ns[-1] >= stamp_ns)
         return len(self._poses) >= 2 and max(time_ns for time_ns, _ in self._poses) >= stamp_ns

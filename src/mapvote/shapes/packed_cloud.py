@@ -20,7 +20,7 @@ from mapvote.core.types import F32, F64, I64, U8, U16
 from mapvote.core.voxels import found_among
 
 SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
-"""Voxel side of each level; one more level takes what is left."""
+"""Voxel side of each level; one more level takes the other points."""
 N_LEVELS = len(SPACINGS_M) + 1
 SIDE_M = TILE_CELLS * CELL_SIZE
 _STEPS = 65535

@@ -36,7 +36,7 @@ from mapvote_lab.evaluation.scores import Scores, score_cells
 from mapvote_lab.evaluation.truths import CaseOutcome, lay_on
 
 Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, done, in all)."""
+"""Called with (name of the work, done, total)."""
 
 
 def untold(stage: str, done: int, total: int) -> None:
@@ -228,7 +228,7 @@ def tallies(drive: Words, mapped: Bool, rules: Iterable[CountedBy]) -> dict[Coun
 
 
 def counting_rule(case: Case) -> CountedBy:
-    """Cases that differ only in who decides count alike."""
+    """Cases that differ only in the server's decision count alike."""
     return case.voting.model_copy(update={"two_stage": True}), case.paper
 
 

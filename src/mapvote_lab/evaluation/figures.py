@@ -211,7 +211,7 @@ def street(
     areas: Sequence[tuple[str, F64]] = (),
     paths: Sequence[tuple[str, F64]] = (),
 ) -> Figure:
-    """The street from above (Figure 6): the old map with what was deleted, the new one with what was added.
+    """The street from above (Figure 6): the old map with the deleted points, the new one with the added points.
 
     ``old`` and ``updated``: points (n, 3), map metres, and their heights above ground (n,); ``areas`` (name,
     corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
@@ -320,7 +320,7 @@ def reliability_diagram(by_state: Mapping[CellState, Reliability]) -> Figure:
         column[0].set_title(f"{title}calibration error {one.calibration_error:.3f}, Brier {one.brier:.3f}", loc="left")
         width = 1.0 / len(one.cells)
         column[1].bar((np.arange(len(one.cells)) + 0.5) * width, one.cells, 0.9 * width, color=colour)
-        column[1].set_xlabel("probability that is told")
+        column[1].set_xlabel("stated probability")
         column[1].set_xlim(0, 1)
         for axis in column:
             axis.grid(alpha=0.25, lw=0.6)

@@ -1,4 +1,4 @@
-"""The bench of a recorded drive: what is decided where nothing changed, and what is found of what was cast into it."""
+"""The bench of a recorded drive: decisions where nothing changed, and the share of cast objects that are found."""
 
 from __future__ import annotations
 

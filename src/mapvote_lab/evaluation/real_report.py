@@ -70,9 +70,7 @@ def _poses(bench: Bench, case: str) -> Sheet:
         rows.append(
             (name, str(run.ballots), f"{100 * f['lost_share'] if seen else 100:.0f}", *(errors if seen else "---"))
         )
-    return Sheet(
-        f"{bench.name}: poses; scans that nobody could trust, those wrong by .5 m, and the rest", headings, rows
-    )
+    return Sheet(f"{bench.name}: poses: scans without a sure place, scans wrong by .5 m, and the rest", headings, rows)
 
 
 def _largest(bench: Bench, case: str) -> Sheet:

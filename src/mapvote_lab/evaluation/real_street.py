@@ -95,7 +95,7 @@ def split(n: int, block: int, rule: StreetRule = STREET_RULE) -> tuple[I64, list
 
 @dataclass(frozen=True)
 class Street:
-    """The map of every other block, and what is needed to judge those who vote on it."""
+    """The map of every other block, and the data by which votes on it are judged."""
 
     recording: Drive
     point_map: PointMap
@@ -218,7 +218,7 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
         _note_movers(vehicle.finish(), street.grid, movers)
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
         reports.append(vehicle.report)
-        if len(there):  # who never found himself sends no ballot
+        if len(there):  # a vehicle that was never localised sends no ballot
             for case in cases:
                 ballots[case.name].append(vehicle.ballot(case))
             metres.append(pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])[0])
@@ -371,7 +371,7 @@ def believing(change: Callable[[F64, F64], F64]) -> Edit:
 
 
 def without_prior(drive: Drive) -> Drive:
-    """Nobody says where the vehicle is."""
+    """The drive without its prior."""
     return replace(drive, T_map_lidar_prior=None)
 
 

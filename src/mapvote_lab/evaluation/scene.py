@@ -1,4 +1,4 @@
-"""One simulated scene and what was made of it, kept on disk: drives, first map, ballots.
+"""One simulated scene and its products, kept on disk: drives, first map, ballots.
 
 Everything is cached by what it depends on: scenario, seed, settings and the program's own sources, so that a run
 that was cut short goes on where it stopped and a changed program never meets an old result.

@@ -438,7 +438,7 @@ class Cost(msgspec.Struct, frozen=True):
 
 
 class Timings(msgspec.Struct, frozen=True, kw_only=True):
-    """Wall time; what is left of a run whose other numbers are all repeatable."""
+    """Wall time, the only number of a run that is not repeatable."""
 
     prepare_s: float
     vote_s: float

@@ -104,7 +104,7 @@ class ReportSection:
     tables: Sequence[Sheet] = ()
     commands: str = ""
     markup: str = ""
-    """HTML as it is, from those who made it safe."""
+    """HTML that its maker has escaped."""
 
 
 def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequence[ReportSection]) -> str:

@@ -102,7 +102,7 @@ def make_traffic(
 
 
 def _lanes(scenario: Scenario, terrain: Terrain, own_lane: str, clock: F64, rng: np.random.Generator) -> list[Track]:
-    """Each lane flows at one speed of its own, so nobody runs into anybody; the vehicle's lane keeps a gap for it."""
+    """Each lane flows at one speed of its own, so no car hits another; the vehicle's lane keeps a gap for it."""
     tracks = []
     for name, (direction, offset) in LANES.items():
         factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.25)  # nobody stays alongside for the whole drive

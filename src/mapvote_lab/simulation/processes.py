@@ -21,7 +21,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """``workers`` spawned processes. On an error or Ctrl-C what waits is dropped, what runs is ended, and waited for.
 
     A terminal sends Ctrl-C to every process; here only the first one hears it. The others are told to end, so that
-    they leave their own files whole, and nobody prints a traceback.
+    they leave their own files whole, and none prints a traceback.
     """
     spawn = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
@@ -72,7 +72,8 @@ def _listen() -> None:
 
 
 def _end_with_the_first() -> None:
-    """A first process that was killed tells nobody: without this the others would work, and then wait, for ever."""
+    """End this process with the first one: a first process that was killed sends no signal, and the others would work,
+    and then wait, for ever."""
     first = multiprocessing.parent_process()
     assert first is not None
     first.join()

@@ -162,7 +162,7 @@ def dense_survey(
     hits = np.zeros((2, len(Role), *ground.shape), dtype=np.int32)
     samples = []
     labels = []
-    # The street before holds what stays and what is demolished; the street after what stays and what is built.
+    # The street before holds objects that stay or are demolished; the street after those that stay or are built.
     for when, role in enumerate((Role.REMOVED, Role.ADDED)):
         caster = Caster(*world.mesh([i for i, r in enumerate(roles) if r in (Role.KEPT, role)]))
         changed_points = [np.zeros((0, 3), dtype=np.float32)]
@@ -257,7 +257,7 @@ def label_cells(
     provenance[lost_points] = Label.CHANGED_EMPTY
     weak = (lost_points & (survey[Role.REMOVED] < support)) | (new_points & (vehicles[Role.ADDED] < support))
 
-    # Cells that nobody could know are not scored; a later reason overrules an earlier one.
+    # Cells that cannot be known are not scored; a later reason overrules an earlier one.
     reason = np.zeros(lost.shape, dtype=np.uint8)
     reason[weak] = Reason.WEAKLY_SUPPORTED
     reason[lost & ~mapped] = Reason.REMOVED_NEVER_SURVEYED

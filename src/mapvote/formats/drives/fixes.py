@@ -38,7 +38,7 @@ class FixRules:
     slip_rad: float = 0.03
     """Standard deviation between the way driven and the axis of the vehicle, radians."""
     turn_rad_s: float = 0.15
-    """Turning that nobody measures: growth of the heading's standard deviation, radians per second."""
+    """Growth of the heading's standard deviation between fixes, radians per second: no sensor measures turns there."""
     drift_rad_s: float = 0.005
     """The same where an IMU measures the turn, radians per second."""
     acceleration_mps2: float = 1.5

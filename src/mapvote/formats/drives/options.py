@@ -164,7 +164,7 @@ def read_mount(numbers: list[float] | str, source: str) -> F64:
 
 
 def read_sensor(sensor: str | dict[str, Any], source: str) -> Sensor:
-    """A sensor by name, or by a table of its fields. MapvoteError lists what is known."""
+    """A sensor by name, or by a table of its fields. MapvoteError lists the known ones."""
     if isinstance(sensor, str):
         if sensor not in NAMED:
             raise MapvoteError(
@@ -223,7 +223,7 @@ def parse_scans(scans: str | None, n: int, source: str) -> I64:
 
 
 def _name(said: str | None, path: Path, owner: str) -> str:
-    """A legal name of a vehicle or a drive: what is said, else made from the file's name."""
+    """A legal name of a vehicle or a drive: the stated one, else made from the file's name."""
     name = said or re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64] or "drive"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
         raise MapvoteError(
@@ -307,7 +307,7 @@ def _sensor_of(
     chosen: I64,
     read_scan: Callable[[int, Sensor], Scan],
 ) -> tuple[Sensor, str]:
-    """(the sensor, where it comes from). A table that gives only some fields wins over what is measured."""
+    """(the sensor, where it comes from). A table that gives only some fields wins over the measured ones."""
     said = options.sensor
     rate_hz = options.rate_hz
     if isinstance(said, str):

@@ -20,7 +20,7 @@ Cloud = TypeVar("Cloud")
 @record()
 @dataclass(frozen=True, slots=True)
 class PacketRule:
-    """How packets are told from whole scans."""
+    """Numbers by which packets are distinguished from whole scans."""
 
     looked_at: int = 8
     """Clouds that are looked at before it is decided."""

@@ -40,7 +40,7 @@ log = logging.getLogger("mapvote.formats")
 @record()
 @dataclass(frozen=True, slots=True)
 class PointRule:
-    """Bounds by which points and rates of scans are told to be right."""
+    """Limits of sound points and rates of scans."""
 
     most_bad_share: float = 0.05
     """A scan or map with a larger share of broken points is refused: it is damaged, or of another format."""

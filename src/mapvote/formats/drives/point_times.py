@@ -53,7 +53,7 @@ class TimeOrigin(StrEnum):
 @record()
 @dataclass(frozen=True, slots=True)
 class TimeJudgement:
-    """Bounds by which a field is told to be the time of points."""
+    """Numbers by which a field is recognised as the time of points."""
 
     least_values: int = 16
     """Different values a scan has at least."""

@@ -119,7 +119,7 @@ class _Message:
     topic: int
     received_ns: int
     header_ns: int
-    """The stamp in its header, 0 where nobody stamped it."""
+    """The stamp in its header, 0 if it has none."""
     packets: tuple[_Message, ...] = ()
     """The packets of a revolution, of which this is the first; () if it came whole."""
 
@@ -181,7 +181,7 @@ def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Messag
 
 
 def _messages_of(bag: Bag, topic: str, k: int, left_out: list[str]) -> list[_Message]:
-    """The messages of the ``k``-th topic by their stamps; what is left out is counted and reported."""
+    """The messages of the ``k``-th topic by their stamps; those that are left out are counted and reported."""
     headers, received, sizes = stamps_of(bag, topic).T
     order = in_order_of_stamps(headers, received)
     for line in order.told:

@@ -91,7 +91,7 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
 
 @dataclass(frozen=True, slots=True)
 class ScanFolder:
-    """One drive's files and what is known of them besides drive.toml."""
+    """Files of one drive, and the properties that its layout states beside drive.toml."""
 
     files: list[Path]
     stamps_ns: I64

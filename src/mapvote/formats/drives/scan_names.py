@@ -23,7 +23,7 @@ from mapvote.core.types import F64, I64, MapvoteError
 @record()
 @dataclass(frozen=True, slots=True)
 class NameRule:
-    """Bounds by which a number in a name is told to be a time."""
+    """Numbers by which a number in a name is recognised as a time."""
 
     since_1970_s: float = 1e8
     """Least number that is a time since 1970, seconds: a day of 1973."""

@@ -260,7 +260,7 @@ def _known(elevations: F64) -> tuple[str, Sensor | None]:
 def _ringless(
     elevation: F64, azimuth: F64, rate_hz: float, blind: tuple[tuple[float, float], ...], share: float
 ) -> Estimate:
-    """A model without rings: as many rows and columns as the density of points makes, over what is seen."""
+    """A model without rings: rows and columns over the field of view, as many as the density of points gives."""
     low, high = np.quantile(elevation, [0.002, 0.998])
     wide = 360.0 - sum(b - a for a, b in blind)
     per_deg = max(len(elevation), 1) / max((high - low) * wide, 1e-6)

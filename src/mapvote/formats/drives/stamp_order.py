@@ -53,7 +53,7 @@ def in_order_of_stamps(stamps_ns: I64, received_ns: I64, rules: StampRules = STA
     lines: list[str] = []
     chosen = np.arange(len(stamps_ns))
     stamps = stamps_ns
-    # Headers that nobody stamped: receipt is the only time there is.
+    # Headers without stamps: the time of receipt is the only one.
     if len(stamps) and (stamps == 0).all():
         lines.append("has no stamps in its headers; the times of receipt are used")
         stamps = received_ns

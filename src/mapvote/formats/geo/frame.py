@@ -52,7 +52,7 @@ class MapFrame:
     projector: str = ""
     """The text of Autoware's map_projector_info.yaml, where the map has one."""
     refusal: str = ""
-    """Why nobody can make out which coordinate system a file means, and how to name it; empty if it is known."""
+    """Why the coordinate system of a file is unclear, and how to name it; empty if it is known."""
 
     @property
     def is_local(self) -> bool:
@@ -66,7 +66,7 @@ class MapFrame:
         return {name: text for name, text in texts.items() if text}
 
     def told(self) -> str:
-        """In words: the coordinate system, its unit if not metres, what is subtracted, what heights count from."""
+        """The frame in words: coordinate system, unit if not metres, subtracted offset, zero of the heights."""
         if self.is_local:
             name = "local metres (place on Earth unknown)"
         elif self.crs.startswith(ENU):

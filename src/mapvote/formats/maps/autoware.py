@@ -201,7 +201,7 @@ def laid_version(folder: Path) -> int | None:
 
 
 def check_followed(folder: Path, map_id: str = "") -> None:
-    """MapvoteError if the folder holds a map of somebody else, or another map than ``map_id``."""
+    """MapvoteError if the folder holds a map that mapvote did not write, or another map than ``map_id``."""
     if is_autoware(folder) and not (folder / HISTORY).is_file():
         raise MapvoteError(
             f"{folder}: holds an Autoware map that mapvote did not make; choose another folder, which may be new"
@@ -233,7 +233,7 @@ def lay_version(
     written, and of those none that is ``present`` where the folder goes.
 
     Tiles of the ``keep`` versions before stay. At every moment the metadata there names only whole tiles. MapvoteError
-    if the folder holds a map of somebody else, or another map than ``map_id``.
+    if the folder holds a map that mapvote did not write, or another map than ``map_id``.
     """
     check_followed(folder, map_id)
     if keep < 0:

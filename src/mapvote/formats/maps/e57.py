@@ -80,7 +80,7 @@ def _scan(library: Any, file: Any, header: Any, frame: MapFrame, block: int) -> 
 def _limits(header: Any, name: str) -> tuple[float, float]:
     """(least, largest) value of a field, as the scan's limits name them, or else the type that it is stored in."""
     group = "intensityLimits" if name == "intensity" else "colorLimits"
-    with suppress(Exception):  # libE57's own, for what is not there
+    with suppress(Exception):  # libE57's own exceptions, for missing nodes
         limits = header[group]
         return float(limits[f"{name}Minimum"].value()), float(limits[f"{name}Maximum"].value())
     with suppress(Exception):

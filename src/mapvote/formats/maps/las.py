@@ -188,7 +188,7 @@ def beside_its_box(path: Path, low: F64, high: F64) -> str:
 
 
 def _frame(source: str, head: Head) -> MapFrame:
-    """The frame that the file names; one that only says what is wrong where nobody can make it out."""
+    """The frame that the file names; where it is unclear, one with a refusal."""
     try:
         return MapFrame(_known(source, head.wkt)) if head.wkt else frame_of_keys(source, head.geo_keys)
     except MapvoteError as error:

@@ -1,6 +1,6 @@
 """A mapvote map on disk: what a server sends, in a folder. Written whole, verified when read.
 
-``manifest.json`` is a server's manifest (:mod:`mapvote.codec.manifest`), and what else the map knows of itself.
+``manifest.json`` is a server's manifest (:mod:`mapvote.codec.manifest`), and other properties of the map.
 ``planes/HASH``: see :mod:`mapvote.codec.tile_planes`.
 """
 

@@ -27,7 +27,7 @@ MARKS = {
     "overlap": "overlap",
 }
 DROPPED = frozenset({"withheld", "noise"})
-"""Marks whose points are left out where nobody says otherwise."""
+"""Marks whose points are left out by default."""
 
 
 def marks_in(text: str) -> frozenset[str]:
@@ -62,7 +62,7 @@ class MarkedPoints:
     counts: Counter[str] = field(default_factory=Counter)
 
     def without(self, pieces: Iterator[Cloud]) -> Iterator[Cloud]:
-        """The pieces of a file without what is dropped."""
+        """The pieces of a file without the dropped points."""
         for piece in pieces:
             bad = np.zeros(len(piece.points), np.bool_)
             for mark in MARKS:
@@ -73,7 +73,7 @@ class MarkedPoints:
             yield piece.where(~bad) if bad.any() else piece
 
     def told(self) -> list[str]:
-        """Lines that say what was left out and what was kept."""
+        """Lines on the points that were left out and kept."""
         lines = []
         for mark, n in self.counts.items():
             done = "dropped" if mark in self.drop else "kept"

@@ -60,7 +60,7 @@ def _full_lines(stream: BinaryIO) -> io.StringIO:
 
 
 def _ascii_header(stream: BinaryIO) -> BinaryIO:
-    """The file from its start, with "?" for what is no ASCII in the comments of its header: plyfile refuses that."""
+    """The file from its start, with "?" for signs of its header's comments that are not ASCII: plyfile refuses them."""
     header = b""
     for line in stream:
         header += line

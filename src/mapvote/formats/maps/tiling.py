@@ -205,7 +205,7 @@ class _Taken:
         return self.frame.georeference() | times
 
     def lattice(self) -> Lattice:
-        """Where the map's cells lie. MapvoteError if no map can be made of what was taken."""
+        """Lattice of the map. MapvoteError if the points that were taken make no map."""
         if not self.total:
             raise MapvoteError(f"{self.where}: holds no points; a map needs at least one")
         if self.bad == self.total or self.bad > self.most_bad * self.total:
