@@ -148,6 +148,15 @@ def test_a_time_that_32_bits_cannot_hold_is_the_nearest_that_they_can(end_ns: in
     assert remembered(memory(came_s=came_s), STANDS, BARE, [gone], states_plane({CELL: CE})).stays[CELL] == 1
 
 
+def test_a_new_object_is_dated_from_its_first_sighting_beside_cells_that_filled_otherwise() -> None:
+    """A point beside the object falls into a cell that nobody calls changed: it has no date."""
+    both = make_tile(wall([CELL, LAWN], [0.75]))
+    early, late = (drive(day, {CELL: CO}) for day in (0.0, 5.0))
+    after = remembered(Memory.none(), BARE, both, [late], states_plane({CELL: CO}), (lambda: [early, late], 2))
+    assert after.came_s[CELL] == early.end_ns // 10**9
+    assert after.came_s[LAWN] == 0
+
+
 def fused(tile: Tile, day: float, state: int, version: int, history: list[Vote]) -> Tile:
     points = wall([CELL], [0.75]) if state == CO else None
     votes = [replace(drive(day, {CELL: state}, vehicle), new_points=points) for vehicle in "ab"]
