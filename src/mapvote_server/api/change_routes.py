@@ -100,7 +100,7 @@ async def lanelets(request: Request, parts: Parts, names: Known, choice: Annotat
 
 def _lanelets(store: Store, names: bool, choice: LaneletsAsked, osm: bytes) -> Response:
     newest = store.current() if choice.new is None else choice.new
-    listed = changes_between(store, choice.old, newest, choice.min_cells, known=names)
+    listed = changes_between(store, choice.old, newest, choice.min_cells, with_names=names)
     return as_json(lanelets_near(listed, osm, choice.within))
 
 
