@@ -64,6 +64,33 @@ def test_the_same_command_adds_versions_and_writes_no_item_again(tmp_path: Path)
     assert (tmp_path / "catalogue" / "v2" / "v2.json").is_file()
 
 
+@pytest.mark.parametrize("order", [(2, 1), (1, 2), (2, None), (None, 1)])
+def test_the_catalogue_names_every_item_that_was_ever_added_with_its_derivation(
+    tmp_path: Path, order: tuple[int | None, ...]
+) -> None:
+    """--version N into a catalogue of more versions made one that named version N alone."""
+    store = store_of_two_versions(tmp_path / "fleet.db", GEOREFERENCE)
+    folder = tmp_path / "catalogue"
+    for version in order:
+        typed("export", store, folder, "--stac", *(() if version is None else ("--version", str(version))))
+    catalog = pystac.Catalog.from_file(str(folder / "catalog.json"))
+    items = {item.id: item for item in catalog.get_items()}
+    assert sorted(items) == ["v1", "v2"]
+    if order != (2, 1):  # nobody asked for version 2 once its parent was there
+        (derived,) = items["v2"].get_links("derived_from")
+        assert Path(derived.get_absolute_href()) == Path(items["v1"].get_self_href())
+        assert json.loads(Path(items["v2"].assets["changes"].get_absolute_href()).read_text())["features"]
+
+
+def test_the_catalogue_of_another_map_is_left_alone(tmp_path: Path) -> None:
+    typed(
+        "export", store_of_two_versions(tmp_path / "fleet.db", {}), tmp_path / "catalogue", "--stac", "--version", "1"
+    )
+    write_map(replace(two_walls(), map_id="elsewhere"), tmp_path / "my_map")
+    with pytest.raises(MapvoteError, match="not of 'elsewhere'"):
+        typed("export", tmp_path / "my_map", tmp_path / "catalogue", "--stac")
+
+
 def test_a_map_of_files_is_one_item_and_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     write_map(replace(two_walls(), georeference=GEOREFERENCE), tmp_path / "my_map")
     typed("export", tmp_path / "my_map", tmp_path / "catalogue", "--stac")

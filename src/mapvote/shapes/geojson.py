@@ -21,6 +21,9 @@ from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.shapes.change_objects import ChangeObject, Kind, Size
 from mapvote.shapes.outlines import Ring
 
+Bounds = tuple[float, float, float, float]
+"""Lowest x and y, highest x and y, map metres."""
+
 
 @answer
 @dataclass(frozen=True, slots=True)
@@ -264,3 +267,19 @@ def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> Places
 def places(features: list[PlacedFeature]) -> Places:
     """Features in map metres as GeoJSON."""
     return Places("FeatureCollection", MAP_METRES, features)
+
+
+def meet(one: Bounds, other: Bounds) -> bool:
+    """Whether two boxes share a point."""
+    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]
+
+
+def bounds_of(geometry: Geometry) -> Bounds:
+    """The box around a geometry in map metres."""
+    corners = geometry.coordinates
+    while isinstance(corners[0], list) and isinstance(corners[0][0], list):
+        corners = [corner for ring in corners for corner in ring]
+    xy = np.reshape(corners, (-1, len(corners[0]) if isinstance(corners[0], list) else len(corners)))[:, :2]
+    x0, y0 = xy.min(axis=0).tolist()
+    x1, y1 = xy.max(axis=0).tolist()
+    return x0, y0, x1, y1

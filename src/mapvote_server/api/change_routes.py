@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
@@ -11,6 +10,7 @@ from pydantic import BaseModel, Field
 from mapvote.shapes.geojson import Changes, Places, feature_rows
 from mapvote_server.api.etags import has_already, tag_of
 from mapvote_server.api.lanes import on
+from mapvote_server.api.paging import BoxQuery, Part, box_in
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -43,6 +43,7 @@ class ChangesAsked(Between):
     format: Literal["geojson", "csv"] = "geojson"
     limit: int = Field(default=1_000, ge=1, le=10_000, description="so many at most, the largest first")
     offset: int = Field(default=0, ge=0, le=MOST, description="after so many")
+    bbox: BoxQuery = None
 
 
 @router.get(
@@ -62,17 +63,17 @@ def changes(request: Request, parts: Parts, with_names: Known, query: Annotated[
     headers = _headers(compare_versions(parts.store, query.old, newest), with_names, query)
     if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    shown: dict[str, Any] = {"limit": query.limit, "offset": query.offset}
-    listed = changes_between(
-        parts.store, query.old, newest, query.min_cells, lonlat=query.lonlat, with_names=with_names, **shown
-    )
+    part = Part(query.limit, query.offset)
+    shown: dict[str, Any] = {
+        "lonlat": query.lonlat,
+        "with_names": with_names,
+        "box": box_in(query.bbox),
+        "part": part.rows,
+    }
+    listed = changes_between(parts.store, query.old, newest, query.min_cells, **shown)
     answer = as_table(feature_rows(listed.features)) if query.format == "csv" else as_json(listed)
-    after = query.offset + listed.numberReturned
-    if after < listed.numberMatched:
-        following = dict(request.query_params) | {"to": str(newest), "offset": str(after)}
-        headers["Link"] = f'<?{urlencode(following)}>; rel="next"'
     answer.headers.update(headers)
-    return answer
+    return part.link(request, answer, listed.numberMatched, to=str(newest))
 
 
 class LaneletsAsked(Between):

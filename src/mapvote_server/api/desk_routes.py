@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
 from mapvote.core.answers import answer
+from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import feature_rows
 from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
+from mapvote_server.api.paging import BoxAsked, PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -48,18 +50,24 @@ class ReviewAsk(Ask):
     responses=problems(403) | AS_CSV,
     summary="What a publish would change now",
 )
-async def whole_desk(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
+async def whole_desk(
+    request: Request, by: Reviewer, parts: Parts, part: PartAsked, box: BoxAsked, format: TableOrMap = "json"
+) -> Response:
     """Pending changes as GeoJSON with their verdicts; deletions beyond the policy's budget; held and rejected changes;
     the reasons to hold the version; the hashes of the tiles that a publish would make (null: without points), which
     `/v1/clouds` serves meanwhile.
 
-    ``geojson`` and ``csv`` hold all of them in one list.
+    ``geojson`` and ``csv`` hold all of them in one list, of which ``limit`` and ``offset`` name a part.
     """
-    shown = (await _look(parts)).answer
+    shown = (await _look(parts)).answer.within(box)
     if format == "json":
+        if part.limit is not None or part.offset:
+            raise MapvoteError("the desk as json is three lists: give format=geojson or csv with limit and offset")
         return as_json(shown)
     listed = shown.in_one()
-    return as_json(listed) if format == "geojson" else as_table(list(map(_flat, feature_rows(listed.features))))
+    features = part.of(listed.features)
+    answer = as_table(list(map(_flat, feature_rows(features)))) if format == "csv" else None
+    return part.link(request, answer or as_json(replace(listed, features=features)), len(listed.features))
 
 
 @router.get(

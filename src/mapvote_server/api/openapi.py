@@ -14,13 +14,13 @@ from pydantic import TypeAdapter
 
 from mapvote_server.api.key_form import COOKIE
 from mapvote_server.api.problems import Problem
+from mapvote_server.api.security import PROBES
 
 SCHEMES: dict[str, dict[str, Any]] = {
     "bearer": {"type": "http", "scheme": "bearer", "description": "the key"},
     "basic": {"type": "http", "scheme": "basic", "description": "the key as password, with any user name"},
     "cookie": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "a browser's, set by its form"},
 }
-KEYLESS = "/livez", "/readyz"
 GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "map": ("Versions of the map, and the planes of its tiles", ("map", "tiles", "clouds", "stac")),
     "ballots": ("Votes of vehicles", ("ballots",)),
@@ -59,7 +59,7 @@ def completed(document: dict[str, Any]) -> dict[str, Any]:
         for operation in operations.values():
             operation["tags"] = [groups[path.removeprefix("/v1").split("/")[1]]]
             _add_examples(operation)
-            if path in KEYLESS:
+            if path in PROBES:
                 operation["security"] = [{}, *document["security"]]
     return document
 

@@ -13,13 +13,16 @@ from fastapi import APIRouter, Query, Request, Response
 from prometheus_client import generate_latest
 
 from mapvote.core.answers import answer
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
-from mapvote.shapes.geojson import Places, tile_squares
+from mapvote.shapes.geojson import Bounds, Places, bounds_of, meet, tile_squares
 from mapvote_server.api.lanes import on
+from mapvote_server.api.paging import BoxAsked, PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
+    MOST_SEQ,
     Digest,
     IssueAsk,
     Metres,
@@ -41,6 +44,7 @@ from mapvote_server.questions.explain import CellStory, explain_cell
 from mapvote_server.questions.freshness import CoveredTile, tiles_seen
 from mapvote_server.questions.history import Info, Log, log_of, overview
 from mapvote_server.questions.vehicles import (
+    Contradiction,
     VehicleStanding,
     contradictions,
     standing_rows,
@@ -206,13 +210,27 @@ class Coverage:
     summary="Freshness of every tile",
 )
 @on("questions")
-def fresh(parts: Parts, with_names: Known, format: TableOrMap = "json") -> Response:
+def fresh(
+    request: Request, parts: Parts, with_names: Known, part: PartAsked, box: BoxAsked, format: TableOrMap = "json"
+) -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
-    tiles = tiles_seen(parts.store, with_names)
+    lattice = parts.store.lattice
+    tiles = [
+        tile for tile in tiles_seen(parts.store, with_names) if box is None or meet(box, _bounds_of(tile, lattice))
+    ]
+    shown = part.of(tiles)
+    rows = [] if format == "json" else [asdict(tile) for tile in shown]
     if format == "json":
-        return as_json(Coverage(tiles))
-    rows = [asdict(tile) for tile in tiles]
-    return as_table(rows) if format == "csv" else as_json(tile_squares(rows, parts.store.lattice))
+        answer = as_json(Coverage(shown))
+    else:
+        answer = as_table(rows) if format == "csv" else as_json(tile_squares(rows, lattice))
+    return part.link(request, answer, len(tiles))
+
+
+def _bounds_of(tile: CoveredTile, lattice: Lattice) -> Bounds:
+    window = lattice.tile((tile.row, tile.col))
+    side_m = TILE_CELLS * CELL_SIZE
+    return window.x0, window.y0, window.x0 + side_m, window.y0 + side_m
 
 
 @router.get(
@@ -223,9 +241,11 @@ def fresh(parts: Parts, with_names: Known, format: TableOrMap = "json") -> Respo
     summary="Where to drive next",
 )
 @on("questions")
-def passes(by: Reviewer, parts: Parts) -> Response:
+def passes(request: Request, by: Reviewer, parts: Parts, part: PartAsked, box: BoxAsked) -> Response:
     """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
-    return as_json(wanted_passes(parts.store))
+    wanted = wanted_passes(parts.store)
+    lines = [line for line in wanted.features if box is None or meet(box, bounds_of(line.geometry))]
+    return part.link(request, as_json(replace(wanted, features=part.of(lines))), len(lines))
 
 
 @answer
@@ -244,16 +264,25 @@ class Vehicles:
     summary="Vehicles that contradict the others",
 )
 @on("questions")
-def vehicles(by: Reviewer, parts: Parts, format: TableOrMap = "json") -> Response:
+def vehicles(
+    request: Request, by: Reviewer, parts: Parts, part: PartAsked, box: BoxAsked, format: TableOrMap = "json"
+) -> Response:
     """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
     standings = vehicle_standings(parts.store)
+    shown = [replace(one, evidence=_within(one.evidence, box)) for one in part.of(standings)]
     if format == "csv":
-        return as_table(standing_rows(standings))
-    if format == "geojson":
-        return as_json(contradictions(standings))
-    return as_json(
-        Vehicles([replace(standing, evidence=standing.evidence[: OPERATOR_SIZES.evidence]) for standing in standings])
-    )
+        answer = as_table(standing_rows(shown))
+    elif format == "geojson":
+        answer = as_json(contradictions(shown))
+    else:
+        most = OPERATOR_SIZES.evidence
+        answer = as_json(Vehicles([replace(one, evidence=one.evidence[:most]) for one in shown]))
+    return part.link(request, answer, len(standings))
+
+
+def _within(evidence: tuple[Contradiction, ...], box: Bounds | None) -> tuple[Contradiction, ...]:
+    """The contradictions in a box."""
+    return tuple(one for one in evidence if box is None or meet(box, (one.x, one.y, one.x, one.y)))
 
 
 @router.get(
@@ -296,9 +325,19 @@ def info(parts: Parts) -> Response:
 
 @router.get("/v1/log", operation_id="get_log", response_model=Log, responses=problems(403), summary="What happened")
 @on("questions")
-def log(by: Reviewer, parts: Parts, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
-    """Every version, and the last so many events."""
-    return as_json(log_of(parts.store, events))
+def log(
+    request: Request,
+    by: Reviewer,
+    parts: Parts,
+    events: Annotated[int, Query(ge=0, le=10_000)] = 0,
+    before: Annotated[int | None, Query(ge=1, le=MOST_SEQ, description="only events with smaller numbers")] = None,
+) -> Response:
+    """Every version, and the last so many events. If there are more, the header Link names the next part."""
+    shown = log_of(parts.store, events, before)
+    answer = as_json(shown)
+    if events and len(shown.events) == events:
+        answer.headers["Link"] = f'<?events={events}&before={shown.events[-1].seq}>; rel="next"'
+    return answer
 
 
 @answer
@@ -418,9 +457,10 @@ class KeysAnswer:
     "/v1/keys", operation_id="list_keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys"
 )
 @on("questions")
-def listed_keys(by: Operator, parts: Parts) -> Response:
+def listed_keys(request: Request, by: Operator, parts: Parts, part: PartAsked) -> Response:
     """All keys ever issued, revoked and expired ones too."""
-    return as_json(KeysAnswer(keys.entries(parts.store)))
+    entries = keys.entries(parts.store)
+    return part.link(request, as_json(KeysAnswer(part.of(entries))), len(entries))
 
 
 @answer

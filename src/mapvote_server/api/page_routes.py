@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import Annotated
@@ -16,11 +16,12 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
-from mapvote.shapes.geojson import Places
+from mapvote.shapes.geojson import Places, places
 from mapvote.shapes.packed_cloud import N_LEVELS
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
+from mapvote_server.api.paging import BoxAsked, PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -36,7 +37,7 @@ from mapvote_server.api.schemas import (
 from mapvote_server.api.services import Parts, Reviewer, name_of
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.explain import evidence
-from mapvote_server.questions.vehicles import paths
+from mapvote_server.questions.vehicles import MOST_PATHS, paths
 
 _FOR_EVER = "private, max-age=31536000, immutable"
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
@@ -50,10 +51,6 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 says what is wrong and how to mend it. The type <code>about:blank</code> means that the status says all.</p>
 <h3 id=held>/docs#held</h3><p>The policy holds a version back, for the <code>reasons</code> of this error. An operator
 publishes it in spite of them with <code>override</code>.</p></body></html>"""
-_STYLE_LINK = b'<link rel="stylesheet" href="viewer/pages.css">'
-_PRELOADED = b'<link rel="modulepreload" href="viewer/%s">'
-_OF_A_FILE = "standalone.js", "bundle.js"
-"""Modules of a page that lies in a file of its own."""
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
 
@@ -120,11 +117,23 @@ def evidence_of(request: Request, parts: Parts, row: _Index, col: _Index, vehicl
     summary="Paths of the drives",
 )
 @on("questions")
-def driven(by: Reviewer, parts: Parts, vehicle: str | None = None, format: TableOrMap = "json") -> Response:
-    """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
+def driven(
+    request: Request,
+    by: Reviewer,
+    parts: Parts,
+    part: PartAsked,
+    box: BoxAsked,
+    vehicle: str | None = None,
+    format: TableOrMap = "json",
+) -> Response:
+    """Paths of standing ballots that carry one, the newest drive first, 500 at a time: GeoJSON lines in map metres; as
     ``csv`` without the lines."""
-    driven_paths = paths(parts.store, vehicle)
-    return as_table([line.properties for line in driven_paths.features]) if format == "csv" else as_json(driven_paths)
+    most = min(part.limit or MOST_PATHS, MOST_PATHS)
+    part = replace(part, limit=most)
+    lines = paths(parts.store, vehicle, box, first=part.offset, most=most + 1).features
+    shown = places(lines[:most])
+    answer = as_table([line.properties for line in shown.features]) if format == "csv" else as_json(shown)
+    return part.link(request, answer, part.offset + len(lines))
 
 
 def packed(request: Request, data: bytes, cache: str) -> Response:
@@ -200,13 +209,19 @@ def _assets() -> dict[str, _Asset]:
 def _index() -> bytes:
     """The operator's page, which asks for all its modules at once: each would be asked for by the one before it."""
     assets = _assets()
-    modules = [name for name in assets if name.endswith(".js") and name not in ("app.js", *_OF_A_FILE)]
-    links = b"".join(_PRELOADED % name.encode() for name in sorted(modules, key=lambda name: ("/" not in name, name)))
+    left_out = "app.js", "standalone.js", "bundle.js"  # the page's own, and those of a page in a file of its own
+    modules = [name for name in assets if name.endswith(".js") and name not in left_out]
+    links = b"".join(
+        b'<link rel="modulepreload" href="viewer/%s">' % name.encode()
+        for name in sorted(modules, key=lambda name: ("/" not in name, name))
+    )
     return assets["index.html"].plain.replace(b"</head>", links + b"</head>", 1)
 
 
 def _page(request: Request, text: bytes) -> Response:
     """A page, with a warning at its end if the server needs no key."""
     if request.state.key is None:
-        text = text.replace(b"</head>", _STYLE_LINK + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
+        text = text.replace(b"</head>", b'<link rel="stylesheet" href="viewer/pages.css"></head>', 1).replace(
+            b"</body>", _OPEN + b"</body>", 1
+        )
     return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache"})

@@ -18,6 +18,7 @@ from mapvote.core.answers import answer
 from mapvote_server.api.encodings import takes_zstd
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
+from mapvote_server.api.paging import PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
     AS_CSV,
@@ -68,13 +69,15 @@ class Versions:
     summary="All versions",
 )
 @on("questions")
-def versions(parts: Parts, with_names: Known, format: Table = "json") -> Response:
+def versions(request: Request, parts: Parts, with_names: Known, part: PartAsked, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by. Only reviewers and operators see the name of the
     policy's gate drive."""
     listed = dated_versions(parts.store, with_names)
+    shown = part.of(listed)
     if format == "csv":
-        return as_table([{name: value for name, value in asdict(one).items() if name != "policy"} for one in listed])
-    return as_json(Versions(listed))
+        rows = [{name: value for name, value in asdict(one).items() if name != "policy"} for one in shown]
+        return part.link(request, as_table(rows), len(listed))
+    return part.link(request, as_json(Versions(shown)), len(listed))
 
 
 @router.get(

@@ -14,7 +14,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
-from mapvote.core.grid import TileIndex
+from mapvote.core.grid import CELL_SIZE, Lattice, TileIndex
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
@@ -22,7 +22,7 @@ from mapvote.fusion.decision_record import Record
 from mapvote.fusion.tile_vote import Vote
 from mapvote.shapes.change_objects import ChangedCells, ChangeObject, Decided, change_objects, changed_cells
 from mapvote.shapes.cutout import Cutout, Tiles, of_feature, whole_page
-from mapvote.shapes.geojson import Changes, to_geojson
+from mapvote.shapes.geojson import Bounds, Changes, meet, to_geojson
 from mapvote_server.errors import Unavailable
 from mapvote_server.questions.explain import seen, sound_votes
 from mapvote_server.store.integrity import hurt_or_mended_since
@@ -149,19 +149,20 @@ def changes_between(
     *,
     lonlat: bool = False,
     with_names: bool = True,
-    limit: int | None = None,
-    offset: int = 0,
+    box: Bounds | None = None,
+    part: slice = slice(None),
 ) -> Changes:
     """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``),
     the largest first. ``with_names``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
 
-    ``limit``, ``offset``: so many of them, after so many. "numberMatched" is the number of all with at least
-    ``min_cells`` cells, "numberReturned" of those here (OGC API Features). NotFound if one of the versions does not
-    exist.
+    ``box``: only those whose own box meets it.
+
+    ``part``: these of them. "numberMatched" is the number of all with at least ``min_cells`` cells, "numberReturned" of
+    those here (OGC API Features). NotFound if one of the versions does not exist.
     """
     compared = compare_versions(store, old, new)
-    listed = [thing for thing in compared.objects if thing.cells >= min_cells]
-    shown = slice(offset, None if limit is None else offset + limit)
+    large = [thing for thing in compared.objects if thing.cells >= min_cells]
+    listed = [thing for thing in large if box is None or meet(box, _bounds(thing, store.lattice))]
     features = to_geojson(
         [
             replace(
@@ -169,7 +170,7 @@ def changes_between(
                 first_seen_ns=seen(thing.first_seen_ns, with_names),
                 last_seen_ns=seen(thing.last_seen_ns, with_names),
             )
-            for thing in listed[shown]
+            for thing in listed[part]
         ],
         store.lattice,
         map_id=store.map_id,
@@ -180,6 +181,11 @@ def changes_between(
         among=listed,
     )
     return replace(features, damaged=list(compared.damaged) or None)
+
+
+def _bounds(change: ChangeObject, lattice: Lattice) -> Bounds:
+    col0, row0, col1, row1 = (CELL_SIZE * corner for corner in change.box)
+    return lattice.x0 + col0, lattice.y0 + row0, lattice.x0 + col1, lattice.y0 + row1
 
 
 def cutouts_between(store: Store, old: int, new: int, changes: Changes, most: int = 12) -> list[Cutout]:

@@ -22,7 +22,16 @@ from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
 from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.shapes.change_objects import ChangedCells, ChangeObject, change_objects, changed_cells
-from mapvote.shapes.geojson import ChangeCollection, ChangeFacts, ChangeFeature, members_of, to_geojson
+from mapvote.shapes.geojson import (
+    Bounds,
+    ChangeCollection,
+    ChangeFacts,
+    ChangeFeature,
+    bounds_of,
+    meet,
+    members_of,
+    to_geojson,
+)
 from mapvote.shapes.packed_cloud import came_and_went
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.coverage import waiting_votes
@@ -96,6 +105,16 @@ class DeskAnswer:
     """held and rejected changes, which a publish leaves out"""
     tiles: dict[str, Drawn | None]
     """as a publish would make them; null: without points"""
+
+    def within(self, box: Bounds | None) -> DeskAnswer:
+        """The desk with the changes that meet a box."""
+        if box is None:
+            return self
+        pending, waiting, reviewed = (
+            [one for one in features if meet(box, bounds_of(one.geometry))]
+            for features in (self.pending.features, self.waiting, self.reviewed)
+        )
+        return replace(self, pending=replace(self.pending, features=pending), waiting=waiting, reviewed=reviewed)
 
     def in_one(self) -> Pending:
         """All changes as one collection."""

@@ -190,10 +190,10 @@ def dated_versions(store: Store, with_names: bool) -> list[DatedVersion]:
     ]
 
 
-def log_of(store: Store, last: int) -> Log:
-    """The versions, oldest first, and the ``last`` so many events, newest first."""
+def log_of(store: Store, last: int, before: int | None = None) -> Log:
+    """The versions, oldest first, and the ``last`` so many events (``before`` one of this number), newest first."""
     versions = [LoggedVersion(**_origin_of(version), created_ns=version.created_ns) for version in store.versions()]
-    return Log(versions, last_events(store, last) if last else [])
+    return Log(versions, last_events(store, last, before) if last else [])
 
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
@@ -236,10 +236,12 @@ def events_after(store: Store, seq: int) -> list[Event]:
     return [Event(*row, version) for row in rows]
 
 
-def last_events(store: Store, limit: int = 100) -> list[LoggedEvent]:
-    """The last events, newest first."""
+def last_events(store: Store, limit: int = 100, before: int | None = None) -> list[LoggedEvent]:
+    """The last events (``before`` one of this number), newest first."""
     e = schema.events.c
     query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
+    if before is not None:
+        query = query.where(e.seq < before)
     with store.database.reading() as connection:
         return [LoggedEvent(*row) for row in connection.execute(query)]
 

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from itertools import chain
+from itertools import chain, islice
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.times import utc
 from mapvote.core.types import F32, I64
-from mapvote.shapes.geojson import Geometry, PlacedFeature, Places, places
+from mapvote.shapes.geojson import Bounds, Geometry, PlacedFeature, Places, meet, places
 from mapvote_server.questions.contradictions import CONTRADICTIONS, Compared, Objects, compare, over_borders
 from mapvote_server.questions.explain import votes_on
 from mapvote_server.questions.kept import KeptTiles
@@ -216,9 +216,12 @@ MOST_PATHS = 500
 """The last drives."""
 
 
-def paths(store: Store, vehicle: str | None = None) -> Places:
+def paths(
+    store: Store, vehicle: str | None = None, box: Bounds | None = None, *, first: int = 0, most: int = MOST_PATHS
+) -> Places:
     """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
-    ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
+    ``vehicle`` only, if named, and only those that meet the ``box``: ``most`` of them after the ``first``. Where the
+    map has no ground height, the last one along the path is used."""
     b = schema.ballots.c
     p = schema.paths.c
     query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
@@ -226,8 +229,12 @@ def paths(store: Store, vehicle: str | None = None) -> Places:
     if vehicle is not None:
         query = query.where(b.vehicle == vehicle)
     with store.database.reading() as connection:
-        rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
-        driven = [unpack_path(row.path) for row in rows]
+        ordered = query.order_by(b.end_ns.desc(), b.seq.desc()).execution_options(yield_per=MOST_PATHS)
+        every = ((row, unpack_path(row.path)) for row in connection.execute(ordered))
+        met = ((row, path) for row, path in every if box is None or meet(box, _bounds(path, store.lattice)))
+        drives = list(islice(met, first, first + most))
+        rows = [row for row, _ in drives]
+        driven = [path for _, path in drives]
         touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
         mapped = tiles_of(connection, version_of(connection).number, sorted(touched)) if touched else {}
 
@@ -257,6 +264,13 @@ def paths(store: Store, vehicle: str | None = None) -> Places:
 
 
 _NO_GROUND = np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32)
+
+
+def _bounds(path: I64, lattice: Lattice) -> Bounds:
+    row0, col0 = path.min(axis=0).tolist()
+    row1, col1 = (path.max(axis=0) + 1).tolist()
+    low = lattice.x0 + CELL_SIZE * col0, lattice.y0 + CELL_SIZE * row0
+    return *low, lattice.x0 + CELL_SIZE * col1, lattice.y0 + CELL_SIZE * row1
 
 
 def _line(store: Store, path: I64, ground: Callable[[TileIndex], F32]) -> list[list[float]]:

@@ -3,91 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import is_dataclass
-from typing import Any
 
-import numpy as np
 import pytest
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
-from msgspec.structs import replace
 from pydantic import TypeAdapter
 
-from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import Ballot, encode, pack_path
-from mapvote.config import FuseSettings
-from mapvote.core.types import CellState
+from asked import ASKED, POLICY, ballot, lived_in
+from hand_made import two_walls
+from mapvote.codec.ballot import encode
 from mapvote_server.api.app import ROUTES, create_app
 from mapvote_server.api.schemas import Answer
 from mapvote_server.api.security import PROBES
-from mapvote_server.store.policy import Policy
-from mapvote_server.store.publish import publish
 from mapvote_server.store.store import Store
-from stores import WALL, NewStore, send
+from stores import WALL, NewStore
 
-ASKED: list[tuple[str, str, str, Any]] = [
-    ("GET", "/healthz", "", None),
-    ("GET", "/readyz", "", None),
-    ("GET", "/v1/map", "", None),
-    ("GET", "/v1/map/versions", "", None),
-    ("GET", "/v1/map/versions/{number}", "/v1/map/versions/1", None),
-    ("GET", "/v1/changes", "/v1/changes?from=1", None),
-    ("GET", "/v1/changes", "/v1/changes?from=1&lonlat=true", None),
-    ("GET", "/v1/cells", "/v1/cells?x=3.15&y=3.15", None),
-    ("GET", "/v1/coverage", "", None),
-    ("GET", "/v1/coverage", "/v1/coverage?format=geojson", None),
-    ("GET", "/v1/coverage/passes", "", None),
-    ("GET", "/v1/vehicles", "", None),
-    ("GET", "/v1/vehicles", "/v1/vehicles?format=geojson", None),
-    ("GET", "/v1/paths", "", None),
-    ("GET", "/v1/policy", "", None),
-    ("PATCH", "/v1/policy", "", {"values": {"fuse.min_votes": 2}}),
-    ("GET", "/v1/info", "", None),
-    ("GET", "/v1/log", "/v1/log?events=9", None),
-    ("GET", "/v1/check", "", None),
-    ("POST", "/v1/check", "", None),
-    ("PUT", "/v1/tiles/{digest}", "/v1/tiles/PLANE", "PLANE"),
-    ("GET", "/v1/gc", "", None),
-    ("POST", "/v1/gc", "", None),
-    ("GET", "/v1/publish", "", None),
-    ("GET", "/v1/desk", "", None),
-    ("GET", "/v1/desk", "/v1/desk?format=geojson", None),
-    ("POST", "/v1/desk/reviews", "", {"change": "PENDING", "verdict": "held"}),
-    ("GET", "/v1/desk", "", None),
-    ("DELETE", "/v1/desk/reviews/{seq}", "/v1/desk/reviews/SEQ", None),
-    ("POST", "/v1/publish", "", {"dry_run": True}),
-    ("POST", "/v1/rollback", "", {"to": 1}),
-    ("POST", "/v1/replay", "", {"vehicle": "a"}),
-    ("DELETE", "/v1/ballots/{vehicle}/{drive}", "/v1/ballots/a/d2", None),
-    ("DELETE", "/v1/ballots/{vehicle}", "/v1/ballots/b", None),
-    ("PUT", "/v1/ballots/{vehicle}/{drive}", "/v1/ballots/a/d3", "BALLOT"),
-    ("DELETE", "/v1/ballots", "/v1/ballots?everybody=true", None),
-    ("POST", "/v1/keys", "", {"name": "boss", "role": "operator"}),
-    ("GET", "/v1/keys", "", None),
-    ("POST", "/v1/keys/rotate", "", {"name": "boss"}),
-    ("POST", "/v1/keys/revoke", "", {"name": "boss"}),
-]
-"""Method, route, what is asked where that differs, and what is sent."""
 NEVER_HERE = {("DELETE", "/v1/publish")}
 """Nothing is being published in this test; see test_desk.py."""
 
 
-def ballot(store: Store, vehicle: str, drive: str, gone: list[tuple[int, int]], tile: tuple[int, int]) -> Ballot:
-    states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
-    made = make_ballot(store.point_map(), {tile: Say(states)}, vehicle, drive, end_ns=store.clock())
-    driven = [np.array([x + 76.8 * tile[1], 3.0]) for x in (3.0, 6.0, 9.0)]
-    return replace(made, path=pack_path(driven, store.lattice))
-
-
 @pytest.fixture
 def store(new_store: NewStore) -> Store:
-    """A store where one wall went in version 2, and another would go with the next."""
-    store = new_store(two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1)))
-    for number, tile in ((1, (0, 0)), (2, (0, 1))):
-        for vehicle in "ab":
-            send(store, ballot(store, vehicle, f"d{number}", WALL, tile))
-        if number == 1:
-            publish(store)
-    return store
+    return lived_in(new_store(two_walls(), POLICY))
 
 
 def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:

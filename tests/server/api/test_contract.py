@@ -6,15 +6,19 @@ import re
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
+from asked import POLICY, lived_in
+from hand_made import two_walls
 from mapvote_server.api.app import create_app
 from mapvote_server.errors import Unavailable
 from mapvote_server.store.database import Database, _clear_errors
+from mapvote_server.store.keys import issue
 from mapvote_server.store.store import Store
 from stores import NewStore
 
@@ -68,6 +72,78 @@ def test_every_refusal_is_a_problem_of_rfc_9457(client: TestClient, method: str,
     assert (told["type"], told["status"], answer.status_code) == ("about:blank", status, status)
     assert (told["title"], told["instance"]) == (HTTPStatus(status).phrase, path.partition("?")[0])
     assert told["detail"]
+
+
+@pytest.fixture
+def lived(new_store: NewStore) -> Iterator[TestClient]:
+    """A client of a store with something of everything, as an operator."""
+    store = lived_in(new_store(two_walls(), POLICY))
+    for name in ("boss", "office"):
+        key = issue(store, name, "operator")
+    with TestClient(create_app(store), base_url="http://localhost") as client:
+        client.headers["Authorization"] = f"Bearer {key}"
+        yield client
+
+
+def parts_of(client: TestClient, path: str, member: str) -> list[list[Any]]:
+    """The parts of a list, as the links lead from one to the next."""
+    parts = []
+    query: str | None = path
+    while query:
+        answer = client.get(query)
+        assert answer.status_code == 200, answer.text
+        parts.append(answer.json()[member])
+        following = answer.links.get("next", {"url": ""})["url"]
+        query = following and path.partition("?")[0] + following
+    return parts
+
+
+@pytest.mark.parametrize(
+    ("path", "member"),
+    [
+        ("/v1/map/versions?", "versions"),
+        ("/v1/changes?from=1&", "features"),
+        ("/v1/coverage?", "tiles"),
+        ("/v1/coverage?format=geojson&", "features"),
+        ("/v1/vehicles?", "vehicles"),
+        ("/v1/paths?", "features"),
+        ("/v1/coverage/passes?", "features"),
+        ("/v1/desk?format=geojson&", "features"),
+        ("/v1/keys?", "keys"),
+    ],
+)
+def test_the_parts_of_every_list_are_the_list(lived: TestClient, path: str, member: str) -> None:
+    (whole,) = parts_of(lived, path.rstrip("?&"), member)
+    assert whole or "passes" in path
+    parts = parts_of(lived, f"{path}limit=1", member)
+    assert [one for part in parts for one in part] == whole
+    assert all(len(part) <= 1 for part in parts)
+
+
+def test_the_events_of_the_log_come_in_parts_too(lived: TestClient) -> None:
+    whole = lived.get("/v1/log?events=10000").json()["events"]
+    assert [event for part in parts_of(lived, "/v1/log?events=3", "events") for event in part] == whole
+
+
+@pytest.mark.parametrize(
+    ("path", "near", "all_over"),
+    [
+        ("changes?from=1&", 1, 1),
+        ("coverage?format=geojson&", 1, 2),
+        ("paths?", 2, 4),
+        ("desk?format=geojson&", 0, 1),
+    ],
+)
+def test_a_box_leaves_what_meets_it(lived: TestClient, path: str, near: int, all_over: int) -> None:
+    """A wall stands at 3 m of each of two tiles, 76.8 m wide; two vehicles drove by each."""
+    every = lived.get(f"/v1/{path}bbox=-1000,-1000,1000,1000").json()["features"]
+    first = lived.get(f"/v1/{path}bbox=2,2,5,5").json()["features"]
+    assert every == lived.get(f"/v1/{path.rstrip('?&')}").json()["features"]
+    assert (len(first), len(every)) == (near, all_over)
+    assert [one for one in every if one in first] == first
+    assert lived.get(f"/v1/{path}bbox=500,500,501,501").json()["features"] == []
+    assert lived.get(f"/v1/{path}bbox=5,5,2,2").status_code == 422
+    assert lived.get(f"/v1/{path}bbox=1,2,3").status_code == 422
 
 
 def test_an_error_of_the_server_itself_is_a_problem_too(new_store: NewStore) -> None:

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.core.types import F64
+from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import write_whole
 from mapvote.formats.geo.frame import MapFrame, read_crs
+from mapvote.formats.reading import read_whole
 
 _STAC = "1.1.0"
 _EXTENSIONS = [
@@ -53,6 +54,30 @@ def file_of_item(folder: Path, number: int) -> Path:
     """The item's file in the catalogue's folder; its assets lie beside it."""
     name = name_of_item(number)
     return folder / name / f"{name}.json"
+
+
+def items_in(folder: Path) -> list[int]:
+    """Numbers of the versions whose items are in a catalogue's folder, ascending."""
+    numbers = [int(item.stem[1:]) for item in folder.glob("v*/v*.json") if item.stem[1:].isdecimal()]
+    return sorted(number for number in numbers if file_of_item(folder, number).is_file())
+
+
+def map_of_catalog(folder: Path) -> str | None:
+    """The id of the map whose catalogue is in a folder; None without one. MapvoteError if it cannot be read."""
+    file = folder / "catalog.json"
+    if not file.exists():
+        return None
+    try:
+        return str(json.loads(read_whole(file))["id"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise MapvoteError(f"{file}: is no STAC catalogue; name a new folder") from error
+
+
+def is_derived(folder: Path, number: int, parent: int) -> bool:
+    """Whether the item of a version in a catalogue names its ``parent``."""
+    links = json.loads(read_whole(file_of_item(folder, number)))["links"]
+    before = name_of_item(parent)
+    return any(link["rel"] == "derived_from" and link["href"].endswith(f"/{before}.json") for link in links)
 
 
 def stac_item(version: MapVersion) -> dict[str, Any]:
@@ -121,6 +146,6 @@ def write_item(folder: Path, version: MapVersion) -> None:
     write_whole(file_of_item(folder, version.number), json.dumps(stac_item(version), indent=1) + "\n")
 
 
-def write_catalog(folder: Path, map_id: str, numbers: Sequence[int]) -> None:
-    """The catalogue's file: written last, so that it names only items that are there."""
-    write_whole(folder / "catalog.json", json.dumps(stac_catalog(map_id, numbers), indent=1) + "\n")
+def write_catalog(folder: Path, map_id: str) -> None:
+    """The catalogue's file: written last, so that it names every item that is there and no other."""
+    write_whole(folder / "catalog.json", json.dumps(stac_catalog(map_id, items_in(folder)), indent=1) + "\n")
