@@ -140,9 +140,19 @@ def publish(
     )
     tiles = {f.index: f.hashes for f in outcome.fused if f.hashes is not None}
     write_version(store, version, tiles, (f.planes for f in outcome.fused), outcome.fused, doubts=outcome.doubts)
+    _forget(store, fused_round)
     if policy.keep.automatic:
         clear(store, by=by, dry_run=False)
     return replace(outcome, version=version.number, published=True)
+
+
+def _forget(store: Store, published: Round) -> None:
+    """Let go of a round that was published: no later one follows from it, and a city's is large."""
+    latest = _latest.of(store)
+    with latest.deciding:
+        latest.round = None if latest.round is published else latest.round
+    with latest.judging:
+        latest.judged = None
 
 
 def _outcome(
