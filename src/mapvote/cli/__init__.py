@@ -15,7 +15,7 @@ import typer
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # Before numpy is imported: its products here are small, and threads that wait for each other cost twice the CPU
-    # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
+    # time. Work is spread over vehicles and tiles instead. A number that the user sets stays.
     os.environ.setdefault(_threads, "1")
 
 from mapvote.cli import drives, files, lanelets, live, setup  # noqa: E402

@@ -97,7 +97,7 @@ def stages() -> Iterator[Callable[[str, int, int], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    if not sys.stderr.isatty():  # a file or a pipe: a line as each stage begins, so that nobody waits in the dark
+    if not sys.stderr.isatty():  # a file or a pipe: a line as each stage begins
         begun: set[str] = set()
 
         def tell_begin(stage: str, done: int, total: int) -> None:

@@ -51,7 +51,7 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
     for requirement in requirements:
         package = re.match(r"[\w.-]+", requirement)
         extra = re.search(r"extra == ['\"](\w+)['\"]", requirement)
-        if package is None or extra is None or extra[1] in ("all", "dev"):  # which hold what the others hold
+        if package is None or extra is None or extra[1] in ("all", "dev"):  # which hold the packages of the others
             continue
         if re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():
             return f"this needs the package {module}; install it with: pip install 'mapvote[{extra[1]}]'"

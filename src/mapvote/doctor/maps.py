@@ -499,7 +499,7 @@ def ghost_shift(standing: F64) -> tuple[float, float] | None:
     reach = int(COPY_CHECK.farthest_m / COPY_CHECK.cell_m)
     near = _likeness(standing, COPY_CHECK.cell_m, COPY_CHECK.side, reach)
     usual = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    # Only what rises above everything half a metre around it is a copy.
+    # A copy rises above everything half a metre around it.
     ring = np.ones((7, 7), dtype=bool)
     ring[2:5, 2:5] = False
     sharp = near - scipy.ndimage.percentile_filter(near, 90, footprint=ring)

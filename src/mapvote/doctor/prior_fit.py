@@ -127,7 +127,7 @@ def compare(e: DriveEvidence, T: F64) -> tuple[list[Finding], F64]:
     numbers += [time] if time is not None else []
     fits = [_fit(_with_side(reading, runs), T, runs) for reading in READINGS]
     fits += [_fit(_reading_of(number, T, runs, e.road_below), T, runs, special=False) for number in numbers]
-    # What the prior's own errors explain is no reason to read it otherwise.
+    # A deviation that the prior's own errors explain is no reason to read it otherwise.
     likely = [h for h in fits if as_it_is.median > _explained_m(drive, h.reading, h.median, length_m)]
     best = _named_before(min([as_it_is, *likely], key=lambda h: h.median), likely, drive, length_m)
     floor_m = 0.1 + 0.12 * length_m + 2.0 * min(drive.prior_sigma_m, 1.5)

@@ -60,7 +60,7 @@ def decided_by_map(
     T = drive.T_map_lidar_prior
     out = list(findings)
     errors = [f for f in out if f.severity == "error"]
-    # Of several errors each may hide what the others do to the scans.
+    # Each of several errors may hide the effect of the others on the scans.
     if T is None or len(errors) > 1:
         return out, None
     for k, finding in enumerate(out):

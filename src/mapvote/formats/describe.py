@@ -43,7 +43,7 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
             return "ballot", _ballot(decode(data), len(data))
         except MapvoteError as error:
             raise MapvoteError(f"{path}: neither map nor drive, and no ballot: {error}") from error
-    return "", _map(read_map(path))  # raises, and names what is there
+    return "", _map(read_map(path))  # raises, and names the files there
 
 
 def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterator[Cloud]:

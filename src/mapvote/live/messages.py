@@ -80,7 +80,7 @@ def from_cdr(kind: str, data: bytes | memoryview) -> Any:
         return typestore().deserialize_cdr(memoryview(data), kind)
     except MapvoteError:
         raise
-    except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
+    except Exception as error:  # rosbags raises the exceptions of struct, numpy and its own parsers
         raise MapvoteError(
             f"{kind}: a message of {len(data)} bytes is cut off, damaged or no plain CDR ({first_line(error)})"
         ) from error

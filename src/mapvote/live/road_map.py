@@ -241,7 +241,7 @@ class RoadMap:
                 except Refused:
                     if version is self._coming:
                         raise
-                    break  # the server has dropped what this version alone had: the next one is coming
+                    break  # the server has dropped the planes of this version alone: the next one is coming
                 version.tiles.add(tile, self._fetcher.points_of(version.planes[tile]))
         if self._current is not self._coming:
             self._current = self._coming

@@ -57,7 +57,7 @@ class Case:
 def paper_cases(settings: Settings) -> dict[str, Case]:
     """Cases 1 to 5 as ``[paper]`` reads them, named "1".., and under the other rules of sight, named "1 column".. ."""
     cases = {}
-    # Readings of sight that stand beside the one that is set, by what they add to a case's name.
+    # Readings of sight beside the one that is set, by the suffix of a case's name.
     occlusions = {
         "": {},
         " farthest_return": {"line_of_sight": "farthest"},

@@ -94,7 +94,7 @@ def with_things(drive: Drive, things: Sequence[Thing], reference: F64, rule: Pla
                 if len(thing.comes):
                     ends_on[_put_in(points, at, thing, T, drive.sensor.range_sigma_m, rng, rule)] = k
         for k, thing in enumerate(things):
-            met = keep & (ends_on == k)  # and not on what stands before it, whichever was put in first
+            met = keep & (ends_on == k)  # and not on a thing before it, whichever was placed first
             thing.met.append(transform(T, at[met]))
         fields = {name: values[keep] for name, values in scan.fields.items()}
         return replace(scan, points=points[keep], time_s=None, fields=fields)

@@ -254,7 +254,7 @@ def _readings(
 ) -> dict[str, dict[str, dict[str, Scores]]]:
     """Scores by reading, case and truth, from what the scans of the vehicles' drives said."""
     kept = [read_kept(pass_folder(scene, cases, name, True)) for name in scene.drive_names("v")]
-    # The truths that differ in what they ask for: the readings of the paper are scored by each.
+    # The truths that differ: the readings of the paper are scored by each.
     truths = {name: jury.truths[name] for name in ("strict", "provenance", "could be known")}
     return swept(kept, jury.first_map.counts > 0, scene.settings, truths, None if only == "all" else only, progress)
 

@@ -149,7 +149,7 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
     left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
     bodies += [_gone(street, thing, thing.left, still) for thing in left]
     yield dry, bodies
-    rain = in_rain(STREET_RULE.rain_share)  # over what was cast: drops hide the things as they hide the street
+    rain = in_rain(STREET_RULE.rain_share)  # over the cast things too: drops hide them as they hide the street
     yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), bodies
 
 

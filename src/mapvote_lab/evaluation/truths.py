@@ -231,7 +231,7 @@ def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
     kept, added, removed = truth.surfaces()
     changed = np.isin(cells, (Label.CHANGED_OCCUPIED, Label.CHANGED_EMPTY))
     near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), NEIGHBOURS)
-    beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
+    beside = near & ~changed  # standing points of a changed cell were hidden, or lie on the ground
     return kept[truth.grid.value_at(beside, kept)], added, removed
 
 

@@ -105,7 +105,7 @@ def _lanes(scenario: Scenario, terrain: Terrain, own_lane: str, clock: F64, rng:
     """Each lane flows at one speed of its own, so no car hits another; the vehicle's lane keeps a gap for it."""
     tracks = []
     for name, (direction, offset) in LANES.items():
-        factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.25)  # nobody stays alongside for the whole drive
+        factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.25)  # no car stays alongside for the whole drive
         speed = scenario.speed_kmh / 3.6 * (1.0 if name == own_lane else factor)
         entry = 0.0 if direction > 0 else scenario.length_m
         turns = scenario.crossing_m is not None and "outer" in name and name != own_lane

@@ -26,7 +26,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     spawn = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
     with _Pool(workers, mp_context=spawn, initializer=_listen) as pool:
-        heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a new process inherits what is blocked
+        heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a new process inherits the blocked signals
         started = [pool.submit(_nothing) for _ in range(workers)]
         signal.pthread_sigmask(signal.SIG_SETMASK, heard)
         try:

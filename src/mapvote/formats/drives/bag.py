@@ -44,7 +44,7 @@ class Bag:
         try:
             self.reader = reader.AnyReader(files.paths, default_typestore=typestore)
             self.reader.open()
-        except Exception as error:  # rosbags lets through what its storages raise
+        except Exception as error:  # rosbags passes on the exceptions of its storages
             raise MapvoteError(
                 f"{path}: not a readable bag ({first_line(error)}); was the recording stopped properly? Try: "
                 f"{mend_of(path)}"
@@ -58,7 +58,7 @@ class Bag:
         """A serialised message; MapvoteError if it is damaged."""
         try:
             return self.reader.deserialize(data, connection.msgtype)
-        except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
+        except Exception as error:  # rosbags raises the exceptions of struct, numpy and its own parsers
             raise MapvoteError(
                 f"{self.path}: {connection.topic}: a message is damaged ({first_line(error)}); copy the bag again"
             ) from error

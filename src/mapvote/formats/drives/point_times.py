@@ -231,7 +231,7 @@ def read_times(
     reference = values.reference
     steps = values.steps
     sample = values.sample
-    # The median and twice the interquartile range: what they say holds whatever a quarter of the points say.
+    # The median and twice the interquartile range hold for any values of a quarter of the points.
     median = float(np.partition(steps[sample], len(sample) // 2)[len(sample) // 2])
     low, high = np.quantile(steps[sample], (0.25, 0.75))
     spread = 2.0 * float(high - low)
@@ -244,7 +244,7 @@ def read_times(
     if chosen is None:
         return Refusal(f"grows by {turn:.4g} in a revolution, which is a LiDAR's in no unit")
     to_s = UNITS_NS[chosen] * 1e-9
-    # Outliers, by what a scan lasts at most.
+    # Outliers, by the longest duration of a scan.
     reach = JUDGEMENT.reach * max(1.0 / rate_hz / to_s if turn is None else turn, spread)
     good = values.is_number & (np.abs(steps - median) <= reach)
     length_s = float(np.ptp(steps[good])) * to_s

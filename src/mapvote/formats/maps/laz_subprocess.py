@@ -144,7 +144,7 @@ def points_in_chunks(path: str, start: int) -> int | None:
             return None
         point_bytes = sum(struct.unpack_from("<H", record, 36 + 6 * i)[0] for i in range(record[32]))
         if point_bytes != header.point_format.size:
-            return None  # the items are damaged: what would be read as a number of points is none
+            return None  # the items are damaged, so the number of points would be wrong
         stream.seek(start + 8 + sum(n for _, n in chunks[:-1]) + point_bytes)
         return (len(chunks) - 1) * int(size) + int(struct.unpack("<I", stream.read(4))[0])
 

@@ -58,7 +58,7 @@ def is_pcd_tiles(path: Path) -> bool:
     names = [file.stem for file in files_like(path, "*.pcd")]
     if not names or is_recording(path):
         return False
-    if all(re.fullmatch(r"-?\d{1,5}_-?\d{1,5}", name) for name in names):  # X_Y: nobody names scans so
+    if all(re.fullmatch(r"-?\d{1,5}_-?\d{1,5}", name) for name in names):  # X_Y: scans have no such names
         return True
     # By metres of UTM or Gauss-Krueger (412340_5423980), or with a word before them (map_0_0). So may scans be named.
     by_metres = r"(?:[a-z][a-z0-9]*[_-])*-?\d{1,7}(?:\.0+)?[_-]-?\d{1,7}(?:\.0+)?"
@@ -261,7 +261,7 @@ def _bytes_left(file: BinaryIO) -> int:
     """Bytes that follow, zeros that fill a page at most not counted."""
     start = file.tell()
     left = max(0, file.seek(0, os.SEEK_END) - start)
-    page = 4096  # PCL up to 1.7 reserved so much for the header; what that leaves follows the points, as zeros
+    page = 4096  # bytes that PCL up to 1.7 reserved for the header; those left over follow the points, as zeros
     if left > page:
         return left
     file.seek(start)
