@@ -313,7 +313,31 @@ def test_the_rays_lean_as_the_sensor_does(roll_deg: float, pitch_deg: float) -> 
 def test_a_sensor_with_unknown_beams_has_no_view_of_the_sky(sensor: Sensor) -> None:
     answered = directions()[2] < 0.0
     rays = follow_rays(np.ascontiguousarray(20.0 * directions()[0][answered].T, dtype=np.float32), 0.45)
-    assert len(Sky(sensor).rays(UP, FORWARD, rays).reach) == 0
+    assert len(Sky(sensor).rays(UP, FORWARD, rays).reach) == 0, "nothing came from above this scan's returns before"
+
+
+def test_a_sensor_without_rings_fires_into_the_sky_up_to_where_returns_came_from_before() -> None:
+    """A sensor that looks ahead: a wall in the first scan shows its field of view, in the second one there is none."""
+    sensor = replace(SENSOR, rings=False)
+    way, azimuth, elevation = directions(sensor)
+    ahead = np.minimum(azimuth % 360.0, -azimuth % 360.0) < 40.0
+    sky = Sky(sensor)
+
+    def rays_of(answered: Bool, turned_deg: float = 0.0) -> tuple[F32, F32]:
+        a = np.radians(turned_deg)
+        R = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+        returns = np.ascontiguousarray((20.0 * way[ahead & answered] @ R.T).T, dtype=np.float32)
+        seen = sky.rays(UP, R @ FORWARD, follow_rays(returns, 0.45))
+        return azimuths_of(seen), np.asarray(np.degrees(np.arctan(seen.slope * CELL_SIZE)), dtype=np.float32)
+
+    assert len(rays_of(elevation < 6.0)[0]) == 0, "no return shows yet that it fires higher"
+    for turned_deg in (0.0, 90.0):  # the vehicle has turned left
+        azimuths, elevations = rays_of(elevation < 0.0, turned_deg)
+        off = np.abs((azimuths - turned_deg + 180.0) % 360.0 - 180.0)
+        assert len(off) > 100
+        assert off.max() < 42.0
+        assert elevations.min() > 0.0
+        assert elevations.max() < 6.0
 
 
 WINDOW_M = 40.0

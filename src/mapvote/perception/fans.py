@@ -72,8 +72,6 @@ class Fans(NamedTuple):
     """(FANS,) the largest of them in each fan; 0 without rays."""
     direction: F64
     """(FANS, 2) mean direction of all rays, of length 1; 0 without any."""
-    begins: F32
-    """(FANS,) horizontal metres from which each fan marks what it passes."""
 
 
 def follow_rays(rows: F32, clearance: float) -> Rays:
@@ -111,22 +109,19 @@ def _follow(rows: F32, clearance: float, rays: Rays) -> None:
 _HALVED = FULL_RANGE_M * 0.5 ** np.array([(f & -f).bit_length() - 1 if f else 64 for f in range(FANS)])
 _MARKS_FROM = np.where(_HALVED <= CELL_SIZE, 0.0, _HALVED).astype(np.float32)
 """(FANS,) horizontal metres from which each fan marks what it passes."""
+_TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
+"""A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
 
 
-def gather_rays(rays: Rays, *, every_fan: bool = False) -> Fans:
-    """Sort rays into fans. A ray that ends in the sensor's own cell proves nothing.
-
-    Near the sensor some fans suffice, because each has a ray of every ring. ``every_fan``: of a sensor without rings,
-    whose fans hold rays of different elevations, all of them mark from the sensor on.
-    """
+def gather_rays(rays: Rays) -> Fans:
+    """Sort rays into fans. A ray that ends in the sensor's own cell proves nothing."""
     room = len(rays.reach) + FANS
     first = np.zeros(FANS, np.int32)
     last = np.empty(FANS, np.int32)
     slope = np.empty(room, np.float32)
     stop = np.empty(room, np.float32)
     end = np.zeros(FANS, np.float32)
-    begins = np.zeros(FANS, np.float32) if every_fan else _MARKS_FROM
-    fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)), begins)
+    fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
     _gather(rays, fans)
     return fans
 
@@ -135,15 +130,13 @@ def gather_rays(rays: Rays, *, every_fan: bool = False) -> Fans:
 def _gather(rays: Rays, fans: Fans) -> None:
     n = np.uint64(len(rays.reach))
     own = np.float32(CELL_SIZE)
-    # A ray that ends so long before its fan marks comes to no cell that it marks: a cell is 1.42 sides across.
-    across = np.float32(1.5 * CELL_SIZE)
-    first, last, slope, stop, end, direction, begins = fans
+    first, last, slope, stop, end, direction = fans
     for i in range(n):
         fan = np.uint64(rays.fan[i])
         if rays.reach[i] >= own:
             direction[fan, 0] += rays.x[i]
             direction[fan, 1] += rays.y[i]
-            first[fan] += 1 if rays.stop[i] > begins[fan] - across else 0
+            first[fan] += 1 if rays.stop[i] > _TOO_SHORT[fan] else 0
     room = 0
     for f in range(FANS):
         room, first[f], last[f] = room + first[f] + 1, room, room
@@ -154,7 +147,7 @@ def _gather(rays: Rays, fans: Fans) -> None:
     for i in range(n):  # rays that are not kept are overwritten: no branch to predict
         fan = np.uint64(rays.fan[i])
         e = rays.stop[i]
-        keep = (rays.reach[i] >= own) & (e > begins[fan] - across)
+        keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
         k = np.uint64(last[fan])
         slope[k] = rays.slope[i]
         stop[k] = e
@@ -292,11 +285,11 @@ def _mark_passed(
     x = (origin[0] - corner[0]) / CELL_SIZE
     y = (origin[1] - corner[1]) / CELL_SIZE
     for f in range(FANS):
-        if fans.end[f] <= fans.begins[f]:
+        if fans.end[f] <= _MARKS_FROM[f]:
             continue
         dx, dy = fans.direction[f]
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        n = _cross_cells(set_out(x, y, dx, dy, fans.begins[f]), ahead, fans.end[f], base, layer, crossed)
+        n = _cross_cells(set_out(x, y, dx, dy, _MARKS_FROM[f]), ahead, fans.end[f], base, layer, crossed)
         lowest = crossed.bottom[0]
         for j in range(1, n):
             lowest = min(lowest, crossed.bottom[j])

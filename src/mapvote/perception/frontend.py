@@ -28,7 +28,7 @@ from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, PosePrior
 from mapvote.matching.localiser import Localise
 from mapvote.matching.odometry import Fix
 from mapvote.perception.placement import cells_and_obstacles, place_points
-from mapvote.perception.raycast import Fired, ScanView, Sky, cast_rays
+from mapvote.perception.raycast import ScanView, Sky, cast_rays
 
 
 @record()
@@ -211,7 +211,6 @@ class Frontend:
         self._compared = compared
         self._with_sight = with_sight
         self._sky = None if sensor is None else Sky(sensor)
-        self._every_fan = sensor is not None and not sensor.rings
         self._waiting: deque[PlacedScan] = deque()
         self._observed = -1
         self._ended = False
@@ -322,18 +321,11 @@ class Frontend:
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 cell = scan.cell if self._compared is None else None
-                fired = Fired(every_fan=self._every_fan)
+                sky = None
                 if self._sky is not None and scan.by_first:
-                    fired = fired._replace(sky=partial(self._sky.rays, scan.up_map, scan.forward_map))
+                    sky = partial(self._sky.rays, scan.up_map, scan.forward_map)
                 view = cast_rays(
-                    scan.rows,
-                    scan.origin_map,
-                    scan.obstacle,
-                    moving,
-                    reference,
-                    cell,
-                    self._with_sight,
-                    fired,
+                    scan.rows, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight, sky
                 )
             out.append(Observation(scan, moving, view, reference))
         return out

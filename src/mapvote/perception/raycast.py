@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,15 +123,6 @@ def _mark_sight(
                 next_r += width_r
 
 
-class Fired(NamedTuple):
-    """How the sensor of a scan fires."""
-
-    sky: Callable[[Rays], Rays] | None = None
-    """From the rays that returned to those that passed into the sky (:class:`Sky`), which are followed, too."""
-    every_fan: bool = False
-    """Whether no two fans hold the same elevations (:func:`mapvote.perception.fans.gather_rays`)."""
-
-
 def cast_rays(
     rows: F32,
     origin_map: F64,
@@ -141,7 +131,7 @@ def cast_rays(
     reference: Reference,
     cell: I32 | None = None,
     with_sight: bool = True,
-    fired: Fired = Fired(),  # noqa: B008 - a tuple
+    sky: Callable[[Rays], Rays] | None = None,
 ) -> ScanView:
     """One scan's planes over ``reference.grid``, which must hold the sensor.
 
@@ -149,7 +139,7 @@ def cast_rays(
     as :func:`mapvote.perception.placement.place_points` gives them (``cell`` is computed where it is not given). Points
     of ``moving`` objects occlude but do not occupy (docs/method.md); the rays of ground points prove emptiness above
     the ground. Without ``with_sight`` the view has neither sight nor hits: rays are followed to their ends only.
-    ``fired``: what the sensor is known to have done beside its returns.
+    ``sky``: which rays passed into the sky (:class:`Sky`); they are followed, too.
     """
     if cell is None:
         cell, _ = cells_and_obstacles(rows, origin_map, reference)
@@ -161,10 +151,10 @@ def cast_rays(
     sight = np.zeros(requested, dtype=np.uint8)
     base = np.ascontiguousarray(reference.base)
     rays = follow_rays(rows, CLEARANCE_M)
-    fans = gather_rays(rays, every_fan=fired.every_fan)
+    fans = gather_rays(rays)
     mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
-    if fired.sky is not None:
-        mark_passed(gather_rays(fired.sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    if sky is not None:
+        mark_passed(gather_rays(sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
         still = obstacle & ~moving
         enter_hits(rows[2], float(origin_map[2]), cell, still, base.ravel(), counts.ravel(), hit.ravel())
