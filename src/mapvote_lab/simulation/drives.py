@@ -18,7 +18,7 @@ from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool, MapvoteError
 from mapvote.formats.drives.scan_folder import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
-from mapvote_lab.simulation.flaws import Casts, Hits, Kinds, spoil
+from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
 from mapvote_lab.simulation.lidar import Caster, SlicedCaster, Sweep, measure, sweep
 from mapvote_lab.simulation.patterns import MOVING_SLICES, pattern_of, turning
 from mapvote_lab.simulation.processes import Run, mapping
@@ -141,7 +141,7 @@ def _is_in_slices(stage: Stage) -> bool:
     return stage.scenario.motion_distortion and pattern_of(stage.sensor) is not turning
 
 
-def _bodies(stage: Stage, traffic: Traffic, rays: Sweep, stamp_s: float, T_map_lidar: F64) -> Casts:
+def _bodies(stage: Stage, traffic: Traffic, rays: Sweep, stamp_s: float, T_map_lidar: F64) -> Caster | SlicedCaster:
     """What moves, where it is when the rays leave."""
     sensor = stage.sensor
     if not _is_in_slices(stage):

@@ -55,10 +55,6 @@ class Kinds:
     seed: int
 
 
-Casts = Caster | SlicedCaster
-"""What moves is cast in slices of a scan where the sensor does not turn."""
-
-
 @dataclass(frozen=True)
 class Hits:
     """True hits of the rays of one revolution; arrays (rays,)."""
@@ -117,7 +113,7 @@ def swallowed(
 
 
 def reflected(
-    rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Casts], wanted: int, sensor: Sensor,
+    rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Caster | SlicedCaster], wanted: int, sensor: Sensor,
     rng: np.random.Generator,
 ) -> tuple[I64, F32]:  # fmt: skip
     """(indices, ranges) of at most ``wanted`` rays of those that met a ``smooth`` surface (rays,): the range over it.
@@ -186,8 +182,8 @@ def shortened(
 
 
 def spoil(
-    rays: Sweep, hits: Hits, kinds: Kinds, casters: tuple[Caster, Casts], tails: F64, sensor: Sensor, flaws: Flaws,
-    rng: np.random.Generator,
+    rays: Sweep, hits: Hits, kinds: Kinds, casters: tuple[Caster, Caster | SlicedCaster], tails: F64, sensor: Sensor,
+    flaws: Flaws, rng: np.random.Generator,
 ) -> tuple[F32, Bool, Bool]:  # fmt: skip
     """(ranges as reported, false, lost), each (rays,): what becomes of the true ``hits`` of one revolution.
 
