@@ -1,7 +1,7 @@
 """Every scan of a drive through our vehicle, through that of another checkout, and through peers: in turn, on one core.
 
     python benchmarks/judge.py OUT --street street:2 --kitti ../shared/data/kitti/* [--last N]
-        [--source OTHER/src --python OTHER/.venv/bin/python]...
+        [--source OTHER/src --python OTHER/.venv/bin/python]... [--against REV]
 
 Times are CPU time, so that a busy neighbour counts little. Ours is everything that ``Vehicle.observe`` does, moving
 windows and first looks included. A first drive compiles; of the judged one the first WARM_UP scans do not count. Peers
@@ -10,6 +10,10 @@ localises, dufomap finds what moves. They get what favours them: points de-skewe
 outside the clock. Open3D's cloud-to-cloud distances, both ways, find what changed. *whole chain* is the sum of the
 peers. Poses are compared with the truth, each trajectory laid on it as a whole. A KITTI map is made of every second
 scan, and its truth is odometry. Drives and maps are kept in OUT. Each checkout makes its map by its own ``build``.
+
+``--against REV`` fails where our whole scan costs a tenth more than that of a revision, in the mean without the dearest
+twentieth of the scans, which the machine may have stopped. Both have the same peers in the same run, so that the ratio
+of their ratios to a peer is the ratio of the two. The revision has our interpreter and our map.
 """
 
 from __future__ import annotations
@@ -19,9 +23,11 @@ import os
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import argparse
+import io
 import json
 import subprocess
 import sys
+import tarfile
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
@@ -53,8 +59,14 @@ VOXEL_M = 0.2
 """dufomap: at its usual 0.1 m a 32-beam scan hardly ever makes a voxel void."""
 AROUND_M = 40.0
 """Half of the square around the sensor in which clouds are compared, as large as our window."""
+MOST_OF_REV = 1.1
+"""Ratio of our whole scan to that of the revision, from which --against fails."""
+COUNTED = 0.95
+"""Share of the scans, the cheapest, whose mean is compared."""
 Checkout = tuple[Path, Path]
 """A source tree, and the interpreter that has its dependencies."""
+Times = dict[tuple[str, str], F64]
+"""CPU milliseconds of each scan by side and stage."""
 Clock = Callable[[str, Callable[[], Any]], Any]
 """Runs something and adds its CPU time to a stage."""
 
@@ -87,6 +99,26 @@ def name_of(src: Path) -> str:
     command = ["git", "-C", str(src), "rev-parse", "--short=8", "HEAD"]
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     return told.stdout.strip() or src.resolve().parent.name
+
+
+def tree_of(rev: str, out: Path) -> Path:
+    """The source tree of a revision of this repository, in ``out``. MapvoteError if this clone lacks it."""
+    git = ["git", "-C", str(Path(__file__).parents[1])]
+    if subprocess.run([*git, "cat-file", "-e", f"{rev}^{{commit}}"], capture_output=True, check=False).returncode:
+        raise MapvoteError(f"{rev} is not in this clone; git fetch --unshallow brings the history of a shallow one")
+    folder = out / f"at_{rev}"
+    if not folder.exists():
+        packed = subprocess.run([*git, "archive", rev, "src"], capture_output=True, check=True).stdout
+        with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+            archive.extractall(folder, filter="data")
+    return folder / "src"
+
+
+def times_of_rev(ms: Times, rev: str) -> float:
+    """How many times the whole scan of a revision costs ours takes, by the scans that count."""
+    ours, theirs = (np.sort(ms[side, "whole scan"][WARM_UP:]) for side in ("ours", rev))
+    counted = round(COUNTED * len(ours))
+    return float(ours[:counted].mean() / theirs[:counted].mean())
 
 
 def build(checkout: Checkout, surveys: Sequence[str], map_path: Path) -> None:
@@ -183,10 +215,6 @@ def peers_of(map_points: F64, T_true: F64) -> dict[str, Peer]:
     return peers
 
 
-Times = dict[tuple[str, str], F64]
-"""CPU milliseconds of each scan by side and stage."""
-
-
 def judge(
     out: Path, drive: Drive, maps: dict[str, Path], T_true: F64, checkouts: dict[str, Checkout], last: int | None
 ) -> tuple[Times, str]:
@@ -218,7 +246,7 @@ def judge(
             turns[k]()
     chain = [took for (name, _), took in ms.items() if name in peers]
     if chain:
-        ms["peers", "whole chain"] = np.sum(chain, axis=0)
+        ms[" + ".join(peers), "whole chain"] = np.sum(chain, axis=0)
     poses = {name: (out / f"{name}.npy", one.ask(str(out / f"{name}.npy"))) for name, one in watched.items()}
     found = {name: (np.load(path), lost) for name, (path, lost) in poses.items()}
     found |= {name: (np.array(peer.poses), peer.lost) for name, peer in peers.items() if isinstance(peer, Vgicp)}
@@ -261,6 +289,7 @@ def main() -> None:
         "--python", type=Path, action="append", default=[], metavar="OTHER/bin/python",
         help="the interpreter of the source beside which it stands; by default this one",
     )  # fmt: skip
+    parser.add_argument("--against", metavar="REV", help="fail where a scan costs a tenth more than at this revision")
     parser.add_argument("--last", type=int, metavar="N", help="stop each drive after so many scans")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -269,14 +298,24 @@ def main() -> None:
     checkouts = {"ours": (Path(__file__).parents[1] / "src", own)}
     checkouts |= {name_of(src): (src, python) for src, python in zip_longest(options.source, options.python)}
     checkouts = {name: (src, python or own) for name, (src, python) in checkouts.items()}
+    if options.against:
+        checkouts[options.against] = tree_of(options.against, options.out), own
+    dearer = False
     print("| drive | stage | side | CPU ms: median / mean / worst | times ours, means |\n|---|---|---|---|---|")
 
     def judged(name: str, folder: Path, surveys: list[str], poses: Path) -> None:
-        maps = {side: options.out / f"map_{name}_{side}" for side in checkouts}
+        nonlocal dearer
+        maps = {side: options.out / f"map_{name}_{side}" for side in checkouts if side != options.against}
+        maps |= {options.against: maps["ours"]} if options.against else {}
         for side, checkout in checkouts.items():
             build(checkout, surveys, maps[side])
         T_true = read_T_map_lidar(poses, folder)
-        print(judge(options.out, open_drive(folder), maps, T_true, checkouts, options.last)[1], flush=True)
+        ms, table = judge(options.out, open_drive(folder), maps, T_true, checkouts, options.last)
+        print(table, flush=True)
+        if options.against:
+            times = times_of_rev(ms, options.against)
+            dearer |= times > MOST_OF_REV
+            print(f"whole scan: {times:.3f} times that of {options.against}; at most {MOST_OF_REV}", flush=True)
 
     for scene in options.street:
         from mapvote_lab.simulation import simulate
@@ -291,7 +330,11 @@ def main() -> None:
         if not (folder / "poses.txt").is_file():
             raise MapvoteError(f"{folder} has no poses.txt")
         judged(folder.name, folder, [str(folder), "--scans", "::2"], folder / "poses.txt")
+    sys.exit(1 if dearer else 0)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except MapvoteError as error:
+        sys.exit(f"error: {error}")
