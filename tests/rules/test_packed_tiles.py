@@ -16,10 +16,24 @@ from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, MapvoteError
 from mapvote.rules.evidence import CROSSED, HIT, PASSED, PASSES
-from mapvote.rules.packed_tiles import PackedTiles, Shelf, TilePacking
+from mapvote.rules.packed_tiles import COUNT_PLANES, PackedTiles, Shelf, TilePacking, add_one, count_of
 from mapvote.rules.surfaces import SurfaceVoter
 
 LATTICE = Lattice()
+
+
+@pytest.mark.parametrize("full", [CROSSED, HIT, PASSES])
+def test_all_counts_of_a_cell_are_halved_when_any_one_counter_is_full(full: int) -> None:
+    """Voxel 5: one counter at its largest number, the others at 2; then one more scan for each of the three."""
+    cell = np.zeros(PASSED + 1, dtype=np.uint64)
+    bit = np.uint64(5)
+    for first in (CROSSED, HIT, PASSES):
+        for k in range(COUNT_PLANES):
+            if first == full or k == 1:
+                cell[first + k] = np.uint64(1) << bit
+    add_one(cell, (np.uint64(1) << bit,) * 3)
+    counts = {first: count_of(cell, first, int(bit)) for first in (CROSSED, HIT, PASSES)}
+    assert counts == {first: 2 ** (COUNT_PLANES - 1) if first == full else 1 for first in counts}
 
 
 def some_planes(seed: int, share: float) -> U64:
