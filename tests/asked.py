@@ -16,6 +16,12 @@ from mapvote_server.store.publish import publish
 from mapvote_server.store.store import Store
 from stores import WALL, send
 
+LANELETS = """<osm>
+<node id='1' lat='0' lon='0'><tag k='local_x' v='3'/><tag k='local_y' v='3'/></node>
+<node id='2' lat='0' lon='0'><tag k='local_x' v='4'/><tag k='local_y' v='3'/></node>
+<way id='9'><nd ref='1'/><nd ref='2'/><tag k='type' v='stop_line'/></way>
+</osm>"""
+"""A stop line at the first wall of :func:`hand_made.two_walls`."""
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1))
 ASKED: list[tuple[str, str, str, Any]] = [
     ("GET", "/healthz", "", None),
@@ -25,6 +31,7 @@ ASKED: list[tuple[str, str, str, Any]] = [
     ("GET", "/v1/map/versions/{number}", "/v1/map/versions/1", None),
     ("GET", "/v1/changes", "/v1/changes?from=1", None),
     ("GET", "/v1/changes", "/v1/changes?from=1&lonlat=true", None),
+    ("POST", "/v1/changes/lanelets", "/v1/changes/lanelets?from=1", "LANELETS"),
     ("GET", "/v1/cells", "/v1/cells?x=3.15&y=3.15", None),
     ("GET", "/v1/coverage", "", None),
     ("GET", "/v1/coverage", "/v1/coverage?format=geojson", None),

@@ -87,7 +87,12 @@ class LaneletsAsked(Between):
     operation_id="list_affected_lanelets",
     response_model=Places,
     responses=problems(404, 413),
-    openapi_extra={"requestBody": {"required": True, "content": {"application/xml": {"schema": {"type": "string"}}}}},
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/xml": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
     summary="Parts of a lanelet2 map near changes",
 )
 async def lanelets(request: Request, parts: Parts, names: Known, choice: Annotated[LaneletsAsked, Query()]) -> Response:

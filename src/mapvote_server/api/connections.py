@@ -453,6 +453,30 @@ def watched(inner: type[asyncio.Protocol], patience: Patience, know: Know) -> ty
     return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd, line, know))
 
 
+class _Ending:
+    """Where an answer ends: with its last message, or with the last byte of its Content-Length. A client that has that
+    byte may send its next request before an empty last message is sent, which then looked like pipelining."""
+
+    def __init__(self) -> None:
+        self._left: int | None = None
+        """Bytes of a declared length that are still to come."""
+        self.is_over = False
+
+    def told(self, message: Message) -> Message:
+        """The message, as the last one if it is."""
+        if message["type"] == "http.response.start":
+            lengths = [int(value) for name, value in message.get("headers", ()) if name.lower() == b"content-length"]
+            self._left = lengths[0] if lengths else None
+        elif message["type"] == "http.response.body":
+            more = message.get("more_body", False)
+            if self._left is not None and more:
+                self._left -= len(message.get("body", b""))
+                more = self._left > 0
+                message = {**message, "more_body": more}
+            self.is_over = not more
+        return message
+
+
 def tracked(app: ASGIApp) -> ASGIApp:
     """``app`` that reports to the connection when a request begins, when its body is complete, and when it ends."""
 
@@ -468,11 +492,16 @@ def tracked(app: ASGIApp) -> ASGIApp:
                 connection.end_body()
             return message
 
+        ending = _Ending()
+
         async def sent(message: Message) -> None:
+            if ending.is_over:
+                return
             if message["type"] == "http.response.start" and connection.is_last():
                 message = {**message, "headers": [*message.get("headers", ()), (b"connection", b"close")]}
+            message = ending.told(message)
             await send(message)
-            if message["type"] == "http.response.body" and not message.get("more_body", False):
+            if ending.is_over:
                 connection.end_request()
 
         sized = {name: value for name, value in scope["headers"] if name in (b"content-length", b"transfer-encoding")}

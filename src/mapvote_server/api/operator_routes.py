@@ -21,6 +21,7 @@ from mapvote_server.api.lanes import on
 from mapvote_server.api.paging import BoxAsked, PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
+    AS_BYTES,
     AS_CSV,
     MOST_SEQ,
     Digest,
@@ -385,6 +386,7 @@ class Restored:
     operation_id="restore_plane",
     responses=problems(403, 404, 413, 429),
     summary="Put a damaged plane back",
+    openapi_extra={"requestBody": {"required": True, "content": AS_BYTES[200]["content"]}},
 )
 async def restore(by: Operator, parts: Parts, request: Request, digest: Digest) -> Restored:
     """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""

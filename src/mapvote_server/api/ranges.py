@@ -67,4 +67,6 @@ def _pieces(file: BinaryIO, sent: range) -> Iterator[bytes]:
         while left:
             piece = file.read(min(left, 1 << 18))
             left -= len(piece)
+            if not left:  # nobody asks for more once the last byte is sent
+                file.close()
             yield piece

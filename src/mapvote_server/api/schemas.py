@@ -148,7 +148,9 @@ ManifestAnswer = _answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[v
 
 AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
 AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
-AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+AS_BYTES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
+}
 
 
 def sends_bytes(*codes: int) -> dict[str, Any]:

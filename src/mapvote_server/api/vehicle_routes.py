@@ -21,6 +21,7 @@ from mapvote_server.api.lanes import on
 from mapvote_server.api.paging import PartAsked
 from mapvote_server.api.problems import problems
 from mapvote_server.api.schemas import (
+    AS_BYTES,
     AS_CSV,
     AS_YOU_HAVE,
     Digest,
@@ -95,7 +96,7 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
 @router.get(
     "/v1/tiles/{digest}",
     operation_id="get_plane",
-    responses=problems(404) | AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
+    responses=problems(404) | AS_YOU_HAVE | AS_BYTES,
     response_class=Response,
     summary="One plane of a tile",
 )
@@ -164,9 +165,6 @@ async def _manifest(request: Request, number: int | None, since: int | None) -> 
     return Response(made.content, media_type="application/json", headers=headers)
 
 
-_BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
-
-
 class BallotRoute(APIRoute):
     """The route that takes ballots: declared to FastAPI for OpenAPI, but handled without it.
 
@@ -224,6 +222,6 @@ router.add_api_route(
     response_model=Receipt,
     responses=problems(403, 409, 413, 429) | {201: {"model": Receipt}},
     operation_id="put_ballot",
-    openapi_extra={"requestBody": {"required": True, "content": _BYTES}},
+    openapi_extra={"requestBody": {"required": True, "content": AS_BYTES[200]["content"]}},
     summary="Vote",
 )

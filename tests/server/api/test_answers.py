@@ -9,7 +9,7 @@ from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 from pydantic import TypeAdapter
 
-from asked import ASKED, POLICY, ballot, lived_in
+from asked import ASKED, LANELETS, POLICY, ballot, lived_in
 from hand_made import two_walls
 from mapvote.codec.ballot import encode
 from mapvote_server.api.app import ROUTES, create_app
@@ -42,6 +42,8 @@ def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:
             url = (asked or path).replace("SEQ", kept.get("seq", "")).replace("PLANE", plane)
             if sent == "BALLOT":
                 answer = client.put(url, content=encode(ballot(store, "a", "d3", WALL, (0, 1))))
+            elif sent == "LANELETS":
+                answer = client.post(url, content=LANELETS)
             elif sent == "PLANE":
                 answer = client.put(url, content=client.get(url).content)
             else:

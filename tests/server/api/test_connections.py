@@ -16,7 +16,7 @@ import pytest
 
 from hand_made import make_map, make_tile
 from live_server import serving_here
-from mapvote_server.api.connections import CROWDING, Caller, Connection, Line
+from mapvote_server.api.connections import CROWDING, Caller, Connection, Line, _Ending
 from mapvote_server.api.security import caller_of
 from mapvote_server.store import keys
 from mapvote_server.store.store import Store
@@ -76,6 +76,19 @@ def until_cut(connection: socket.socket, every_s: float = PATIENT_S, piece: byte
         except ConnectionError:
             return said
     raise AssertionError("the server waits for ever")
+
+
+@pytest.mark.parametrize("length", [4, None])
+def test_an_answer_ends_with_the_last_byte_of_its_length(length: int | None) -> None:
+    """A client that had it sent its next request before the empty last message, and was cut off for pipelining."""
+    ending = _Ending()
+    headers = [] if length is None else [(b"Content-Length", b"%d" % length)]
+    ending.told({"type": "http.response.start", "status": 200, "headers": headers})
+    sent = [ending.told({"type": "http.response.body", "body": piece, "more_body": True}) for piece in (b"ab", b"cd")]
+    assert [message["more_body"] for message in sent] == [True, length is None]
+    assert ending.is_over == (length is not None)
+    ending.told({"type": "http.response.body", "body": b"", "more_body": False})
+    assert ending.is_over
 
 
 def test_a_connection_that_says_nothing_is_cut(line: socket.socket) -> None:
