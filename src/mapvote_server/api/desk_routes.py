@@ -10,7 +10,6 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
 from mapvote.core.answers import answer
-from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import feature_rows
 from mapvote_server.api.lanes import on
 from mapvote_server.api.page_routes import packed
@@ -57,13 +56,13 @@ async def whole_desk(
     the reasons to hold the version; the hashes of the tiles that a publish would make (null: without points), which
     `/v1/clouds` serves meanwhile.
 
-    ``geojson`` and ``csv`` hold all of them in one list, of which ``limit`` and ``offset`` name a part.
+    ``geojson`` and ``csv`` hold all of them in one list. ``limit`` and ``offset`` name a part of that list, or of the
+    pending changes in ``json``.
     """
     shown = (await _look(parts)).answer.within(box)
     if format == "json":
-        if part.limit is not None or part.offset:
-            raise MapvoteError("the desk as json is three lists: give format=geojson or csv with limit and offset")
-        return as_json(shown)
+        pending = replace(shown.pending, features=part.of(shown.pending.features))
+        return part.link(request, as_json(replace(shown, pending=pending)), len(shown.pending.features))
     listed = shown.in_one()
     features = part.of(listed.features)
     answer = as_table(list(map(_flat, feature_rows(features)))) if format == "csv" else None

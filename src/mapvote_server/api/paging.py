@@ -9,7 +9,6 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
 
-from mapvote.core.types import MapvoteError
 from mapvote.shapes.geojson import Bounds
 
 BoxQuery = Annotated[
@@ -17,7 +16,7 @@ BoxQuery = Annotated[
     Query(
         alias="bbox",
         pattern=r"^-?[0-9]{1,9}(\.[0-9]{1,9})?(,-?[0-9]{1,9}(\.[0-9]{1,9})?){3}$",
-        description="x0,y0,x1,y1 in map metres: only what meets this box",
+        description="two opposite corners x0,y0,x1,y1 in map metres: only what meets this box",
     ),
 ]
 
@@ -61,13 +60,11 @@ async def _box(bbox: BoxQuery = None) -> Bounds | None:
 
 
 def box_in(text: str | None) -> Bounds | None:
-    """The box of a query, None without one; MapvoteError if its corners are the wrong way round."""
+    """The box of a query, whichever two opposite corners it names; None without one."""
     if text is None:
         return None
     x0, y0, x1, y1 = map(float, text.split(","))
-    if x0 > x1 or y0 > y1:
-        raise MapvoteError(f"bbox: {text} has its upper right corner first: give the lower left one first")
-    return x0, y0, x1, y1
+    return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
 
 
 PartAsked = Annotated[Part, Depends(_part)]

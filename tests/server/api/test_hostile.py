@@ -240,7 +240,7 @@ def test_an_operators_slip_is_422(site: Site, path: str, body: dict[str, Any]) -
 ENDS_KEYS = ["--exclude-path-regex", "/v1/keys/.+"]
 DEPENDS = """
 [[operations]]
-include-path-regex = "/v1/(ballots/.*|tiles/.*|policy|desk/reviews)"
+include-path-regex = "/v1/(ballots/.*|tiles/.*|policy|desk/reviews|changes/lanelets)"
 checks.positive_data_acceptance.expected-statuses = ["2xx", "3xx", "401", "403", "404", "409", "422", "429", "5xx"]
 """
 """Bodies of bytes, and values that the policy or the desk know: a schema cannot say which of them are possible."""
