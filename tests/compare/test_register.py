@@ -78,5 +78,5 @@ def test_a_group_of_patches_that_a_line_divides_from_the_others_is_named_by_the_
 def test_two_planes_of_ground_cannot_be_registered() -> None:
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-30, 30, (20_000, 2)), rng.normal(0, 0.01, 20_000)])
-    with pytest.raises(MapvoteError, match="nothing stands"):
+    with pytest.raises(MapvoteError, match="holds nothing but ground"):
         register_maps(map_from_points(ground), map_from_points(ground))

@@ -28,7 +28,7 @@ class Rule:
     min_votes: int | None = None
     """Vehicles that a change needs unless the settings say otherwise; None: ``fuse.min_votes``."""
     needs_sight: bool = False
-    """The voter asks how far every scan could see each cell (perception/raycast.py)."""
+    """The voter asks for the hits of each scan, and how far it could see each cell (perception/raycast.py)."""
     takes_points_beyond: bool = True
     """New points are also taken outside the local grid; the voter then requires more of a new voxel than one hit."""
     takes_clouds: bool = False

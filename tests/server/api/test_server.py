@@ -257,4 +257,4 @@ def test_a_plane_comes_compressed_or_not(client: httpx2.Client) -> None:
 
 def test_what_is_refused_is_the_same_answer_as_over_http(client: httpx2.Client) -> None:
     answer = client.post("/v1/rollback", json={"to": 7})
-    assert (answer.status_code, list(answer.json())) == (404, ["detail"])
+    assert (answer.status_code, list(answer.json())) == (404, ["type", "title", "status", "detail", "instance"])
