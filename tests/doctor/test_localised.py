@@ -38,6 +38,18 @@ def _moved(T: F64, by: F64) -> F64:
     return T
 
 
+def _scattered(sigma_m: float) -> LocalisedDrive:
+    drive = _drive()
+    off = np.random.default_rng(2).normal(0, sigma_m, (N, 3)) * [1.0, 1.0, 0.0]
+    return replace(drive, T_map_lidar=_moved(drive.T_map_lidar.copy(), off))
+
+
+def _jittered(sigma_s: float) -> LocalisedDrive:
+    drive = _drive()
+    off_ns = np.random.default_rng(3).normal(0, sigma_s * 1e9, N).clip(-45e6, 45e6).astype(np.int64)
+    return replace(drive, stamps_ns=drive.stamps_ns + off_ns)
+
+
 SOUND = {
     "a bend": _drive(),
     "a U-turn": _drive(bend=np.pi / N),
@@ -46,6 +58,7 @@ SOUND = {
     "walking pace": _drive(step_m=0.05),
     "a prior 8 m beside": _prior(lambda T: _moved(T, np.array([6.0, -5.0, 3.0]))),
     "a prior that drifts by its sigma": _prior(lambda T: _moved(T, np.linspace(0, 2.0, N)[:, None] * [1.0, 0.5, 0.0])),
+    "places 0.1 m off": _scattered(0.1),
     "no prior": replace(_drive(), T_prior=None),
     "a third of the scans lost": replace(_drive(), sure=np.arange(N) % 3 > 0),
     "short": replace(_drive(), stamps_ns=np.arange(5) * 10**8, sure=np.zeros(5, dtype=np.bool_)),
@@ -74,6 +87,7 @@ def _swapped() -> LocalisedDrive:
     [
         (replace(_drive(), sure=np.arange(N) % 3 == 0), "could be localised"),
         (_leaping(), "the localised path leaps"),
+        (_jittered(0.04), "of the steps of the localised path need an acceleration"),
         (_swapped(), "the localised path leaps once before scan 30"),
         (_prior(lambda T: T[np.random.default_rng(1).permutation(N)]), "prior differ in length"),
         (_prior(lambda T: T @ from_xyz_rpy(0, 0, 0, yaw=np.pi / 2)), "attitude differs by 90 deg"),

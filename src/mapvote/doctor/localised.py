@@ -34,6 +34,12 @@ class LocalisedRules:
     """Greatest speed between two localised scans, metres per second; a faster step is a leap."""
     leap_m: float = 5.0
     """Steps up to this length are no leap, metres: a correction of the track moves it by less."""
+    brakes_mps2: float = 8.0
+    """Largest acceleration of a vehicle, metres per second squared."""
+    velocity_mps: float = 4.0
+    """Change of the velocity between two steps that poses 0.1 m off may feign at 10 Hz, metres per second."""
+    jerky_share: float = 0.25
+    """Greatest share of steps between which the velocity changes by more than both."""
     way_m: float = 10.0
     """Least length of the stretches whose lengths are compared with the prior, metres."""
     way_share: float = 0.25
@@ -122,6 +128,7 @@ def check_localised(
     if len(sure_scans) < rules.least_scans:
         return
     yield from _leaps(drive, sure_scans, rules)
+    yield from _jerks(drive, sure_scans, rules)
     if drive.T_prior is not None:
         sure_scans = sure_scans[np.isfinite(drive.T_prior[sure_scans]).all(axis=(1, 2))]
         if len(sure_scans) < rules.least_scans:
@@ -170,6 +177,18 @@ def _leaps(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Ite
         times = "once" if leaps.sum() == 1 else f"{int(leaps.sum())} times, most"
         problem = f"the localised path leaps {times} before scan {sure_scans[worst + 1]} "
         yield Finding("error", f"{problem}({step_m[worst]:.1f} m in {step_s[worst]:.2f} s)", _PLACE_MEND)
+
+
+def _jerks(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
+    """Changes of the velocity, by the places found and the stamps, that no vehicle can make."""
+    step_s = np.diff(drive.stamps_ns[sure_scans])[:, None] * 1e-9
+    velocity_mps = np.diff(drive.T_map_lidar[sure_scans, :3, 3], axis=0) / step_s
+    change_mps = np.linalg.norm(np.diff(velocity_mps, axis=0), axis=1)
+    possible_mps = rules.velocity_mps + rules.brakes_mps2 * 0.5 * (step_s[1:, 0] + step_s[:-1, 0])
+    share = float((change_mps > possible_mps).mean())
+    if share > rules.jerky_share:
+        problem = f"{share:.0%} of the steps of the localised path need an acceleration that no vehicle has"
+        yield Finding("error", problem, "are the stamps of the scans right, and the scans in order?")
 
 
 def _ways(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
