@@ -23,11 +23,9 @@ import os
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import argparse
-import io
 import json
 import subprocess
 import sys
-import tarfile
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
@@ -109,8 +107,8 @@ def tree_of(rev: str, out: Path) -> Path:
     folder = out / f"at_{rev}"
     if not folder.exists():
         packed = subprocess.run([*git, "archive", rev, "src"], capture_output=True, check=True).stdout
-        with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
-            archive.extractall(folder, filter="data")
+        folder.mkdir(parents=True)
+        subprocess.run(["tar", "-x", "-C", str(folder)], input=packed, check=True)
     return folder / "src"
 
 

@@ -46,7 +46,9 @@ def what_of(folder: Path, names: tuple[str, ...]) -> list[str]:
     options = {"topic": ",".join(f"/{name}" for name in names), "prior": "/odom", "sensor": "hdl32e"}
     found = diagnose(folder, options).findings
     return [
-        f"{f.what} -> {f.mend}" for f in found if f.what in serious([f]) and ("swapped" in f.what or "sits" in f.what)
+        f"{f.what} -> {f.mend}"
+        for f in found
+        if f.what in serious([f]) and ("swapped" in f.what or "its stated place" in f.what)
     ]
 
 
@@ -76,7 +78,7 @@ def test_a_lidar_off_its_stated_place_is_measured_and_the_line_that_is_advised_m
     off = PLACES["left"] @ from_xyz_rpy(0.3, 0.1, 0.0, yaw=0.05)
     what = told(sound, tmp_path / "b", names, {**PLACES, "left": off})
     (warning,) = [one for one in what if "off its stated place" in one]
-    assert "/left sits 0.3" in warning
+    assert "the points of /left show it 0.3" in warning
     line = warning.split("write into drive.toml: ")[1].split("; or leave")[0]
     (tmp_path / "b" / "drive.toml").write_text(line)
     assert what_of(tmp_path / "b", names) == []

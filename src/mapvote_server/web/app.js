@@ -55,12 +55,12 @@ async function start() {
 state.restart = () => start();
 
 // The first look goes to what changed: what waits at the desk, else what the list holds. A link says itself where to look.
-let opened = false;
+// It is read before the view writes its own place into the address.
+const linked = address.read();
+let opened = ["eye", "change", "cell", "pending"].some((name) => linked[name]);
 function openOnChanges(pending) {
-  const asked = address.read();
-  const marked = opened || ["eye", "change", "cell", "pending"].some((name) => asked[name]);
+  if (opened) return;
   opened = true;
-  if (marked) return;
   if (pending.length) return choose(pending[0], true);
   const large = state.features.filter((f) => f.properties.size !== "small");
   const boxes = (large.length ? large : state.features).map((f) => drawable(f).box);
