@@ -21,14 +21,12 @@ from fastapi.testclient import TestClient
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from asked import ASKED, LANELETS, POLICY, ballot, lived_in
+from asked import POLICY, answered, lived_in
 from contract import CHANGELOG, STORED, changed, stored, unnamed
 from hand_made import two_walls
-from mapvote.codec.ballot import encode
 from mapvote_server.api import openapi
 from mapvote_server.api.app import create_app
 from mapvote_server.store.store import Store
-from stores import WALL
 
 EXAMPLES = Path(openapi.__file__).with_name("examples.json")
 
@@ -61,30 +59,15 @@ def recorded(store: Store) -> dict[str, Any]:
     }
     requests: dict[str, Any] = {}
     answers: dict[str, Any] = {}
-    kept: dict[str, str] = {}
     with TestClient(app, base_url="http://localhost") as client:
-        for method, path, url, sent in ASKED:
-            address = (url or path).replace("SEQ", kept.get("seq", "")).replace("PLANE", hashes.points)
+        for method, path, _, body, answer in answered(client, store):
             name = names[method, path]
-            if sent == "BALLOT":
-                answer = client.put(address, content=encode(ballot(store, "a", "d3", WALL, (0, 1))))
-            elif sent == "LANELETS":
-                answer = client.post(address, content=LANELETS)
-            elif sent == "PLANE":
-                answer = client.put(address, content=client.get(address).content)
-            else:
-                body = {k: kept["pending"] if v == "PENDING" else v for k, v in sent.items()} if sent else None
-                answer = client.request(method, address, json=body)
-                if body is not None:
-                    requests[name] = body
-            found = answer.json()
-            kept |= {"seq": str(found["seq"])} if "seq" in found else {}
-            if name == "get_desk" and "waiting" in found:
-                kept["pending"] = [*found["pending"]["features"], *found["reviewed"]][0]["id"]
-            if "key" in found:
-                client.headers["Authorization"] = f"Bearer {found['key']}"
-                found["key"] = "shown this once"
-            answers.setdefault(name, shortened(found))
+            if body is not None:
+                requests[name] = body
+            content = answer.json()
+            if "key" in content:
+                content["key"] = "shown this once"
+            answers.setdefault(name, shortened(content))
     parameters = {"vehicle": "a", "drive": "d1", "number": 1, "same": 1, "since": 1, "from": 1, "to": 2, "version": 1}
     places = {"x": 3.15, "y": 3.15, "row": 0, "col": 0, "bbox": "0,0,76.8,76.8"}
     planes = {"digest": hashes.points, "points": hashes.points, "ground": hashes.ground, "level": 0}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+import httpx2
 import numpy as np
+from fastapi.testclient import TestClient
 from msgspec.structs import replace
 
 from hand_made import Say, make_ballot, states_plane
-from mapvote.codec.ballot import Ballot, pack_path
+from mapvote.codec.ballot import Ballot, encode, pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote_server.store.policy import Policy
@@ -85,3 +88,41 @@ def lived_in(store: Store) -> Store:
         if number == 1:
             publish(store)
     return store
+
+
+class Answered(NamedTuple):
+    """One request of :data:`ASKED`, and its answer."""
+
+    method: str
+    path: str
+    """The route."""
+    url: str
+    body: dict[str, Any] | None
+    """JSON that was sent."""
+    answer: httpx2.Response
+
+
+def answered(client: TestClient, store: Store) -> Iterator[Answered]:
+    """Every request of :data:`ASKED` to an open server of :func:`lived_in`, in turn; the first key closes it."""
+    kept: dict[str, str] = {}
+    plane = store.tiles()[0, 0].points
+    for method, path, asked, sent in ASKED:
+        url = (asked or path).replace("SEQ", kept.get("seq", "")).replace("PLANE", plane)
+        body = None
+        if sent == "BALLOT":
+            answer = client.put(url, content=encode(ballot(store, "a", "d3", WALL, (0, 1))))
+        elif sent == "LANELETS":
+            answer = client.post(url, content=LANELETS)
+        elif sent == "PLANE":
+            answer = client.put(url, content=client.get(url).content)
+        else:
+            body = {k: kept["pending"] if v == "PENDING" else v for k, v in sent.items()} if sent else None
+            answer = client.request(method, url, json=body)
+        yield Answered(method, path, url, body, answer)
+        content = answer.json()
+        if "seq" in content:
+            kept["seq"] = str(content["seq"])
+        if "key" in content:
+            client.headers["Authorization"] = f"Bearer {content['key']}"
+        if path == "/v1/desk" and not asked:
+            kept["pending"] = [*content["pending"]["features"], *content["reviewed"]][0]["id"]

@@ -9,14 +9,13 @@ from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 from pydantic import TypeAdapter
 
-from asked import ASKED, LANELETS, POLICY, ballot, lived_in
+from asked import ASKED, POLICY, answered, lived_in
 from hand_made import two_walls
-from mapvote.codec.ballot import encode
 from mapvote_server.api.app import ROUTES, create_app
 from mapvote_server.api.schemas import Answer
 from mapvote_server.api.security import PROBES
 from mapvote_server.store.store import Store
-from stores import WALL, NewStore
+from stores import NewStore
 
 NEVER_HERE = {("DELETE", "/v1/publish")}
 """Nothing is being published in this test; see test_desk.py."""
@@ -35,30 +34,12 @@ def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:
     assert {(method, path) for method, path, _, _ in ASKED} | NEVER_HERE == typed.keys()
     models_of = [m for model in typed.values() for m in getattr(model, "__args__", [model])]
     assert all(issubclass(m, Answer) or is_dataclass(m) for m in models_of)
-    kept: dict[str, str] = {}
-    plane = store.tiles()[0, 0].points
     with TestClient(app, base_url="http://localhost") as client:
-        for method, path, asked, sent in ASKED:
-            url = (asked or path).replace("SEQ", kept.get("seq", "")).replace("PLANE", plane)
-            if sent == "BALLOT":
-                answer = client.put(url, content=encode(ballot(store, "a", "d3", WALL, (0, 1))))
-            elif sent == "LANELETS":
-                answer = client.post(url, content=LANELETS)
-            elif sent == "PLANE":
-                answer = client.put(url, content=client.get(url).content)
-            else:
-                body = {k: kept["pending"] if v == "PENDING" else v for k, v in sent.items()} if sent else None
-                answer = client.request(method, url, json=body)
+        for method, path, url, _, answer in answered(client, store):
             assert answer.status_code in (200, 201), (method, url, answer.text)
             found, model = answer.json(), TypeAdapter(models[method, path])
             taken = model.validate_json(answer.content)
             assert not is_dataclass(taken) or model.dump_python(taken, mode="json") == found, "no other members"
-            kept |= {"seq": str(found["seq"])} if "seq" in found else {}
-            if "key" in found:  # the first key closes an open server
-                client.headers["Authorization"] = f"Bearer {found['key']}"
-            if path == "/v1/desk" and not asked:
-                features = [*found["pending"]["features"], *found["reviewed"]]
-                kept["pending"] = features[0]["id"]
     assert PROBES[1] in {path for _, path in typed}
 
 
