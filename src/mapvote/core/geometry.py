@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F64, read_only
+from mapvote.core.types import F64, I64, read_only
 
 
 def transform(T_a_b: F64, points_b: NDArray[np.floating]) -> F64:
@@ -327,3 +327,11 @@ def turn(x: np.float32, y: np.float32) -> np.float32:
     a = np.float32(0.25) - a if ay > ax else a
     a = np.float32(0.5) - a if x < np.float32(0.0) else a
     return np.float32(1.0) - a if y < np.float32(0.0) else a
+
+
+def velocity_changes(places_m: F64, stamps_ns: I64) -> tuple[F64, F64]:
+    """((m - 2,) changes of the velocity between consecutive steps, metres per second; (m - 2,) seconds in which each
+    happens) of places (m, 3) at stamps (m,)."""
+    seconds = np.diff(stamps_ns) * 1e-9
+    velocity_mps = np.diff(places_m, axis=0) / seconds[:, None]
+    return np.linalg.norm(np.diff(velocity_mps, axis=0), axis=1), 0.5 * (seconds[1:] + seconds[:-1])

@@ -14,7 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
-from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
+from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform, velocity_changes
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration, Scan
 from mapvote.doctor import Finding, Progress
@@ -510,8 +510,6 @@ def _check_motion(runs: Sequence[Run], drive: Drive) -> Iterator[Finding]:
 
 def _agree_with_time(run: Run, stamps_ns: I64) -> Bool:
     """(m - 2,) whether the steps of a run follow each other as a vehicle can: no leap of its speed."""
-    seconds = np.diff(stamps_ns[run.indices]) * 1e-9
-    velocity = np.diff(run.T_first_lidar[:, :3, 3], axis=0) / seconds[:, None]
-    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    out: Bool = change < 1.0 + RUN_RULE.brakes_mps2 * 0.5 * (seconds[1:] + seconds[:-1])
+    change_mps, seconds = velocity_changes(run.T_first_lidar[:, :3, 3], stamps_ns[run.indices])
+    out: Bool = change_mps < 1.0 + RUN_RULE.brakes_mps2 * seconds
     return out

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from mapvote.codec.ballot import Ballot
+from mapvote.core.geometry import velocity_changes
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
@@ -181,11 +182,8 @@ def _leaps(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Ite
 
 def _jerks(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     """Changes of the velocity, by the places found and the stamps, that no vehicle can make."""
-    step_s = np.diff(drive.stamps_ns[sure_scans])[:, None] * 1e-9
-    velocity_mps = np.diff(drive.T_map_lidar[sure_scans, :3, 3], axis=0) / step_s
-    change_mps = np.linalg.norm(np.diff(velocity_mps, axis=0), axis=1)
-    possible_mps = rules.velocity_mps + rules.brakes_mps2 * 0.5 * (step_s[1:, 0] + step_s[:-1, 0])
-    share = float((change_mps > possible_mps).mean())
+    change_mps, seconds = velocity_changes(drive.T_map_lidar[sure_scans, :3, 3], drive.stamps_ns[sure_scans])
+    share = float((change_mps > rules.velocity_mps + rules.brakes_mps2 * seconds).mean())
     if share > rules.jerky_share:
         problem = f"{share:.0%} of the steps of the localised path need an acceleration that no vehicle has"
         yield Finding("error", problem, "are the stamps of the scans right, and the scans in order?")
