@@ -17,7 +17,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 
-from mapvote.cli.live import _maps, _outbox
+from mapvote.cli.live import maps_around, outbox_to
 from mapvote.config import load_settings
 from mapvote.core.types import MapvoteError
 from mapvote.formats.drives.options import read_mount, read_sensor
@@ -112,8 +112,8 @@ class MapvoteVehicle(LifecycleNode):
         with ExitStack() as stack:
             network = RosNetwork(self)
             stack.callback(network.close)
-            maps = stack.enter_context(_maps(given["map"], key_file))
-            outbox = stack.enter_context(_outbox(given["vehicle"], given["send"] or None, out, key))
+            maps = stack.enter_context(maps_around(given["map"], key_file))
+            outbox = stack.enter_context(outbox_to(given["vehicle"], given["send"] or None, out, key))
             keeper = None
             if given["keep_doubt"]:
                 keeper = DoubtKeeper(Path(given["keep_doubt"]), 10**6 * given["keep_doubt_mb"])

@@ -247,7 +247,7 @@ def drive(
         heartbeat()
         return stopped[-1]
 
-    with _maps(map_source, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
+    with maps_around(map_source, key_file) as maps, outbox_to(vehicle, send, out, key_in(key_file)) as outbox:
         warm_vehicle(plan.settings)
         heartbeat.ready()
         on_earth = frame_of(maps.current().georeference)
@@ -287,7 +287,7 @@ def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
 
 
 @contextmanager
-def _maps(map_source: str, key_file: Path | None) -> Iterator[Maps]:
+def maps_around(map_source: str, key_file: Path | None) -> Iterator[Maps]:
     """The tiles around the vehicle of a server's map, or a whole map from a file or store."""
     from mapvote.live.road_map import OneMap, RoadMap
 
@@ -300,7 +300,7 @@ def _maps(map_source: str, key_file: Path | None) -> Iterator[Maps]:
 
 
 @contextmanager
-def _outbox(vehicle: str, url: str | None, folder: Path | None, key: str | None) -> Iterator[Outbox]:
+def outbox_to(vehicle: str, url: str | None, folder: Path | None, key: str | None) -> Iterator[Outbox]:
     """The outbox of the ballots; at its end it sends what can be sent now."""
     from mapvote.config import cache_folder
     from mapvote.live.outbox import Outbox

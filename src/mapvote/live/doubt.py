@@ -212,7 +212,7 @@ def doubtful_place(tile: BallotTile, lattice: Lattice, rule: DoubtRule = DOUBT_R
 
 
 def _messages(job: _Job, near_m: float) -> Iterator[FileMessage]:
-    """Of each cloud its place, and its points near the change."""
+    """Place of each cloud, and its points near the change."""
     for cloud in job.clouds:
         points_map = transform(cloud.T_map_lidar, cloud.points)
         near = np.hypot(points_map[:, 0] - job.place[0], points_map[:, 1] - job.place[1]) <= near_m

@@ -16,7 +16,7 @@ Value = bool | str | list[str]
 
 
 class NodeParameters:
-    """What the node at ``name``, such as /map/pointcloud_map_loader, tells of its parameters."""
+    """Parameters of the node at ``name``, such as /map/pointcloud_map_loader, by its services."""
 
     def __init__(self, name: str, values: Callable[[], Mapping[str, Value]]) -> None:
         """``values``: of the moment at which they are asked for."""

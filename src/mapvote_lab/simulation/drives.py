@@ -142,7 +142,7 @@ def _is_in_slices(stage: Stage) -> bool:
 
 
 def _bodies(stage: Stage, traffic: Traffic, rays: Sweep, stamp_s: float, T_map_lidar: F64) -> Caster | SlicedCaster:
-    """What moves, where it is when the rays leave."""
+    """Moving objects, at their places when the rays leave."""
     sensor = stage.sensor
     if not _is_in_slices(stage):
         turns_hz = sensor.rate_hz if stage.scenario.motion_distortion else None

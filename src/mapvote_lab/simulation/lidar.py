@@ -72,7 +72,7 @@ class SlicedCaster:
         self._first = first
 
     def cast(self, origins: F32, directions: F32) -> tuple[F32, I32, F32]:
-        """As :meth:`Caster.cast`, of all rays of a sweep."""
+        """All rays of a sweep, see :meth:`Caster.cast`."""
         parts = zip(
             self._slices, np.split(origins, self._first[1:]), np.split(directions, self._first[1:]), strict=True
         )
@@ -80,7 +80,7 @@ class SlicedCaster:
         return np.concatenate(ranges), np.concatenate(objects), np.concatenate(cosine)
 
     def normals(self, rays: Sweep, met: I64) -> F32:
-        """As :meth:`Caster.normals`."""
+        """Normals, see :meth:`Caster.normals`."""
         normals = np.empty((len(met), 3), np.float32)
         slice_of = np.searchsorted(self._first, met, side="right") - 1
         for k in np.unique(slice_of):

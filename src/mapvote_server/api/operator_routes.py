@@ -369,7 +369,7 @@ async def whole(by: Operator, parts: Parts) -> Response:
     summary="Set aside what is damaged",
 )
 async def mend(by: Operator, parts: Parts) -> Response:
-    """As GET; damaged items are also quarantined."""
+    """The answer of GET; damaged items are also quarantined."""
     return as_json(Checked(await parts.rounds.run(check, parts.store, mend=True, by=by)))
 
 

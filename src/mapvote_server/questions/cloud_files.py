@@ -68,7 +68,7 @@ class CloudFiles:
             return made, made.path.open("rb")
 
     def open(self, number: int) -> tuple[CloudFile, BinaryIO]:
-        """As :meth:`ready`; made if there is none yet. MapvoteError if the version is too large, or empty."""
+        """The same as :meth:`ready`; made if there is none yet. MapvoteError if the version is too large, or empty."""
         with self._making:  # of several requests, one makes it
             opened = self.ready(number)
             if opened is None:

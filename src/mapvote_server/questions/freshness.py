@@ -52,7 +52,7 @@ class _Seen:
         self._tiles: dict[TileIndex, tuple[int, int | None]] = {}
         """(vehicles, end of the last drive)."""
         self._rows: dict[bool, dict[TileIndex, CoveredTile]] = {True: {}, False: {}}
-        """What was told, by whether the asker may know exact times; without tiles that have changed since."""
+        """Rows of earlier answers, by whether their times are exact; without tiles that have changed since."""
 
     def refresh(self, connection: sa.Connection) -> None:
         """Read the tiles on which ballots came or went, or which a version set: all of them at first, and once ballots

@@ -33,7 +33,7 @@ def _of_zlib(data: bytes, size: int) -> bytes:
 
 
 _READ: Mapping[str, Callable[[bytes, int], bytes]] = {"zstd": _of_zstd, "zlib": _of_zlib}
-"""What undoes a format, at most a byte more than the size: a message cannot fill the memory."""
+"""Decoders by format. Each returns one byte more than the size at most: a message cannot fill the memory."""
 
 
 def decompressed(source: str, message: Any) -> bytes:
@@ -58,7 +58,7 @@ def decompressed(source: str, message: Any) -> bytes:
 
 
 def republished(form: str) -> str:
-    """What to do about clouds in a format that is not read."""
+    """The mend for clouds in a format that is not read."""
     named = form or "FORMAT"
     return (
         f"send zstd or zlib, or make PointCloud2 of them: ros2 run point_cloud_transport republish --ros-args "
