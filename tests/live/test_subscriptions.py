@@ -21,7 +21,7 @@ from mapvote.formats.drives.frames import matrix_of
 from mapvote.formats.drives.packets import direction_of
 from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.formats.drives.point_times import TimeRules
-from mapvote.live.choice import Chosen, Voice, Wish, choose_topics, missing_for_drive
+from mapvote.live.choice import WAITS, Chosen, Voice, Waits, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
 from mapvote.live.messages import CLOUD, ODOMETRY, TF, blank_message, cloud_of, from_cdr, to_cdr
 from mapvote.live.outbox import Outbox
@@ -201,9 +201,11 @@ class Vehicle:
         until(lambda: all(out.readers for out in self._out.values()))
 
 
-def subscriptions(domain: int, points: list[str], rules: TimeRules | None = None) -> Subscriptions:
+def subscriptions(
+    domain: int, points: list[str], rules: TimeRules | None = None, waits: Waits = WAITS
+) -> Subscriptions:
     network = Network(domain)
-    chosen = choose_topics(network, Wish(tuple(points)), Voice(print), lambda: False, 60.0)
+    chosen = choose_topics(network, Wish(tuple(points)), Voice(print, waits), lambda: False, 60.0)
     assert chosen is not None
     return Subscriptions(network, chosen, SENSORS["hdl32e"], rules=rules or TimeRules())
 
@@ -214,7 +216,8 @@ def test_a_live_topic_obeys_what_is_stated_of_motion(domain: int, compensated: b
     """Clouds without times, 20 times a second, of a sensor whose data sheet says ten."""
     seen = np.array([[10, 0, 0], [0, 10, 0], [0, -10, 0]], dtype=np.float32)
     vehicle = Vehicle(domain, (POINTS, CLOUD))
-    topics, scans = subscriptions(domain, [], TimeRules(motion_compensated=compensated)), list[list[Cloud]]()
+    rules = TimeRules(motion_compensated=compensated)
+    topics, scans = subscriptions(domain, [], rules, Waits(odometry_s=0.0)), list[list[Cloud]]()
     vehicle.until_subscribed()
     for i in range(5):
         vehicle.send(POINTS, cloud_message(Scan(START + i * STEP // 2, seen)))
@@ -297,7 +300,7 @@ def test_a_drive_to_which_no_cloud_comes_ends_after_the_idle_time(tmp_path: Path
 def test_a_drive_whose_first_seconds_show_an_error_ends_and_leaves_nothing(
     tmp_path: Path, domain: int, late_ns: int, wider: float, said: str
 ) -> None:
-    poses = path(46, speed_mps=5.0)
+    poses = path(12, speed_mps=5.0)  # so few that none is decided before the drive ends
     scans = list(drive_along(poses, 1))
     vehicle = Vehicle(domain, (POINTS, CLOUD), (POSES, ODOMETRY), ("/tf_static", TF))
     vehicle.send("/tf_static", frames_message(0, {"lidar": np.eye(4)}))

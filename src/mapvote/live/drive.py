@@ -336,13 +336,18 @@ class LiveDrive:
         self.counts.left_out += self._thinning.shed(self._waiting)
         return True
 
-    def finish(self) -> None:
-        """The drive has ended: the scans that wait vote, and the last ballot leaves."""
+    def end(self) -> None:
+        """No scan comes any more: every scan that arrived is decided. No ballot leaves yet."""
         while self.step(ended=True):
             pass
         if self.vehicle is not None:
             self.vehicle.finish()
             self._count_votes(self.vehicle, ended=True)
+
+    def finish(self) -> None:
+        """The drive has ended: the scans that wait vote, and the last ballot leaves."""
+        self.end()
+        if self.vehicle is not None:
             self.counts.ballots += 1
             self._held.append((self.drive_id, self._written(self.vehicle.last_stretch()), None))
             self._release()

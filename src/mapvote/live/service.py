@@ -190,6 +190,7 @@ def run(
             topics.network.wait(LOOP_TIMES.loop_s)
         poses = topics.take_poses()
         scans = topics.take_scans()
+    live.end()  # a drive of a few seconds is checked by all of its scans
     _check(live, topics)
     live.finish()
     return live
