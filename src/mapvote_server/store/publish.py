@@ -16,8 +16,6 @@ from threading import Lock
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
-import numpy as np
-import scipy
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
@@ -25,16 +23,17 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.config import FuseSettings
 from mapvote.core.answers import answer
-from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import LazyTiles, PointMap, with_changed
 from mapvote.core.tile import Tile
-from mapvote.core.types import I64, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.fusion.decision_record import Record
 from mapvote_server.errors import Conflict, Held
 from mapvote_server.store import schema
 from mapvote_server.store.database import address_of, insert_rows
 from mapvote_server.store.doubts import Doubts, doubts_about
 from mapvote_server.store.fusion_jobs import JOB_SIZES, Fused, Task, edited_tile, fuse_round, settled
+from mapvote_server.store.hold import hold_reasons
 from mapvote_server.store.integrity import quarantine, tiles_hurt_or_mended
 from mapvote_server.store.policy import GatePolicy
 from mapvote_server.store.queries import (
@@ -424,51 +423,3 @@ def _after(store: Store, old: PointMap, changed: Sequence[Fused]) -> PointMap:
 
     points = {fused.index: fused.points + fused.added - fused.deleted for fused in changed}
     return replace(old, tiles=with_changed(old.tiles, LazyTiles(edited, points)))
-
-
-def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
-    """The policy's reasons against publishing these tiles."""
-    reasons = []
-    for fused in changed:
-        name = f"tile {tile_key(fused.index)}"
-        if fused.points and fused.deleted > settings.max_deleted_share * fused.points:
-            share = fused.deleted / fused.points
-            reasons.append(f"deletes {share:.0%} of the points of {name}, more than {settings.max_deleted_share:.0%}")
-        if fused.freed > settings.max_freed_share * CELLS:
-            freed = fused.freed / CELLS
-            reasons.append(f"learns free space in {freed:.0%} of {name}, more than {settings.max_freed_share:.0%}")
-    for verb, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
-        rows, cols = lattice_cells([(f, getattr(f, cells)) for f in changed])
-        areas = areas_m2(rows, cols)
-        largest = int(np.argmax(areas)) if len(areas) else 0
-        if len(areas) and areas[largest] > settings.max_change_m2:
-            about = f"{verb} one connected thing of {areas[largest]:.0f} m2"
-            reasons.append(f"{about}, more than {settings.max_change_m2:.0f} m2")
-    return reasons
-
-
-def lattice_cells(cells_by_tile: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
-    """(rows, cols) on the lattice of flat cells of some tiles."""
-    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in cells_by_tile]
-    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in cells_by_tile]
-    nothing = np.empty(0, dtype=np.int64)
-    return np.concatenate([nothing, *rows]), np.concatenate([nothing, *cols])
-
-
-def areas_m2(rows: I64, cols: I64) -> np.ndarray:
-    """(k,) the area of each thing: cells that touch, corners included, whatever tile they are in."""
-    if not len(rows):
-        return np.empty(0)
-    keys = (rows << 32) + cols
-    order = np.argsort(keys)
-    ordered = keys[order]
-    pairs = []
-    for step in (1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1):
-        near = np.searchsorted(ordered, keys + step)
-        near[near == len(keys)] = 0
-        touching = np.flatnonzero(ordered[near] == keys + step)
-        pairs.append(np.stack([touching, order[near[touching]]]))
-    a, b = np.concatenate(pairs, axis=1)
-    links = scipy.sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
-    labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
-    return np.bincount(labels) * CELL_SIZE**2

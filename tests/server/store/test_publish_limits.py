@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.types import I64
 from mapvote_server.store.fusion_jobs import Fused
-from mapvote_server.store.publish import areas_m2, hold_reasons, lattice_cells
+from mapvote_server.store.hold import areas_m2, hold_reasons, lattice_cells
 
 SETTINGS = FuseSettings(max_deleted_share=0.5, max_freed_share=0.25, max_change_m2=0.9)  # 0.9 m2 are ten cells
 NOTHING = Fused.nothing((0, 0), ())
@@ -85,10 +85,16 @@ def test_flat_cells_of_tiles_are_cells_of_the_lattice() -> None:
     assert [len(part) for part in nowhere] == [0, 0]
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.6), st.integers(-300, 300))
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.6), st.integers(-TILE_CELLS - 4, -TILE_CELLS))
 def test_things_are_the_8_connected_components_wherever_they_lie(seed: int, share: float, shift: int) -> None:
     picture = np.random.default_rng(seed).random((9, 11)) < share
-    rows, cols = np.nonzero(picture)
     labels, count = ndimage.label(picture, structure=np.ones((3, 3)))
     expected = sorted(np.bincount(labels.ravel(), minlength=count + 1)[1:] * 0.09)
-    assert sorted(areas_m2(rows.astype(np.int64) + shift, cols.astype(np.int64) - shift)) == pytest.approx(expected)
+    rows, cols = (axis.astype(np.int64) for axis in np.nonzero(picture))
+    # The corner of four tiles is inside of the picture at some shifts; each tile is a part of its own.
+    rows += shift
+    cols += TILE_CELLS - 5
+    tiles = np.stack([rows // TILE_CELLS, cols // TILE_CELLS])
+    parts = [(tiles == one[:, None]).all(axis=0) for one in np.unique(tiles, axis=1).T]
+    assert sorted(areas_m2((rows[part], cols[part]) for part in parts)) == pytest.approx(expected)
+    assert sorted(areas_m2([(rows, cols)])) == pytest.approx(expected)
