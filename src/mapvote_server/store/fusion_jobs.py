@@ -60,7 +60,7 @@ class JobSizes:
     groups."""
     sites: int = 32
     """Tiles that are kept while groups are followed, at most, 2 MB each; tiles that are kept open, about 6 MB each; and
-    tiles of which the large parts stay in memory, up to 2 MB each. Those of further tiles of a round lie on disk."""
+    tiles of a round of which the large parts stay in memory, up to 2 MB each. Those of a larger round lie on disk."""
 
 
 JOB_SIZES = JobSizes()
@@ -330,7 +330,7 @@ def fuse_round(
 ) -> list[Fused | Open]:
     """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another.
 
-    The first ``JobSizes.sites`` tiles stay in memory whole, the large parts of all others lie on disk.
+    A round of at most ``JobSizes.sites`` tiles stays in memory whole; the large parts of a larger one lie on disk.
     """
     pool = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
@@ -345,7 +345,7 @@ def fuse_round(
         if isinstance(fused, Open):
             unpacked += 1
         small = fused.packed() if isinstance(fused, Open) and unpacked > sizes.sites else fused
-        if file is not None and len(done) >= sizes.sites and isinstance(small, Fused):
+        if file is not None and isinstance(small, Fused):
             small = replace(small, bulk=file.put(small.bulk)) if isinstance(small.bulk, Bulk) else small
         done.append(small)
     return done

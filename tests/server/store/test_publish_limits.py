@@ -3,6 +3,7 @@ too."""
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -98,3 +99,14 @@ def test_things_are_the_8_connected_components_wherever_they_lie(seed: int, shar
     parts = [(tiles == one[:, None]).all(axis=0) for one in np.unique(tiles, axis=1).T]
     assert sorted(areas_m2((rows[part], cols[part]) for part in parts)) == pytest.approx(expected)
     assert sorted(areas_m2([(rows, cols)])) == pytest.approx(expected)
+
+
+def test_of_the_cells_of_a_city_only_those_at_edges_of_tiles_are_kept() -> None:
+    rows, cols = (axis.reshape(-1) for axis in np.mgrid[100:140, 100:140])
+    parts = [(rows, cols + TILE_CELLS * col) for col in range(200)]
+    areas_m2(parts[:1])
+    tracemalloc.start()
+    assert areas_m2(parts) == pytest.approx(np.full(200, 144.0))
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 0.3 * sum(rows.nbytes + cols.nbytes for rows, cols in parts)

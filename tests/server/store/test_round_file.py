@@ -39,7 +39,7 @@ def test_a_round_on_disk_decides_what_it_decides_in_memory(tmp_path: Path) -> No
         assert one.deleted == other.deleted == 2 * len(WALL)
         assert one.planes == other.planes != {}
         assert one.record == other.record is not None
-    assert [isinstance(one.bulk, OnDisk) for one in there if isinstance(one, Fused)] == [False, True, True]
+    assert [isinstance(one.bulk, OnDisk) for one in there if isinstance(one, Fused)] == [True, True, True]
     assert not any(isinstance(one.bulk, OnDisk) for one in here if isinstance(one, Fused))
 
 
