@@ -337,6 +337,8 @@ def explain(
             f"{v['vehicle']}: {v['state']}{gone}{sure}. Drive {v['drive']} ended {ended}, with version {v['version']}"
         )
         print(f"    {before}; {counts_text}")
+    if answer["unlisted"]:
+        print(f"{answer['unlisted']} older votes on the tile do not count and are not listed")
 
 
 _MOST_STRETCHES = 20

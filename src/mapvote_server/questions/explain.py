@@ -7,15 +7,18 @@ version are decided here, for the one tile.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.record import record
 from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.times import utc
@@ -35,21 +38,39 @@ from mapvote_server.store.integrity import DamagedBallots, ballot_name
 from mapvote_server.store.keys import pseudonyms
 from mapvote_server.store.policy import Policy, policy_in
 from mapvote_server.store.queries import records_of, tile_as_of, version_of
-from mapvote_server.store.store import Store
+from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import (
     FOREVER,
     Electorate,
+    Polled,
     electorate_now,
     from_sound_ballots,
+    judged_among,
     judged_on,
     judged_votes,
+    poll,
     read_votes,
     recent_votes,
     stored_votes,
 )
 
-MOST_RECORDS = 30
-"""So many of the last versions that decided a cell are asked which votes they counted."""
+
+@record()
+@dataclass(frozen=True, slots=True)
+class ExplainSizes:
+    """Limits of the story of a cell."""
+
+    records: int = 30
+    """Last versions that decided the cell that are asked which votes they counted."""
+    votes: int = 100
+    """Votes that are listed: those that count, then the newest that do not. A tile of a city has thousands."""
+    tiles: int = 4
+    """Tiles of which the decision of the next version is kept for further questions."""
+    states: int = 256
+    """Earlier decisions of which the unpacked states are kept, 64 kB each."""
+
+
+EXPLAIN_SIZES = ExplainSizes()
 UNREADABLE = "unreadable"
 ENDED = {
     "ballot": "replaced by a later ballot of this drive",
@@ -132,6 +153,8 @@ class CellStory:
     probability: float | None
     """Probability that the cell changed as the last decision states (fusion/loss_budget.py); None if it states no
     change."""
+    unlisted: int
+    """Further standing votes on the tile that do not count, older than those listed."""
     thing: str
     """Text: "outside the map", or what stands in the cell, whether a new object is temporary, and how many earlier
     objects stood there."""
@@ -145,7 +168,9 @@ class _Now:
     cell: tuple[int, int]
     electorate: Electorate
     standings: Sequence[Vote]
-    """Every standing vote on the tile, and why the next version does not count it."""
+    """The standing votes on the tile that are listed, and why the next version does not count them."""
+    unlisted: frozenset[int]
+    """Ballots of all other standing votes on the tile."""
     said: Mapping[int, Vote]
     """The vote of each readable ballot on the tile as it was sent, by the ballot's number."""
     decided: Decision
@@ -156,7 +181,9 @@ FARTHEST_M = 1e7
 """No place of a map lies farther from its origin."""
 
 
-def explain_cell(store: Store, x: float, y: float, *, with_names: bool = True) -> CellStory:
+def explain_cell(
+    store: Store, x: float, y: float, *, with_names: bool = True, sizes: ExplainSizes = EXPLAIN_SIZES
+) -> CellStory:
     """The votes behind the cell that holds (x, y), map metres. ``with_names``: with the names of vehicles and
     exact times, else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
     if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M):
@@ -167,12 +194,13 @@ def explain_cell(store: Store, x: float, y: float, *, with_names: bool = True) -
     index = (row // TILE_CELLS, col // TILE_CELLS)
     cell = (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
-        tile = tile_as_of(connection, store.lattice.tile(index), version_of(connection).number)
-        present = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
+        number = version_of(connection).number
+        tile = tile_as_of(connection, store.lattice.tile(index), number)
+        present = _as_of_now(store, connection, number, tile, cell, electorate_now(connection, store.clock()), sizes)
         states = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
         decisions = [(record, state) for record, state in states if state != state_name(NO_VOTE)]
         falls = [fell_with(store, connection, index, record, cell) for record, _ in decisions]
-        votes = _votes(connection, present, [record for record, _ in decisions[-MOST_RECORDS:]], with_names)
+        votes = _votes(connection, present, [record for record, _ in decisions[-sizes.records :]], with_names)
     if not with_names:
         shown = pseudonyms(store, {vote.vehicle for vote in votes})
         votes = [replace(vote, vehicle=shown[vote.vehicle], drive="", clouds="") for vote in votes]
@@ -184,7 +212,8 @@ def explain_cell(store: Store, x: float, y: float, *, with_names: bool = True) -
     thing = [*_lacks(present, votes), *_thing(present)]
     if not thing and not votes and not decisions and not len(present.tile.points):
         thing = ["outside the map"]
-    return CellStory(row, col, votes, by_version, probability, "; ".join(thing))
+    unlisted = len(present.unlisted)
+    return CellStory(row, col, votes, by_version, probability, unlisted, "; ".join(thing))
 
 
 def seen(stamp_ns: int | None, exactly: bool) -> int | None:
@@ -218,44 +247,100 @@ def sound_votes(connection: sa.Connection, index: TileIndex, ballots: Collection
             stored = [vote for vote in stored if lost.isdisjoint((str(vote.ballot), ballot_name(vote.ballot, *index)))]
 
 
-def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], electorate: Electorate) -> _Now:
-    """The standing ballots on a tile, without those that cannot be read."""
+def _as_of_now(
+    store: Store,
+    connection: sa.Connection,
+    number: int,
+    tile: Tile,
+    cell: tuple[int, int],
+    electorate: Electorate,
+    sizes: ExplainSizes,
+) -> _Now:
+    """The standing ballots on a tile of version ``number``, without those that cannot be read."""
+    index = tile.index
 
-    def look(electorate: Electorate) -> tuple[Electorate, Sequence[Vote], Mapping[int, Vote]]:
-        judged = judged_on(connection, tile, electorate)
-        readable = [vote for vote in judged if vote.why != "damaged"]
-        return electorate, judged, {vote.ballot: vote for vote in read_votes(connection, tile.index, readable)}
+    def look(electorate: Electorate) -> tuple[Electorate, Polled, Sequence[Vote], Mapping[int, Vote]]:
+        polled = poll(connection, index[0], [index[1]], electorate)
+        listed = _listed(judged_among(polled, index, electorate), sizes.votes)
+        readable = [vote for vote in listed if vote.why != "damaged"]
+        return electorate, polled, listed, {v.ballot: v for v in read_votes(connection, index, readable, polled)}
 
-    electorate, judged, said = from_sound_ballots(connection, electorate, look)
+    electorate, polled, listed, said = from_sound_ballots(connection, electorate, look)
+    standings, decided = _decided.of(store).of(
+        (number, index, electorate.policy.fuse, electorate.policy.round, electorate.set_aside, polled.key(index)),
+        lambda: _decide(connection, tile, electorate, polled),
+    )
+    shown = {vote.ballot for vote in listed}
+    unlisted = frozenset(vote.ballot for vote in standings) - shown
+    return _Now(tile, cell, electorate, [v for v in standings if v.ballot in shown], unlisted, said, decided)
+
+
+def _listed(judged: Sequence[Vote], most: int) -> list[Vote]:
+    """The votes that are listed, in their order: those that count, and the newest others, ``most`` in all."""
+    others = sorted((vote for vote in judged if vote.why), key=lambda vote: vote.end_ns, reverse=True)
+    room = max(0, most - (len(judged) - len(others)))
+    dropped = {vote.ballot for vote in others[room:]}
+    return [vote for vote in judged if vote.ballot not in dropped]
+
+
+def _decide(
+    connection: sa.Connection, tile: Tile, electorate: Electorate, polled: Polled
+) -> tuple[Sequence[Vote], Decision]:
+    """(every standing vote, the decision) of the next version on a tile."""
     policy = electorate.policy
+    judged = judged_on(connection, tile, electorate, polled=polled)
     counting = [vote for vote in judged if not vote.why]
 
     def history() -> Sequence[Vote]:
-        return recent_votes(connection, tile, electorate)
+        return recent_votes(connection, tile, electorate, polled=polled)
 
     past = history if policy.round.stage == "two-stage" else None
     decided = decide_tile(tile, counting, rule_named(policy.round.method), policy.fuse, past)
-    standings = standings_of(judged, decided.copies, decided.heard, policy.fuse)
-    return _Now(tile, cell, electorate, standings, said, decided)
+    return standings_of(judged, decided.copies, decided.heard, policy.fuse), decided
+
+
+class _Decided:
+    """The latest decisions on tiles, by all that they follow from; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._kept: OrderedDict[Hashable, tuple[Sequence[Vote], Decision]] = OrderedDict()
+
+    def of(
+        self, key: Hashable, decide: Callable[[], tuple[Sequence[Vote], Decision]]
+    ) -> tuple[Sequence[Vote], Decision]:
+        """The decision of this ``key``, made by ``decide`` if it is not at hand."""
+        with self._lock:
+            decided = self._kept.get(key)
+        if decided is None:
+            decided = decide()
+        with self._lock:
+            self._kept[key] = decided
+            self._kept.move_to_end(key)
+            while len(self._kept) > EXPLAIN_SIZES.tiles:
+                self._kept.popitem(last=False)
+        return decided
+
+
+_decided = PerStore(_Decided)
 
 
 def _votes(connection: sa.Connection, present: _Now, records: Sequence[Record], with_names: bool) -> list[CellVote]:
-    """Every standing vote, then those that some version counted on the cell and that stand no more."""
+    """The standing votes that are listed, then those that some version counted on the cell and that stand no more."""
     flat = present.cell[0] * TILE_CELLS + present.cell[1]
-    past = sound_votes(
-        connection, present.tile.index, {s.ballot for r in records for s in _standings(r)} - present.said.keys()
-    )
+    once = {standing.ballot for made in records for standing in _standings(made)}
+    past = sound_votes(connection, present.tile.index, once - present.said.keys() - present.unlisted)
     said = {**present.said, **past}
     counted = defaultdict[int, list[int]](list)
     left_out = defaultdict[int, list[LeftOut]](list)
-    for record in records:
-        for standing in _standings(record):
+    for made in records:
+        for standing in _standings(made):
             if standing.ballot in said and said[standing.ballot].spoken()[present.cell]:
                 reason_code = standing.why_not(flat)
                 if reason_code:
-                    left_out[standing.ballot].append(LeftOut(record.version, REASONS[reason_code]))
+                    left_out[standing.ballot].append(LeftOut(made.version, REASONS[reason_code]))
                 else:
-                    counted[standing.ballot].append(record.version)
+                    counted[standing.ballot].append(made.version)
     gone = sorted(past.keys() & counted.keys())
     ended = _ended(connection, gone)
     everyone = [(standing, _why_not(standing, present)) for standing in present.standings]
@@ -314,9 +399,15 @@ def _standings(record: Record) -> Sequence[Vote]:
 
 def _state_in(record: Record, cell: tuple[int, int]) -> str:
     try:
-        return state_name(int(record.states[cell]))
+        return state_name(int(_states_of(record.packed_states)[cell]))
     except MapvoteError:
         return UNREADABLE
+
+
+@lru_cache(maxsize=EXPLAIN_SIZES.states)
+def _states_of(packed: bytes) -> U8:
+    """(256, 256) the states of a record."""
+    return Record(0, packed, b"", None, b"").states
 
 
 def _edit_of(record: Record, cell: tuple[int, int]) -> Edit | None:

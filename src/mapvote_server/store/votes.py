@@ -8,7 +8,7 @@ sum of their row: two rows of one sum say the same. The cache ends with the proc
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -122,6 +122,12 @@ class Polled:
     fresh: dict[tuple[int, int, int, Why], Vote] = field(default_factory=dict)
     """Votes in the cells in which they are not spent."""
 
+    def key(self, index: TileIndex) -> Hashable:
+        """What the decision on a tile follows from, beside the tile and the policy."""
+        votes = tuple((vote.ballot, vote.why) for vote in self.standing[index])
+        rows = frozenset((row.ballot, row.sum) for row in self.rows.values() if (row.row, row.col) == index)
+        return votes, rows, tuple((seq, cells.tobytes()) for seq, cells in self.bars[index])
+
     def unspent(self, vote: Vote, tile: Tile, misread: Mapping[int, Bool] | None) -> Vote:
         """The vote in the cells of ``tile`` in which it is not spent."""
         key = *tile.index, vote.ballot, vote.why
@@ -178,6 +184,11 @@ def judged_votes(connection: sa.Connection, index: TileIndex, electorate: Electo
     """Every standing vote on a tile, without planes, and why it does not count there. A vote that counts does so in
     cells where it is not spent (:func:`mapvote.fusion.fuse.unspent`)."""
     return _judged(_standing_on(connection, index[0], [index[1]], electorate)[index], index, electorate)
+
+
+def judged_among(polled: Polled, index: TileIndex, electorate: Electorate) -> list[Vote]:
+    """The same of votes that were polled."""
+    return _judged(polled.standing[index], index, electorate)
 
 
 def _judged(standing: Sequence[Vote], index: TileIndex, electorate: Electorate) -> list[Vote]:

@@ -107,6 +107,7 @@ export async function showCell([x, y]) {
     answer.votes.length
       ? element("ol", { className: "votes" }, answer.votes.map(vote))
       : element("p", { className: "hint" }, ["No ballot says anything about this cell."]),
+    answer.unlisted > 0 && element("p", { className: "hint" }, [`${answer.unlisted} older votes on the tile do not count and are not listed.`]),
   ]);
 }
 

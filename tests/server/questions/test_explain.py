@@ -16,7 +16,7 @@ from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import DAY_NS, REASONS
 from mapvote_server.questions import explain
-from mapvote_server.questions.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell
+from mapvote_server.questions.explain import CellDecision, CellStory, ExplainSizes, LeftOut, evidence, explain_cell
 from mapvote_server.questions.history import last_events
 from mapvote_server.store import schema
 from mapvote_server.store.keys import issue, revoke
@@ -100,6 +100,26 @@ def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_sta
     assert publish(store).published
     assert story(store, LAWN).thing.startswith("1 things came and went here, after 21.0 days on average; the next can")
     assert story(store, WALL).thing == "stands: surveyed"
+
+
+def test_votes_that_count_are_listed_then_the_newest_others_and_the_rest_are_a_number(
+    store: Store, clock: Clock
+) -> None:
+    store.set_policy(Policy(fuse=FuseSettings(latest_vehicles=2)))
+    for vehicle in "abcde":
+        clock.now += DAY_NS
+        say(store, vehicle, CellState.UNCHANGED_OCCUPIED)
+    for _ in range(2):  # the second answer knows the decision of the first
+        told = explain_cell(store, 3.15, 3.15, sizes=ExplainSizes(votes=3))
+        assert [(vote.vehicle, vote.counts) for vote in told.votes] == [("c", False), ("d", True), ("e", True)]
+        assert told.unlisted == 2
+    clock.now += DAY_NS
+    say(store, "a", CellState.CHANGED_EMPTY)
+    told = explain_cell(store, 3.15, 3.15, sizes=ExplainSizes(votes=1))
+    assert [(vote.vehicle, vote.state) for vote in told.votes] == [
+        ("a", "unchanged_occupied"), ("e", "unchanged_occupied"), ("a", "changed_empty")
+    ], "a vote that counts is always listed"  # fmt: skip
+    assert told.unlisted == 3
 
 
 def test_who_looked_last_holds_up_what_is_new(store: Store, clock: Clock) -> None:
