@@ -58,6 +58,10 @@ state.restart = () => start();
 // It is read before the view writes its own place into the address.
 const linked = address.read();
 let opened = ["eye", "change", "cell", "pending"].some((name) => linked[name]);
+// Who acts before everything has come looks where they chose.
+for (const part of ["map", "cloud", "tools", "content"])
+  for (const act of ["pointerdown", "click", "wheel", "keydown"])
+    $(part).addEventListener(act, () => (opened = true), { capture: true, passive: true });
 function openOnChanges(pending) {
   if (opened) return;
   opened = true;
