@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hand_made import make_map, make_tile, wall
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F64
 from mapvote.doctor.localised import LocalisedDrive, check_localised
@@ -99,3 +100,16 @@ def test_a_drive_that_did_not_know_its_place_is_an_error(drive: LocalisedDrive, 
     findings = list(check_localised(drive))
     assert any(np.any([word in one.what for word in named.split("|")]) for one in findings)
     assert all(one.severity == "error" and one.mend for one in findings)
+
+
+@pytest.mark.parametrize(("height_m", "errors"), [(0.0, 1), (-1.5, 1), (0.3, 0), (1.9, 0)])
+def test_rays_that_begin_on_the_road_are_an_error(height_m: float, errors: int) -> None:
+    """Points in the frame of the vehicle have their origin on the road."""
+    drive = replace(_drive(), T_prior=None)
+    drive = replace(drive, T_map_lidar=_moved(drive.T_map_lidar.copy(), np.array([5.0, 5.0, height_m])))
+    ground = make_map({(0, 0): make_tile(wall([(1, 1)], [0.05]))})
+    findings = list(check_localised(drive, ground))
+    assert [one.what for one in findings if "the origin of the points lies" in one.what] == [
+        one.what for one in findings
+    ]
+    assert len(findings) == errors

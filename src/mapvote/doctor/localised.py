@@ -17,6 +17,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.core.geometry import velocity_changes
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
+from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
 from mapvote.doctor import Finding
 from mapvote.perception.frontend import DriveReport
@@ -49,6 +50,8 @@ class LocalisedRules:
     """Greatest difference of the prior's attitude, beside four of its sigmas, degrees."""
     off_m: float = 3.0
     """Greatest median scatter of the prior's positions about their mean offset, beside four of its sigmas, metres."""
+    low_m: float = 0.15
+    """Least median height of a sensor over the map's ground, metres; points nearer to it count from the road."""
 
 
 LOCALISED_RULES = LocalisedRules()
@@ -120,8 +123,8 @@ class LocalisedDrive:
 def check_localised(
     drive: LocalisedDrive, point_map: PointMap | None = None, rules: LocalisedRules = LOCALISED_RULES
 ) -> Iterator[Finding]:
-    """The share of scans with a sure place, leaps, and how prior and found poses differ. ``point_map``: scans that lie
-    beside its ground need no place."""
+    """The share of scans with a sure place, leaps, the height over the map's ground, and how prior and found poses
+    differ. ``point_map``: scans that lie beside its ground need no place."""
     if len(drive.stamps_ns) < rules.least_scans:
         return
     yield from _share(drive, point_map, rules)
@@ -130,6 +133,8 @@ def check_localised(
         return
     yield from _leaps(drive, sure_scans, rules)
     yield from _jerks(drive, sure_scans, rules)
+    if point_map is not None:
+        yield from _height(drive.T_map_lidar[sure_scans, :3, 3], point_map, rules)
     if drive.T_prior is not None:
         sure_scans = sure_scans[np.isfinite(drive.T_prior[sure_scans]).all(axis=(1, 2))]
         if len(sure_scans) < rules.least_scans:
@@ -187,6 +192,15 @@ def _jerks(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Ite
     if share > rules.jerky_share:
         problem = f"{share:.0%} of the steps of the localised path need an acceleration that no vehicle has"
         yield Finding("error", problem, "are the stamps of the scans right, and the scans in order?")
+
+
+def _height(positions: F64, point_map: PointMap, rules: LocalisedRules) -> Iterator[Finding]:
+    """Where the rays begin, by the positions (n, 3) found: rays from the road see through what stands on it."""
+    height_m = check_heights(point_map, positions).median_m
+    if height_m < rules.low_m:
+        problem = f"the origin of the points lies {height_m:.2f} m over the map's ground, where no sensor is"
+        mend = "are they in the vehicle's frame (base_link)? Give them in the sensor's: rays begin at its origin."
+        yield Finding("error", problem, mend)
 
 
 def _ways(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
