@@ -109,7 +109,6 @@ def test_a_missing_topic_is_named_soon_and_again_with_the_option_to_type(
 
 def test_types_that_hold_points_but_are_not_read_have_a_hint() -> None:
     for kind, hint in (
-        ("livox_ros_driver2/msg/CustomMsg", "xfer_format"),
         ("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"),
         ("ouster_sensor_msgs/msg/PacketMsg", "driver"),
     ):

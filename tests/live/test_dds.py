@@ -12,7 +12,7 @@ import pytest
 from live.loopback_dds import LOOPBACK, own_domain, until
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.point_fields import LIVOX, scan_from_point_cloud2
 from mapvote.live.dds import Network, ros_type
 from mapvote.live.messages import CLOUD, READ, TF, blank_message, from_cdr, to_cdr
 from mapvote.live.play import cloud_message
@@ -30,7 +30,7 @@ def test_every_type_that_is_read_has_a_blank_message_that_dds_carries(domain: in
     network = Network(domain)
     for kind in sorted(READ):
         blank = to_cdr(kind, blank_message(kind))
-        assert to_cdr(kind, from_cdr(kind, blank)) == blank
+        assert kind in LIVOX or to_cdr(kind, from_cdr(kind, blank)) == blank  # those are read as PointCloud2
         network.publish("/any", kind).send(blank)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drive_formats import livox_message
 from live.loopback_dds import until
 from mapvote.codec.planes import zstd
 from mapvote.config import Settings
@@ -19,7 +20,7 @@ from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.compressed_cloud import COMPRESSED
 from mapvote.formats.drives.frames import matrix_of
 from mapvote.formats.drives.packets import direction_of
-from mapvote.formats.drives.point_fields import point_cloud_table
+from mapvote.formats.drives.point_fields import LIVOX, point_cloud_table
 from mapvote.formats.drives.point_times import TimeRules
 from mapvote.live.choice import WAITS, Chosen, Voice, Waits, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
@@ -318,3 +319,32 @@ def test_a_drive_whose_first_seconds_show_an_error_ends_and_leaves_nothing(
     outbox.close()
     assert not list((tmp_path / "out").iterdir())
     assert not list((tmp_path / "state/car").glob("*.journal"))
+
+
+@pytest.mark.parametrize("kind", LIVOX)
+def test_clouds_of_a_livox_driver_arrive_as_scans_with_the_times_of_their_points(domain: int, kind: str) -> None:
+    sender = Network(domain).publish("/livox/lidar", kind)
+    topics = Subscriptions(
+        Network(domain), Chosen((PublishedTopic("/livox/lidar", kind, 1, True, False),), None), SENSORS["hdl32e"]
+    )
+    until(lambda: sender.readers == 1)
+    names = ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"]
+    table = np.zeros(300, dtype=list(zip(names, ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"], strict=True)))
+    rng = np.random.default_rng(0)
+    for axis in "xyz":
+        table[axis] = rng.uniform(5.0, 30.0, 300)
+    table["offset_time"] = np.linspace(0, 99_000_000, 300)
+    sender.send(livox_message(table, START))
+    scans: list[list[Cloud]] = []
+
+    def arrived() -> bool:
+        scans.extend(topics.take_scans())
+        return bool(scans)
+
+    until(arrived)
+    scan = topics.waiting(scans[0]).read()
+    assert scan.stamp_ns == START
+    assert topics.lidar_frames == ["livox"]
+    assert np.array_equal(scan.points, np.column_stack([table[axis] for axis in "xyz"]))
+    assert scan.time_s is not None
+    assert np.allclose(scan.time_s, 1e-9 * table["offset_time"], atol=1e-9)

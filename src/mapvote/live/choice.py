@@ -37,7 +37,6 @@ class Waits:
 
 WAITS = Waits()
 _UNREAD = {
-    "CustomMsg": "set the Livox driver's xfer_format to 0, so that it sends PointCloud2",
     "Packet": "start the part of the driver that makes PointCloud2 of packets",
     "VelodyneScan": "start velodyne_pointcloud, which makes PointCloud2 of packets",
     "PandarScan": "start the part of the driver that makes PointCloud2 of packets",

@@ -1,8 +1,9 @@
-"""Message types that rosbags lacks: those of Autoware's map, of parameters, and of compressed clouds."""
+"""Message types that rosbags lacks: those of Autoware's map, of parameters, of compressed clouds and of Livox's."""
 
 from __future__ import annotations
 
 from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
+from mapvote.formats.drives.point_fields import LIVOX
 
 
 def lacking_types() -> dict[str, str]:
@@ -12,6 +13,12 @@ def lacking_types() -> dict[str, str]:
         COMPRESSED: definition_of_compressed(),
         "tier4_external_api_msgs/msg/MapHash": "string lanelet, string pcd",
     }
+    for cloud in LIVOX:
+        package = cloud.partition("/")[0]
+        point = "uint32 offset_time, float32 x, float32 y, float32 z, uint8 reflectivity, uint8 tag, uint8 line"
+        types[f"{package}/msg/CustomPoint"] = point
+        head = "std_msgs/Header header, uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd"
+        types[cloud] = f"{head}, {package}/CustomPoint[] points"
     # Services of the map loader, and their parts.
     maps = "autoware_map_msgs"
     area = f"{maps}/AreaInfo area"

@@ -6,6 +6,7 @@ copied.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.compressed_cloud import COMPRESSED
+from mapvote.formats.drives.point_fields import LIVOX, livox_table
 from mapvote.formats.reading import first_line
 from mapvote.live.message_types import lacking_types
 
@@ -26,7 +28,7 @@ POSES = (ODOMETRY, POSE_WITH_COVARIANCE, POSE)
 """Types of topics that say where a vehicle is."""
 POSE_TOPIC = "mapvote/pose"
 """Where a vehicle publishes its own pose, below its namespace."""
-CLOUDS = (CLOUD, COMPRESSED)
+CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
 """Types of topics that hold the points of a LiDAR."""
 CLOCK = "rosgraph_msgs/msg/Clock"
 GNSS = "sensor_msgs/msg/NavSatFix"
@@ -41,7 +43,7 @@ READ |= {
 """Types of the topics that are counted and played."""
 MAP_FRAME = "map"
 LIDAR_FRAME = "lidar"
-_DATATYPES = {"<f4": 7, "<u2": 4}
+_DATATYPES = {"<f4": 7, "<u4": 6, "<u2": 4, "|u1": 2}
 """Types of a sensor_msgs/PointField."""
 
 
@@ -72,11 +74,14 @@ def _blank(shape: Any, of: Any) -> Any:
 
 
 def from_cdr(kind: str, data: bytes | memoryview) -> Any:
-    """The message, its members as attributes; numbers of a sequence as an array that is a view of ``data``.
+    """The message, its members as attributes; numbers of a sequence as an array that is a view of ``data``. A cloud of
+    Livox's drivers as a PointCloud2.
 
     MapvoteError if the bytes end too early or are in an encoding that ROS 2 does not use.
     """
     try:
+        if kind in LIVOX:
+            return _cloud_of_livox(kind, data)
         return typestore().deserialize_cdr(memoryview(data), kind)
     except MapvoteError:
         raise
@@ -84,6 +89,15 @@ def from_cdr(kind: str, data: bytes | memoryview) -> Any:
         raise MapvoteError(
             f"{kind}: a message of {len(data)} bytes is cut off, damaged or no plain CDR ({first_line(error)})"
         ) from error
+
+
+def _cloud_of_livox(kind: str, data: bytes | memoryview) -> Any:
+    """The PointCloud2 of a CustomMsg. rosbags would make an object of each point."""
+    table = livox_table(kind, data, ros2=True)
+    seconds, nanoseconds, length = struct.unpack_from("<3I", data, 4)
+    frame = bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+    columns = {name: table[name] for name in table.dtype.names or ()}
+    return cloud_of(columns, seconds * 10**9 + nanoseconds, frame)
 
 
 def to_cdr(kind: str, message: Any) -> bytes:
@@ -108,7 +122,7 @@ def header_of(time_ns: int, frame_id: str) -> Any:
 
 
 def cloud_of(columns: Mapping[str, NDArray[Any]], stamp_ns: int, frame: str) -> Any:
-    """A PointCloud2 whose fields are the (n,) columns, of float32 or uint16."""
+    """A PointCloud2 whose fields are the (n,) columns, of float32, uint8, uint16 or uint32."""
     types = {name: column.dtype.newbyteorder("<").str for name, column in columns.items()}
     table = np.empty(len(next(iter(columns.values()))), list(types.items()))
     fields = []

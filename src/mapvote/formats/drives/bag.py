@@ -17,12 +17,10 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
 from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
 from mapvote.formats.drives.frames import Edges, pose_of_message
-from mapvote.formats.drives.point_fields import livox_table, point_cloud_table
+from mapvote.formats.drives.point_fields import LIVOX, livox_table, point_cloud_table
 from mapvote.formats.reading import first_line
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
-LIVOX = "livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"
-"""Clouds of Livox's drivers: decoded points, each with its time."""
 CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
 TF = "tf2_msgs/msg/TFMessage"
 

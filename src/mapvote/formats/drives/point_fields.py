@@ -54,6 +54,12 @@ class PointRule:
 
 POINT_RULE = PointRule()
 _AZIMUTHS_AT_ONCE = 512
+LIVOX = (
+    "livox_ros_driver2/msg/CustomMsg",
+    "livox_ros_driver/msg/CustomMsg",
+    "livox_interfaces/msg/CustomMsg",
+)
+"""Clouds of Livox's three drivers, all of one definition: decoded points, each with its time."""
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
 
@@ -365,7 +371,7 @@ def point_cloud_table(source: str, message: Any) -> NDArray[np.void]:
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
-def livox_table(source: str, data: bytes, *, ros2: bool) -> NDArray[np.void]:
+def livox_table(source: str, data: bytes | memoryview, *, ros2: bool) -> NDArray[np.void]:
     """The points (n,) of a serialised CustomMsg of Livox's drivers: offset_time in ns since the stamp, x, y, z,
     reflectivity, tag, line.
 
