@@ -13,6 +13,7 @@ from mapvote.core.geometry import wrapped
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.point_fields import PointReader
+from mapvote.formats.maps.cloud import xyz
 
 Cloud = TypeVar("Cloud")
 
@@ -134,11 +135,11 @@ class Packets(Generic[Cloud]):
 
 
 def direction_of(table: NDArray[np.void], rule: PacketRule = PACKET_RULE) -> tuple[float, float]:
-    """The azimuth of the middle of points with fields x and y (n,), radians, and the share of the circle in which there
-    are any."""
+    """The azimuth of the middle of points (n,) with x, y and z, radians, and the share of the circle in which there are
+    any. MapvoteError as :func:`mapvote.formats.maps.cloud.xyz`."""
     few = table[:: max(1, len(table) // rule.sampled)]
-    x = few["x"].astype(np.float64)
-    y = few["y"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # damaged numbers
+        x, y, _ = xyz("a cloud", few).astype(np.float64).T
     seen = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0.0)
     azimuth = np.arctan2(y[seen], x[seen])
     if not len(azimuth):

@@ -167,7 +167,8 @@ def xyz_view(source: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     x, y, z = (table.dtype.fields[columns[axis]] for axis in "xyz")  # type: ignore[index]
     single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
     if single and table.flags.c_contiguous and len(table):
-        return np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
+        raw = table.view(np.uint8).data  # fields may overlap, or be listed in another order than they lie
+        return np.ndarray((len(table), 3), "<f4", raw, x[1], (table.dtype.itemsize, 4))
     short = (np.float32, np.float16, np.int16, np.uint16, np.int8, np.uint8)  # float32 holds them exactly
     exact = any(table.dtype[columns[axis]] not in short for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
