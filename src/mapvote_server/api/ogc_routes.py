@@ -29,6 +29,8 @@ from mapvote_server.questions.features import (
     Collection,
     Features,
     OnEarth,
+    Source,
+    Whole,
     during,
     extent,
     placed,
@@ -127,10 +129,14 @@ def _items(request: Request, store: Store, with_names: bool, name: str, pending:
     kind = COLLECTIONS[name]
     place = OnEarth.of(store)
     wanted = _Asked.of(request, kind, place)
-    features = _features(store, kind, with_names, request, pending)
-    features = within(features, wanted.box, place, wanted.box_crs) if wanted.box and features else features
-    features = during(features, wanted.datetime) if wanted.datetime else features
-    shown = [placed(feature, place, wanted.crs) for feature in features[wanted.offset : wanted.offset + wanted.limit]]
+    source = _features(store, kind, with_names, request, pending)
+    positions: Sequence[int] = range(len(source))
+    if wanted.box is not None:
+        positions = within(source, wanted.box, place, wanted.box_crs)
+    if wanted.datetime:
+        positions = during(source, positions, wanted.datetime)
+    page = source.made(positions[wanted.offset : wanted.offset + wanted.limit])
+    shown = [placed(feature, place, wanted.crs) for feature in page]
     path = f"/collections/{name}/items"
     query = dict(request.query_params)
     links = [
@@ -139,12 +145,12 @@ def _items(request: Request, store: Store, with_names: bool, name: str, pending:
         _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
     ]
     after = wanted.offset + len(shown)
-    if after < len(features):
+    if after < len(positions):
         links.append(_link(request, path, "next", _GEOJSON, "the next page", query | {"offset": str(after)}))
     if wanted.offset > 0:
         before = query | {"offset": str(max(wanted.offset - wanted.limit, 0))}
         links.append(_link(request, path, "prev", _GEOJSON, "the page before", before))
-    counts = {"numberMatched": len(features), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
+    counts = {"numberMatched": len(positions), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
     answer = {"type": "FeatureCollection", "features": shown, "links": links} | counts
     return _answer(request, answer, _GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
 
@@ -162,9 +168,8 @@ def _item(
     kind = COLLECTIONS[name]
     place = OnEarth.of(store)
     query = _Asked.of(request, kind, place, ("crs",))
-    features = _features(store, kind, with_names, request, pending)
-    wanted = next((feature for feature in features if feature["id"] == feature_id), None)
-    if wanted is None:
+    named = _features(store, kind, with_names, request, pending).named(feature_id)
+    if not named:
         raise NotFound(f"{name} has no feature {feature_id[:80]!r}")
     path = f"/collections/{name}/items/{feature_id}"
     links = [
@@ -172,7 +177,7 @@ def _item(
         _link(request, path, "alternate", _HTML, "this feature for people", {"f": "html"}),
         _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
     ]
-    shown = placed(wanted, place, query.crs) | {"links": links}
+    shown = placed(named[0], place, query.crs) | {"links": links}
     return _answer(request, shown, _GEOJSON, {"Content-Crs": f"<{query.crs}>"})
 
 
@@ -239,10 +244,10 @@ async def _pending(parts: Services, kind: Collection) -> Features | None:
     return pending
 
 
-def _features(store: Store, kind: Collection, with_names: bool, request: Request, pending: Features | None) -> Features:
+def _features(store: Store, kind: Collection, with_names: bool, request: Request, pending: Features | None) -> Source:
     """All features of a collection, in map metres; of the desk those ``pending``."""
     if kind.features is None:
-        return pending or []
+        return Whole(pending or [])
     newest = store.current() if kind.of_versions else 1
     new = _integer(request.query_params, "to", newest, LEAST)
     old = _integer(request.query_params, "from", max(new - 1, LEAST), LEAST)

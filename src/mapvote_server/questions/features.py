@@ -6,6 +6,8 @@ OGC 17-069r4 (Part 1: Core) and 18-058r1 (Part 2: Coordinate Reference Systems).
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -14,21 +16,106 @@ from typing import Any
 import msgspec
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import mapping, shape
 
+from mapvote.codec.ballot import tile_key
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame, frame_of, read_crs
 from mapvote.shapes.geojson import tile_squares
 from mapvote_server.errors import BadRequest
 from mapvote_server.questions.changes import changes_between
 from mapvote_server.questions.coverage import wanted_passes
-from mapvote_server.questions.freshness import tiles_seen
+from mapvote_server.questions.freshness import CoveredTile, tiles_seen
 from mapvote_server.store.store import Store
 
 CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 """WGS 84, longitude before latitude: what every client knows."""
+Shapes = NDArray[np.object_]
+"""Shapely geometries."""
 Features = list[dict[str, Any]]
 """GeoJSON features in map metres, each with an id."""
+
+
+class Source(ABC):
+    """All features of a collection in their order, of which only those of a page are made."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of features."""
+
+    @abstractmethod
+    def shapes(self) -> Shapes:
+        """(n,) their shapes, map metres."""
+
+    @abstractmethod
+    def times(self, position: int) -> tuple[str | None, str | None]:
+        """When the feature at a position was first and last seen; None where unknown."""
+
+    @abstractmethod
+    def made(self, positions: Sequence[int]) -> Features:
+        """The features at some positions."""
+
+    @abstractmethod
+    def named(self, feature_id: str) -> Features:
+        """The feature of this id, as the only one; none without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whole(Source):
+    """Features that are there already: a question makes all of them at once, and keeps them."""
+
+    features: Features
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def shapes(self) -> Shapes:
+        return np.array([shape(feature["geometry"]) for feature in self.features], dtype=object)
+
+    def times(self, position: int) -> tuple[str | None, str | None]:
+        about = self.features[position]["properties"]
+        return about.get("first_seen"), about.get("last_seen")
+
+    def made(self, positions: Sequence[int]) -> Features:
+        return [self.features[position] for position in positions]
+
+    def named(self, feature_id: str) -> Features:
+        return [feature for feature in self.features if feature["id"] == feature_id]
+
+
+@dataclass(frozen=True, slots=True)
+class TileSquares(Source):
+    """Tiles in ascending order: of a city's 28,000 a page shows some."""
+
+    tiles: Sequence[CoveredTile]
+    lattice: Lattice
+
+    def __len__(self) -> int:
+        return len(self.tiles)
+
+    def shapes(self) -> Shapes:
+        side_m = TILE_CELLS * CELL_SIZE
+        places = np.array([(tile.col, tile.row) for tile in self.tiles], dtype=np.float64).reshape(-1, 2)
+        low = places * side_m + (self.lattice.x0, self.lattice.y0)
+        squares: Shapes = shapely.box(*low.T, *(low + side_m).T)
+        return squares
+
+    def times(self, position: int) -> tuple[str | None, str | None]:
+        return None, self.tiles[position].last_seen
+
+    def made(self, positions: Sequence[int]) -> Features:
+        rows = [asdict(self.tiles[position]) for position in positions]
+        squares: Features = msgspec.to_builtins(tile_squares(rows, self.lattice).features)
+        return [square | {"id": tile_key((row["row"], row["col"]))} for square, row in zip(squares, rows, strict=True)]
+
+    def named(self, feature_id: str) -> Features:
+        if not re.fullmatch(r"-?\d{1,9},-?\d{1,9}", feature_id, re.ASCII):
+            return []
+        row, col = map(int, feature_id.split(","))
+        at = bisect_left(self.tiles, (row, col), key=lambda tile: (tile.row, tile.col))
+        return [feature for feature in self.made(range(at, min(at + 1, len(self)))) if feature["id"] == feature_id]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +124,7 @@ class Collection:
 
     title: str
     description: str
-    features: Callable[[Store, bool, int, int], Features] | None
+    features: Callable[[Store, bool, int, int], Source] | None
     """``(store, known, old, new)``: the features, as far as may be ``known``; None: the desk makes them."""
     for_reviewers: bool = False
     """Whether only reviewers and operators see it."""
@@ -45,24 +132,21 @@ class Collection:
     """Whether it compares two versions."""
 
 
-def _changes(store: Store, with_names: bool, old: int, new: int) -> Features:
-    features: Features = msgspec.to_builtins(changes_between(store, old, new, with_names=with_names).features)
-    return features
+def _changes(store: Store, with_names: bool, old: int, new: int) -> Source:
+    return Whole(msgspec.to_builtins(changes_between(store, old, new, with_names=with_names).features))
 
 
-def _tiles(store: Store, with_names: bool, old: int, new: int) -> Features:
-    rows = [asdict(tile) for tile in tiles_seen(store, with_names)]
-    squares: Features = msgspec.to_builtins(tile_squares(rows, store.lattice).features)
-    return [square | {"id": f"{row['row']},{row['col']}"} for square, row in zip(squares, rows, strict=True)]
+def _tiles(store: Store, with_names: bool, old: int, new: int) -> Source:
+    return TileSquares(tiles_seen(store, with_names), store.lattice)
 
 
-def _seen(store: Store, with_names: bool, old: int, new: int) -> Features:
-    return [tile for tile in _tiles(store, with_names, old, new) if tile["properties"]["vehicles"]]
+def _seen(store: Store, with_names: bool, old: int, new: int) -> Source:
+    return TileSquares([tile for tile in tiles_seen(store, with_names) if tile.vehicles], store.lattice)
 
 
-def _passes(store: Store, with_names: bool, old: int, new: int) -> Features:
+def _passes(store: Store, with_names: bool, old: int, new: int) -> Source:
     lines: Features = msgspec.to_builtins(wanted_passes(store).features)
-    return [line | {"id": str(number)} for number, line in enumerate(lines, 1)]
+    return Whole([line | {"id": str(number)} for number, line in enumerate(lines, 1)])
 
 
 COLLECTIONS: Mapping[str, Collection] = {
@@ -118,35 +202,63 @@ class OnEarth:
         return [1, 0] if read_crs(self.frame.crs).axis_info[0].direction == "north" else [0, 1]
 
 
-def extent(features: Sequence[Mapping[str, Any]], place: OnEarth) -> list[float] | None:
-    """[west, south, east, north] in degrees of all features; None without any."""
-    if not features:
+def extent(source: Source, place: OnEarth) -> list[float] | None:
+    """[west, south, east, north] in degrees of all features, west > east over the date line; None without any."""
+    if not len(source):
         return None
-    bounds = shapely.total_bounds(np.array([shape(feature["geometry"]) for feature in features]))
-    corners = np.array([[bounds[i], bounds[j]] for i in (0, 2) for j in (1, 3)])
-    degrees = place.out(corners, CRS84)
-    return [*degrees.min(axis=0).tolist(), *degrees.max(axis=0).tolist()]
+    west, south, east, north = _bounds_in(shapely.total_bounds(source.shapes()), place, CRS84).tolist()
+    return [(west + 180.0) % 360.0 - 180.0, south, (east + 180.0) % 360.0 - 180.0, north]
 
 
-def within(features: Sequence[dict[str, Any]], box: Sequence[float], place: OnEarth, crs: str) -> Features:
-    """The features that a box meets: (x0, y0, x1, y1) in a system. BadRequest if it is none."""
+def within(source: Source, box: Sequence[float], place: OnEarth, crs: str) -> list[int]:
+    """Positions of the features that a box meets: (x0, y0, x1, y1) in a system. BadRequest if it is none."""
     if len(box) not in (4, 6) or not np.isfinite(box).all():
         raise BadRequest("bbox needs four numbers, or six with heights")
-    x0 = box[0]
-    y0 = box[1]
-    x1 = box[len(box) // 2]
-    y1 = box[len(box) // 2 + 1]
-    if y0 > y1 or (x0 > x1 and crs != CRS84):
+    half = len(box) // 2
+    low = np.array(box[:half])
+    high = np.array(box[half:])
+    over_date_line = crs == CRS84 and low[0] > high[0]
+    if (low > high)[1 if over_date_line else 0 :].any():
         raise BadRequest("bbox: the lower corner comes first")
-    # The edges of a box are curves in the map: it is cut into short ones.
-    edge = shapely.segmentize(shapely.box(x0, y0, x1 if x1 >= x0 else x1 + 360.0, y1), max(abs(y1 - y0), 1e-9) / 8.0)
-    metres = shapely.transform(edge, lambda xy: place.into(xy, crs))
-    meets = shapely.intersects(metres, np.array([shape(feature["geometry"]) for feature in features], dtype=object))
-    return [feature for feature, met in zip(features, np.atleast_1d(meets), strict=True) if met]
+    if not len(source):
+        return []
+    high[0] += 360.0 if over_date_line else 0.0
+    shapes = source.shapes()
+    bounds = _bounds_in(shapely.total_bounds(shapes), place, crs)
+    area = _area(np.array([low[:2], high[:2]]), bounds, place, crs)
+    shapely.prepare(area)
+    positions: list[int] = np.flatnonzero(shapely.intersects(area, shapes)).tolist()
+    return positions
 
 
-def during(features: Sequence[dict[str, Any]], interval: str) -> Features:
-    """The features whose time meets an instant or an interval of RFC 3339 ("../..", "a/b"); those without one stay.
+def _bounds_in(bounds_m: F64, place: OnEarth, crs: str) -> F64:
+    """(4,) [x0, y0, x1, y1] in a system around a box (4,) of map metres. Longitudes are continuous: over the date line
+    they go on above 180 degrees."""
+    side_m = max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
+    outline = shapely.segmentize(shapely.box(*bounds_m), side_m / 8.0)
+    xy = place.out(shapely.get_coordinates(outline), crs)
+    if crs == CRS84:
+        xy[:, 0] = (xy[:, 0] - xy[0, 0] + 180.0) % 360.0 - 180.0 + xy[0, 0]
+    return np.array([*xy.min(axis=0), *xy.max(axis=0)])
+
+
+def _area(corners: F64, bounds: F64, place: OnEarth, crs: str) -> shapely.Geometry:
+    """The part of a box with these corners (2, 2) that lies near ``bounds`` (4,), both in a system, in map metres: far
+    away a projection knows no coordinates. Its edges are curves in the map, so they are cut into short ones."""
+    margin = 0.1 * (bounds[2:] - bounds[:2]) + 1e-6
+    parts = []
+    for turn in (-360.0, 0.0, 360.0) if crs == CRS84 else (0.0,):
+        low = np.maximum(corners[0] + (turn, 0.0), bounds[:2] - margin)
+        high = np.minimum(corners[1] + (turn, 0.0), bounds[2:] + margin)
+        if (low <= high).all():
+            side = max(*(high - low), 1e-9)
+            parts.append(shapely.segmentize(shapely.box(*low, *high), side / 8.0))
+    return shapely.transform(shapely.union_all(parts), lambda xy: place.into(xy, crs))
+
+
+def during(source: Source, positions: Sequence[int], interval: str) -> list[int]:
+    """Those ``positions`` whose feature's time meets an instant or an interval of RFC 3339 ("../..", "a/b"); features
+    without one stay.
 
     BadRequest if the text is neither.
     """
@@ -158,12 +270,11 @@ def during(features: Sequence[dict[str, Any]], interval: str) -> Features:
     if low > high:
         raise BadRequest("datetime: the interval ends before it begins")
 
-    def meets(feature: dict[str, Any]) -> bool:
-        last = feature["properties"].get("last_seen")
-        first = feature["properties"].get("first_seen") or last
-        return last is None or (_instant(str(first), low) <= high and _instant(str(last), high) >= low)
+    def meets(position: int) -> bool:
+        first, last = source.times(position)
+        return last is None or (_instant(first or last, low) <= high and _instant(last, high) >= low)
 
-    return [feature for feature in features if meets(feature)]
+    return [position for position in positions if meets(position)]
 
 
 def _instant(text: str, unbounded: datetime) -> datetime:
