@@ -121,6 +121,34 @@ def test_a_box_holds_what_it_meets_in_degrees_and_in_metres(url: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("box", "n"),
+    [
+        ("-180,-90,180,90", 2),
+        ("100,-10,-100,80", 2),  # over the date line
+        ("-100,-10,100,80", 0),
+        ("-181,0,181,60", 2),
+        ("-180,-90,-9,180,90,9", 2),  # with heights
+    ],
+)
+def test_a_box_may_be_the_world_or_cross_the_date_line(url: str, box: str, n: int) -> None:
+    assert get(f"{url}/collections/tiles/items?bbox={box}").json()["numberMatched"] == n
+
+
+def test_a_map_on_the_date_line_is_found_from_both_sides(tmp_path: Path) -> None:
+    ((x, y),) = frame_of({"crs": "EPSG:32601"}).plane_from_lonlat(np.array([[180.0, 72.0]]))
+    there = replace(two_walls(), georeference={"crs": "EPSG:32601", "offset": f"{x - 76.8},{y},0"})
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", there).close()
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as address:
+        tiles = f"{address}/ogc/collections/tiles"
+        ((west, south, east, north),) = get(tiles).json()["extent"]["spatial"]["bbox"]
+        assert west > 179.9
+        assert east < -179.9
+        for box in (f"{west},{south},{east},{north}", "-180,-90,180,90", "-180,0,-179,80", "179,0,180,80"):
+            assert get(f"{tiles}/items?bbox={box}").json()["numberMatched"] >= 1
+        assert get(f"{tiles}/items?bbox=-1,0,1,80").json()["numberMatched"] == 0
+
+
+@pytest.mark.parametrize(
     ("interval", "n"),
     [("../..", 1), ("1960-01-01/..", 1), ("../1960-01-01T00:00:00Z", 0), ("2999-01-01T00:00:00Z", 0)],
 )
@@ -130,7 +158,7 @@ def test_an_interval_of_time_holds_the_changes_seen_in_it(url: str, interval: st
 
 @pytest.mark.parametrize(
     "query",
-    ["bbox=1,2,3", "bbox=a,b,c,d", "bbox=1,9,2,3", "limit=0", "limit=x", "offset=-1", "datetime=monday", "colour=red",
+    ["bbox=1,2,3", "bbox=1,2,9,3,4,5", "bbox=nan,0,1,1", "bbox=a,b,c,d", "bbox=1,9,2,3", "limit=0", "limit=x", "offset=-1", "datetime=monday", "colour=red",
      "crs=EPSG:1", "bbox-crs=x", "datetime=2020-01-02/2020-01-01", "datetime=a/b/c", "f=gml", "from=0"],
 )  # fmt: skip
 def test_a_wrong_or_unknown_parameter_is_400_and_says_which(url: str, query: str) -> None:
