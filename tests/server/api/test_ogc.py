@@ -158,9 +158,25 @@ def test_an_interval_of_time_holds_the_changes_seen_in_it(url: str, interval: st
 
 @pytest.mark.parametrize(
     "query",
-    ["bbox=1,2,3", "bbox=1,2,9,3,4,5", "bbox=nan,0,1,1", "bbox=a,b,c,d", "bbox=1,9,2,3", "limit=0", "limit=x", "offset=-1", "datetime=monday", "colour=red",
-     "crs=EPSG:1", "bbox-crs=x", "datetime=2020-01-02/2020-01-01", "datetime=a/b/c", "f=gml", "from=0"],
-)  # fmt: skip
+    [
+        "bbox=1,2,3",
+        "bbox=1,2,9,3,4,5",
+        "bbox=nan,0,1,1",
+        "bbox=a,b,c,d",
+        "bbox=1,9,2,3",
+        "limit=0",
+        "limit=x",
+        "offset=-1",
+        "datetime=monday",
+        "colour=red",
+        "crs=EPSG:1",
+        "bbox-crs=x",
+        "datetime=2020-01-02/2020-01-01",
+        "datetime=a/b/c",
+        "f=gml",
+        "from=0",
+    ],
+)
 def test_a_wrong_or_unknown_parameter_is_400_and_says_which(url: str, query: str) -> None:
     assert query.partition("=")[0] in get(f"{url}/collections/changes/items?{query}", 400).json()["detail"]
 
