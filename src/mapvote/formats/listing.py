@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from fnmatch import translate
 from pathlib import Path, PureWindowsPath
 
@@ -59,3 +60,21 @@ def files_like(folder: Path, pattern: str) -> list[Path]:
     except OSError:
         return []
     return [place / name for name in sorted(names)]
+
+
+def clouds_beside(folder: Path, taken: Sequence[Path], suffixes: str = "pcd|las|laz|ply|e57|xyz|pts") -> list[str]:
+    """Names in ``folder`` that point clouds have, compressed ones and folders too, without the files ``taken``."""
+    cloud = re.compile(rf"[^.].*\.({suffixes})(\.(gz|bz2|xz|zst|zip|7z))?", re.IGNORECASE)
+    names = {file.name for file in taken}
+    return sorted(name for name in os.listdir(folder) if cloud.fullmatch(name) and name not in names)
+
+
+def require_all_tiles(folder: Path, tiles: Sequence[Path]) -> None:
+    """MapvoteError if point clouds lie beside the ``tiles`` that are read: a part of the map would be missing."""
+    others = clouds_beside(folder, tiles)
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise MapvoteError(
+            f"{folder}: {others[0]}{more} would not be read beside {tiles[0].name}, and a part of the map would be "
+            "missing. Unpack it, bring all tiles into one format (mapvote export TILE NEW), or move it elsewhere"
+        )

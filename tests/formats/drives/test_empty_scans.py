@@ -77,3 +77,18 @@ def test_scans_without_points_are_left_out_and_named(
 def test_a_drive_without_any_point_is_refused(layout: str, tmp_path: Path) -> None:
     with pytest.raises(MapvoteError, match=f"none of its {N} scans holds a point"):
         open_drive(LAYOUTS[layout](tmp_path / "drive", set(range(N))))
+
+
+@pytest.mark.parametrize("layout", ["KITTI", "PCD"])
+@pytest.mark.parametrize("packed", [True, False])
+def test_scans_that_are_compressed_or_folders_are_named(
+    layout: str, packed: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = LAYOUTS[layout](tmp_path / "drive", set())
+    suffix = {"KITTI": ".bin", "PCD": ".pcd"}[layout]
+    room = folder / "velodyne" if layout == "KITTI" else folder
+    name = f"{N:06}{suffix}" + (".gz" if packed else "")
+    (room / name).touch() if packed else (room / name).mkdir()
+    with caplog.at_level(logging.WARNING):
+        assert len(open_drive(folder).stamps_ns) == N
+    assert f"1 scans are compressed or folders: left out ({name})" in caplog.text

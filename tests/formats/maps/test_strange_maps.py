@@ -74,3 +74,14 @@ def test_a_folder_of_las_tiles_is_one_map_and_a_folder_of_las_scans_is_none(tmp_
     assert import_cloud(tmp_path / "tiles")[0].n_points == 12_000
     with pytest.raises(MapvoteError):
         import_cloud(tmp_path / "scans")
+
+
+@pytest.mark.parametrize("beside", ["1_0.las", "1_0.pcd.gz", "1_0.PCD"])
+def test_tiles_of_another_kind_beside_tiles_are_an_error_and_no_part_of_a_map(tmp_path: Path, beside: str) -> None:
+    written(tmp_path / "0_0.pcd", POINTS)
+    other = tmp_path / beside
+    other.mkdir() if beside.endswith("PCD") else other.write_bytes(b"any")
+    with pytest.raises(MapvoteError, match=f"{beside} would not be read beside 0_0.pcd"):
+        import_cloud(tmp_path)
+    other.rename(tmp_path / "note.txt")
+    assert len(all_points(import_cloud(tmp_path)[0])) == len(POINTS)

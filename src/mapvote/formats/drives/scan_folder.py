@@ -30,7 +30,7 @@ from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
 from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, date_ns, of_scans, prior_of
-from mapvote.formats.listing import entry, files_like
+from mapvote.formats.listing import clouds_beside, entry, files_like
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import table_of, xyz
 from mapvote.formats.maps.field_names import known_fields
@@ -117,6 +117,9 @@ def _tell_unread(files: Sequence[Path]) -> None:
         if others:
             problem = "%s: %d files *%s lie beside the *%s that are read; they are left out"
             log.warning(problem, room, len(others), suffix, taken)
+    unread = clouds_beside(room, files, taken.lstrip("."))
+    if unread:
+        log.warning("%s: %d scans are compressed or folders: left out (%s); unpack them", room, len(unread), unread[0])
 
 
 def _with_points(path: Path, folder: ScanFolder) -> tuple[I64, tuple[str, ...]]:

@@ -28,7 +28,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs
 from mapvote.formats.geo.units import METRES, with_units
-from mapvote.formats.listing import files_like, is_recording
+from mapvote.formats.listing import files_like, is_recording, require_all_tiles
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces
 from mapvote.formats.maps.field_names import kept_fields, known_fields, other_fields
@@ -121,8 +121,11 @@ def tile_files(path: Path) -> list[Path]:
 
 
 def stream_las_tiles(path: Path) -> Iterator[Cloud]:
-    """The points of all tiles, one file after the other, each in the coordinates that its file names."""
-    for file in tile_files(path):
+    """The points of all tiles, one file after the other, each in the coordinates that its file names. MapvoteError if
+    clouds of another kind lie beside them."""
+    files = tile_files(path)
+    require_all_tiles(path, files)
+    for file in files:
         yield from stream_las(file)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.listing import files_like, is_recording
+from mapvote.formats.listing import files_like, is_recording, require_all_tiles
 from mapvote.formats.maps.cloud import (
     READ_SIZES,
     Cloud,
@@ -93,8 +93,11 @@ def hardly_overlap(boxes: Sequence[tuple[F64, F64]], rule: TileRule = TILE_RULE)
 
 
 def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
-    """The points of all tiles, one file after the other: points are in map metres, names say nothing about places."""
-    for file in files_like(path, "*.pcd"):
+    """The points of all tiles, one file after the other: points are in map metres, names say nothing about places.
+    MapvoteError if clouds of another kind lie beside them."""
+    files = files_like(path, "*.pcd")
+    require_all_tiles(path, files)
+    for file in files:
         yield from stream_pcd(file)
 
 
