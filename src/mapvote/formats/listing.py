@@ -42,6 +42,18 @@ def entry(folder: Path, name: str) -> Path:
     return folder
 
 
+def file_if_any(folder: Path, name: str) -> Path | None:
+    """The file that :func:`entry` finds; None if there is none. MapvoteError if a folder, or a link to nothing, has the
+    name."""
+    place = entry(folder, name)
+    if place.is_file():
+        return place
+    if place.exists() or place.is_symlink():
+        kind = "a link to nothing" if place.is_symlink() else "no file"
+        raise MapvoteError(f"{place}: is {kind}; a file is read from there: put it there, or rename what is there")
+    return None
+
+
 def is_recording(folder: Path) -> bool:
     """Whether stamps, poses or a description of a drive lie in ``folder``: its clouds are scans, not tiles of a map."""
     return any(entry(folder, name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))

@@ -92,3 +92,13 @@ def test_scans_that_are_compressed_or_folders_are_named(
     with caplog.at_level(logging.WARNING):
         assert len(open_drive(folder).stamps_ns) == N
     assert f"1 scans are compressed or folders: left out ({name})" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["drive.toml", "prior.txt", "times.txt"])
+@pytest.mark.parametrize("is_link", [True, False])
+def test_a_folder_or_a_link_to_nothing_is_no_missing_file(name: str, is_link: bool, tmp_path: Path) -> None:
+    folder = kitti(tmp_path / "drive", set())
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(tmp_path / "moved") if is_link else (folder / name).mkdir()
+    with pytest.raises(MapvoteError, match=f"{name}: is {'a link to nothing' if is_link else 'no file'}"):
+        open_drive(folder)

@@ -29,7 +29,7 @@ from mapvote.formats.drives.sensor_estimate import (
     turning_about,
 )
 from mapvote.formats.geo.frame import MapFrame, enu_frame
-from mapvote.formats.listing import below, entry
+from mapvote.formats.listing import below, entry, file_if_any
 from mapvote.formats.reading import read_text
 
 
@@ -112,9 +112,10 @@ def source_of_times(drive: Path) -> str:
 def drive_options(folder: Path, **said: Unpack[SaidOfDrive]) -> DriveOptions:
     """drive.toml in ``folder``, or beside a drive that is one file, and over it what is ``said``. MapvoteError names an
     unknown key or a wrong value."""
-    file = entry(beside(folder), "drive.toml")
+    file = beside(folder) / "drive.toml"
+    stated = file_if_any(beside(folder), "drive.toml")
     try:
-        table = tomllib.loads(read_text(file)) if file.is_file() else {}
+        table = {} if stated is None else tomllib.loads(read_text(stated))
     except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"{file}: not valid TOML ({error})") from error
     prior = table.get("prior")

@@ -30,7 +30,7 @@ from mapvote.formats.drives.options import DriveOptions, make_drive, step_of
 from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
 from mapvote.formats.drives.scan_names import in_natural_order, stamps_of_names_ns
 from mapvote.formats.drives.trajectory import Trajectory, check_rigid, date_ns, of_scans, prior_of
-from mapvote.formats.listing import clouds_beside, entry, files_like
+from mapvote.formats.listing import clouds_beside, file_if_any, files_like
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import table_of, xyz
 from mapvote.formats.maps.field_names import known_fields
@@ -74,8 +74,8 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
 
     MapvoteError if there is none of them.
     """
-    table = entry(folder, "times.txt")
-    if table.is_file():
+    table = file_if_any(folder, "times.txt")
+    if table is not None:
         times_ns = of_scans(read_times_ns(table), files, table)
         if len(times_ns) and has_date(int(times_ns[0])) and has_date(options.start_ns):
             problem = f"{table}: its times count from 1970 already, and drive.toml adds start_ns = {options.start_ns}"
@@ -85,7 +85,9 @@ def read_stamps(folder: Path, files: list[Path], options: DriveOptions) -> I64:
     if stamps_ns is not None:
         return stamps_ns
     if options.rate_hz is None:
-        raise MapvoteError(f"{table}: missing; write one line of seconds per scan, or give --rate HZ (10 for KITTI)")
+        raise MapvoteError(
+            f"{folder / 'times.txt'}: missing; write one line of seconds per scan, or give --rate HZ (10 for KITTI)"
+        )
     return options.start_ns + np.round(np.arange(len(files)) * (1e9 / options.rate_hz)).astype(np.int64)
 
 

@@ -26,7 +26,7 @@ from mapvote.formats.drives.point_fields import log
 from mapvote.formats.drives.pose_header import Column, find_header, is_number, number_in, split_row
 from mapvote.formats.drives.scan_names import numbers_of
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
-from mapvote.formats.listing import entry
+from mapvote.formats.listing import entry, file_if_any
 from mapvote.formats.reading import read_text
 
 
@@ -520,8 +520,11 @@ def prior_of(
     if said is not None and said.lower() == "none":
         return Prior()
     home = beside(path)
-    places = (entry(home, "prior.txt"),) if said is None else () if said == own_name else (Path(said), home / said)
-    file = next((place for place in places if place.is_file()), None)
+    if said is None:
+        file = file_if_any(home, "prior.txt")
+    else:
+        places = () if said == own_name else (Path(said), home / said)
+        file = next((place for place in places if place.is_file()), None)
     if file is None and said not in (None, own_name):
         raise MapvoteError(f"{said}: no such prior, neither here nor in {path}; give a file of 3 x 4 rows, or none")
     if file is not None and not has_times(file):
