@@ -354,7 +354,7 @@ class Services:
         """Short changes: keys, policy, votes taken back."""
         self.rounds = Lane("rounds", 4, each=2)
         """Work that fuses tiles, or reads the whole store."""
-        self._fuse = ThreadPoolExecutor(2, "fuse")
+        self._fuse = ThreadPoolExecutor(1, "fuse")  # two take as long, and a third more CPU: they share the interpreter
         self.fusing = executor or self._fuse
         """The executor that fuses tiles."""
         quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
