@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, NO_VOTE, U8, CellState, Drive, MapvoteError
 from mapvote.formats.atomic import whole_file
 
@@ -199,12 +200,12 @@ def _headline(diagnosis: Diagnosis, most: int) -> str:
 def _some_scans(drive: Drive, sizes: PictureSizes) -> dict[int, F32]:
     """A few scans along the drive, thinned; broken ones left out."""
     scans = {}
-    for i in np.unique(np.linspace(0, len(drive) - 1, sizes.scans).astype(np.int64)):
+    for i in evenly(0, len(drive) - 1, sizes.scans).tolist():
         try:
-            points = drive.read_scan(int(i)).points
+            points = drive.read_scan(i).points
         except MapvoteError:
             continue
-        scans[int(i)] = _thinned(points, sizes.points_of_a_scan)
+        scans[i] = _thinned(points, sizes.points_of_a_scan)
     return scans
 
 

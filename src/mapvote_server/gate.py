@@ -21,6 +21,7 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.listing import below
@@ -132,7 +133,7 @@ def gate(
     if drive.T_map_lidar_prior is None:
         raise MapvoteError(f"{drive.path}: the gate needs a drive with prior poses (prior.txt, or --prior FILE)")
     near = scans_near(old, new, drive.T_map_lidar_prior, GATE_RULE.reach_m)
-    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), GATE_RULE.most_scans)).astype(np.int64))]
+    chosen = near[evenly(0, len(near) - 1, min(len(near), GATE_RULE.most_scans))]
     if len(chosen) < GATE_RULE.min_scans:
         reason = (
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "

@@ -240,11 +240,9 @@ def _warnings_of(watching: list[Looking], unchecked: bool) -> list[tuple[str, li
 def require_straight(drive: Drive, report: DriveReport, point_map: PointMap, *, unchecked: bool = False) -> None:
     """MapvoteError for a drive whose scans fit the map better with other times of points, or whose points lie off the
     map's surfaces: no ballot comes of it. ``unchecked``: a warning."""
-    from mapvote.doctor.bent_scans import check_bent
-    from mapvote.doctor.off_surfaces import check_off_surfaces
+    from mapvote.doctor.off_surfaces import check_points
 
-    bent = list(check_bent(drive, report.T_map_lidar, point_map))
-    for finding in bent or check_off_surfaces(drive, report.T_map_lidar, point_map):
+    for finding in check_points(drive, report.T_map_lidar, point_map):
         if finding.severity == "error" and not unchecked:
             raise MapvoteError(f"{drive.path}: {finding.what}. {finding.mend}; nothing was written")
         _warn(str(drive.path), [finding])

@@ -16,6 +16,7 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.doctor import Finding
 from mapvote.formats.drives.point_fields import spinning_time_s
@@ -60,7 +61,7 @@ def check_bent(
     first_level = len(LEVELS) - 1 if localised else 0
     scores: dict[str, list[float]] = {}
     times = None
-    for i in np.unique(np.linspace(1, len(poses) - 2, BENT_SCANS.scans).astype(np.int64)).tolist():
+    for i in evenly(1, len(poses) - 2, BENT_SCANS.scans).tolist():
         twist = _steady_motion(stamps_ns, poses, i)
         if twist is None:
             continue

@@ -20,12 +20,11 @@ from mapvote.core.record import record
 from mapvote.core.types import F64, CellState, Drive, MapvoteError
 from mapvote.doctor import Finding, Progress, any_error, in_order
 from mapvote.doctor.bags import check_bag, check_lidars_of_bag
-from mapvote.doctor.bent_scans import check_bent
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
 from mapvote.doctor.maps import check_cloud, check_map, classified_ground, examine_map, tile_by_tile
-from mapvote.doctor.off_surfaces import check_off_surfaces
+from mapvote.doctor.off_surfaces import check_points
 from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.reading_on_map import decided_by_map
 from mapvote.doctor.scans import IN_MAP_FRAME, NO_PRIOR, cheap_checks
@@ -178,8 +177,7 @@ def _with_map(
         more, T_level = check_on_map(mount.turned(drive), T @ mount.C.T, point_map, progress)
         T = T_level @ mount.C
     if not any_error(more):
-        bent = list(check_bent(drive, list(T), point_map, localised=False))
-        more += bent or check_off_surfaces(drive, list(T), point_map, localised=False)
+        more += check_points(drive, list(T), point_map, localised=False)
     if not of_map and all(f.severity == "note" for f in more):
         findings = [f for f in findings if not f.map_tells]
     return [*findings, *named, *more], T

@@ -15,6 +15,7 @@ import scipy
 
 from mapvote.core.geometry import exp, inverse, log, transform
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, Drive
 from mapvote.doctor import Finding
 from mapvote.matching.matcher import likelihood_at
@@ -97,7 +98,7 @@ def _places(T_base_lidars: F64) -> F64:
 def _sweeps(drive: Drive, T_base_lidars: F64, rules: SweepRules) -> Iterator[list[F32]]:
     """The points of each LiDAR, in its own axes, of sweeps in which all took part."""
     stated = _places(T_base_lidars)
-    for i in np.unique(np.linspace(0, len(drive) - 1, rules.sweeps).astype(np.int64)).tolist():
+    for i in evenly(0, len(drive) - 1, rules.sweeps).tolist():
         parts = [part.points for _, part in drive.read_scan(i).by_lidar()]
         if len(parts) == len(T_base_lidars):
             own = [transform(inverse(T), p).astype(np.float32) for T, p in zip(stated, parts[1:], strict=True)]

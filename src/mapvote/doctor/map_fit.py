@@ -19,6 +19,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, cut_tiles
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
@@ -130,7 +131,7 @@ class MapEvidence:
     def scans(self) -> dict[int, Scan]:
         """Along the drive, by their numbers; de-skewed by the prior's motion."""
         out = {}
-        for i in np.unique(np.linspace(0, len(self.drive) - 1, MAP_FIT_RULE.places).astype(np.int64)).tolist():
+        for i in evenly(0, len(self.drive) - 1, MAP_FIT_RULE.places).tolist():
             scan = self.drive.read_scan(i)
             points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
             out[i] = Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))

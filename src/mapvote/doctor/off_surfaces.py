@@ -14,10 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, Bool, Drive, MapvoteError
 from mapvote.doctor import Finding
+from mapvote.doctor.bent_scans import check_bent
 from mapvote.matching.ndt_map import MapWindow, tiles_within
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, deskew, motion_at
@@ -65,6 +68,15 @@ class OffSurfaces:
 OFF_SURFACES = OffSurfaces()
 
 
+def check_points(
+    drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap, *, localised: bool = True
+) -> list[Finding]:
+    """Whether times or ranges of the points are wrong, by the map: bent scans, else points off its surfaces, on which
+    those of bent scans do not lie either. ``T_map_lidar`` as :func:`check_off_surfaces`."""
+    bent = list(check_bent(drive, T_map_lidar, point_map, localised=localised))
+    return bent or list(check_off_surfaces(drive, T_map_lidar, point_map, localised=localised))
+
+
 def check_off_surfaces(
     drive: Drive,
     T_map_lidar: Sequence[F64],
@@ -82,7 +94,7 @@ def check_off_surfaces(
     first_level = len(LEVELS) - 1 if localised else 0
     of_walls: list[tuple[float, float]] = []
     of_roads: list[tuple[float, float]] = []
-    for i in np.unique(np.linspace(0, len(poses) - 1, rules.scans).astype(np.int64)).tolist():
+    for i in evenly(0, len(poses) - 1, rules.scans).tolist():
         try:
             scan = drive.read_scan(i)
         except MapvoteError:  # its own finding
@@ -107,7 +119,7 @@ def _off_planes(points: F32, T: F64, point_map: PointMap, rules: OffSurfaces) ->
     few = points[:: max(1, len(points) // rules.points)].astype(np.float64)
     range_m = np.linalg.norm(few, axis=1)
     few = few[(range_m > rules.ranges_m[0]) & (range_m < rules.ranges_m[1])]
-    on_map = few @ T[:3, :3].T + T[:3, 3]
+    on_map = transform(T, few)
     tiles = [point_map.tiles[index].points_map for index in tiles_within(point_map, T[:3, 3], rules.ranges_m[1])]
     mapped = np.concatenate([np.zeros((0, 3)), *tiles])
     if len(mapped) < rules.neighbours or not len(on_map):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.mount import mount_of_prior
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan, TimesTold
 from mapvote.doctor import Finding, Severity, any_error, usable
 from mapvote.doctor.lean import check_lean
@@ -171,11 +172,7 @@ def looked_at(drive: Drive, progress: Callable[[int, int], None] | None = None) 
     """A drive that must be usable. Some of its scans are looked at before, the others when they are read: so none is
     read only to be looked at. MapvoteError with the first error that some of the scans show, as of all scans."""
     looking = Looking(drive)
-    sample = (
-        np.unique(np.linspace(0, len(drive) - 1, SCAN_CHECK.first_scans).astype(np.int64)).tolist()
-        if len(drive)
-        else []
-    )
+    sample = evenly(0, len(drive) - 1, SCAN_CHECK.first_scans).tolist() if len(drive) else []
     if any_error(cheap_checks(drive, looking.look(sample, progress))):
         looking.warnings(progress)
     return looking

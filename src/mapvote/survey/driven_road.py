@@ -21,6 +21,7 @@ import scipy
 
 from mapvote.core.geometry import transform
 from mapvote.core.record import record
+from mapvote.core.sampling import evenly
 from mapvote.core.types import F64, PRECISE_PRIOR, Bool, Drive
 
 
@@ -154,7 +155,7 @@ def wrong_attitude(
     if not drive.has_precise_prior:
         return None
     chosen = np.arange(len(drive)) if scans is None else np.asarray(scans, dtype=np.int64)
-    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(numbers.scans, len(chosen))).astype(np.int64))]
+    chosen = chosen[evenly(0, len(chosen) - 1, min(numbers.scans, len(chosen)))]
     pitches = np.array([_pitch_rad(drive, int(i), numbers) for i in chosen])
     pitches = np.degrees(pitches[np.isfinite(pitches)])
     if len(pitches) < numbers.min_scans:
