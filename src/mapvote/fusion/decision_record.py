@@ -75,7 +75,7 @@ class Record:
     @cached_property
     def states(self) -> U8:
         """(256, 256) CellState or NO_VOTE."""
-        return unpack_plane(self.packed_states, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
+        return unpack_decided(self.packed_states)
 
     @cached_property
     def tally(self) -> I32:
@@ -103,6 +103,11 @@ class Record:
         """Every vote that stood on the tile, without its planes and names, and why it did not count; in the order of
         the ballots."""
         return unpack_standings(self.packed_standings)
+
+
+def unpack_decided(data: bytes) -> U8:
+    """(256, 256) CellState or NO_VOTE. MapvoteError if it is damaged."""
+    return unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
 
 
 def pack_tally(tally: NDArray[Any]) -> bytes:

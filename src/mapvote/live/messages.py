@@ -6,7 +6,6 @@ copied.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.compressed_cloud import COMPRESSED
-from mapvote.formats.drives.point_fields import LIVOX, livox_table
+from mapvote.formats.drives.point_fields import LIVOX, livox_table, serialised_frame, serialised_stamp_ns
 from mapvote.formats.reading import first_line
 from mapvote.live.message_types import lacking_types
 
@@ -94,10 +93,8 @@ def from_cdr(kind: str, data: bytes | memoryview) -> Any:
 def _cloud_of_livox(kind: str, data: bytes | memoryview) -> Any:
     """The PointCloud2 of a CustomMsg. rosbags would make an object of each point."""
     table = livox_table(kind, data, ros2=True)
-    seconds, nanoseconds, length = struct.unpack_from("<3I", data, 4)
-    frame = bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
     columns = {name: table[name] for name in table.dtype.names or ()}
-    return cloud_of(columns, seconds * 10**9 + nanoseconds, frame)
+    return cloud_of(columns, serialised_stamp_ns(kind, data, ros2=True), serialised_frame(data, ros2=True))
 
 
 def to_cdr(kind: str, message: Any) -> bytes:

@@ -30,8 +30,8 @@ class NodeParameters:
         return {f"rcl_interfaces/srv/{kind}": f"{self._name}/{name}" for name, kind in each.items()}
 
     def answer(self, service: str, request: Any) -> dict[str, Any]:
-        """The members of the response of a service of this type. As rclcpp has it, one unknown name makes the answer
-        empty."""
+        """The members of the response of a service of this type. One unknown name makes the answer empty, as in
+        rclcpp."""
         values = self._values()
         kind = service.rpartition("/")[2]
         if kind == "ListParameters":

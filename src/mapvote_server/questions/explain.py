@@ -25,7 +25,7 @@ from mapvote.core.times import utc
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
-from mapvote.fusion.decision_record import Record
+from mapvote.fusion.decision_record import Record, unpack_decided
 from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.fuse import Decision, decide_tile, deletions
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability
@@ -404,10 +404,7 @@ def _state_in(record: Record, cell: tuple[int, int]) -> str:
         return UNREADABLE
 
 
-@lru_cache(maxsize=EXPLAIN_SIZES.states)
-def _states_of(packed: bytes) -> U8:
-    """(256, 256) the states of a record."""
-    return Record(0, packed, b"", None, b"").states
+_states_of = lru_cache(maxsize=EXPLAIN_SIZES.states)(unpack_decided)
 
 
 def _edit_of(record: Record, cell: tuple[int, int]) -> Edit | None:

@@ -123,7 +123,7 @@ class Polled:
     """Votes in the cells in which they are not spent."""
 
     def key(self, index: TileIndex) -> Hashable:
-        """What the decision on a tile follows from, beside the tile and the policy."""
+        """All that decides a tile beside its content and the policy: two polls of one key give one decision."""
         votes = tuple((vote.ballot, vote.why) for vote in self.standing[index])
         rows = frozenset((row.ballot, row.sum) for row in self.rows.values() if (row.row, row.col) == index)
         return votes, rows, tuple((seq, cells.tobytes()) for seq, cells in self.bars[index])

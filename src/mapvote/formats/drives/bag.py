@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,13 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
 from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
 from mapvote.formats.drives.frames import Edges, pose_of_message
-from mapvote.formats.drives.point_fields import LIVOX, livox_table, point_cloud_table
+from mapvote.formats.drives.point_fields import (
+    LIVOX,
+    livox_table,
+    point_cloud_table,
+    serialised_frame,
+    serialised_stamp_ns,
+)
 from mapvote.formats.reading import first_line
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -90,17 +95,11 @@ class Bag:
 
     def frame_id(self, data: bytes) -> str:
         """The frame in the header of a serialised message, without reading the rest."""
-        order = "<" if not self.reader.is2 or data[1] & 1 else ">"
-        length = struct.unpack_from(f"{order}I", data, 12)[0] if len(data) >= 16 else 0
-        return bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+        return serialised_frame(data, ros2=self.reader.is2)
 
     def stamp_ns(self, data: bytes) -> int:
         """The stamp in the header of a serialised message, without reading the rest."""
-        order = "<" if not self.reader.is2 or data[1] & 1 else ">"
-        if len(data) < 12:
-            raise MapvoteError(f"{self.path}: a message of {len(data)} bytes has no header; copy the bag again")
-        seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
-        return int(seconds) * 10**9 + int(nanoseconds)
+        return serialised_stamp_ns(str(self.path), data, ros2=self.reader.is2)
 
 
 def stamps_of(bag: Bag, topic: str) -> I64:

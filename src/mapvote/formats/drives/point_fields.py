@@ -405,6 +405,26 @@ def livox_table(source: str, data: bytes | memoryview, *, ros2: bool) -> NDArray
     return np.frombuffer(whole, dtype=record)
 
 
+def serialised_stamp_ns(source: str, data: bytes | memoryview, *, ros2: bool) -> int:
+    """The stamp in the header of a serialised message, nanoseconds, without reading the rest. MapvoteError if the
+    message is too short."""
+    if len(data) < 12:
+        raise MapvoteError(f"{source}: a message of {len(data)} bytes has no header; copy the bag again")
+    seconds, nanoseconds = struct.unpack_from(f"{_order(data, ros2)}II", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def serialised_frame(data: bytes | memoryview, *, ros2: bool) -> str:
+    """The frame in the header of a serialised message, without reading the rest; "" if the message is too short."""
+    length = struct.unpack_from(f"{_order(data, ros2)}I", data, 12)[0] if len(data) >= 16 else 0
+    return bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+
+
+def _order(data: bytes | memoryview, ros2: bool) -> str:
+    """The order of bytes for struct: CDR (ROS 2) states it, ROS 1 is little-endian."""
+    return "<" if not ros2 or data[1] & 1 else ">"
+
+
 def stamp_of(message: Any) -> int:
     """Nanoseconds of the stamp in a message's header."""
     stamp = message.header.stamp
