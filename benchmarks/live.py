@@ -4,6 +4,7 @@
     python benchmarks/live.py kills DRIVE MAP --kills 50 # kill -9 at random moments, in half of them without a server
     python benchmarks/live.py priors DRIVE MAP           # scans that vote by each kind of prior, without DDS
     python benchmarks/live.py packets DRIVE MAP          # the same on a bag of tenths of revolutions
+    python benchmarks/live.py lidars DRIVE MAP           # CPU of two LiDARs against one with the same points, from bags
 
 DRIVE is one that ``mapvote simulate`` wrote, MAP what ``mapvote build`` made of its surveys. For kills the drive goes
 round and round with stamps that go on; at the end of a lap the vehicle leaps back to the start, where some scans are
@@ -23,14 +24,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.types import F64, I64, PosePrior, Scan
+from mapvote.core.types import F64, I64, Bool, Drive, PosePrior, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at
 from mapvote.formats.drives.frames import BASE_FRAME
@@ -272,9 +273,98 @@ def packets(drive_path: str, map_path: str) -> None:
     print(f"packets of a tenth in a bag: {voted} of {report.scans} revolutions voted ({len(drive)} were recorded)")
 
 
+@dataclass(frozen=True)
+class LidarPair:
+    """Two LiDARs that share the points of one."""
+
+    phase_s: float = 0.0
+    """By how much the second one's clouds begin later."""
+    yaw_rad: float = 0.0
+    """How the second one is turned on the vehicle."""
+
+
+LIDAR_PAIRS = {
+    "in phase": LidarPair(),
+    "a quarter of a turn later, turned by 180 deg": LidarPair(0.025, np.pi),
+    "half a turn later": LidarPair(0.05),
+    "three quarters of a turn later": LidarPair(0.075),
+}
+
+
+def record_lidars(path: Path, drive: Drive, pair: LidarPair | None) -> Path:
+    """A bag of the drive by one LiDAR, or by a pair of which each has every second point."""
+    assert drive.T_map_lidar_prior is not None
+    bag = Recorder(path)
+    T_first_second = from_xyz_rpy(0.0, 0.0, 0.0, 0.0, 0.0, 0.0 if pair is None else pair.yaw_rad)
+    bag.static({BASE_FRAME: np.eye(4), "second": T_first_second})
+    end: Scan | None = None
+    for i, scan in enumerate(drive):
+        ns = scan.stamp_ns
+        bag.write_raw("/odom", ODOMETRY, ns, odometry_message(ns, drive.T_map_lidar_prior[i]))
+        if pair is None:
+            bag.write_raw("/points", CLOUD, ns, cloud_message(scan, BASE_FRAME))
+            continue
+        assert scan.time_s is not None
+        second = np.arange(len(scan.points)) % 2 == 1
+        bag.write_raw("/points", CLOUD, ns, cloud_message(chosen_points(scan, ~second), BASE_FRAME))
+        begun = scan.time_s - scan.time_s.min() < pair.phase_s
+        if end is not None:
+            _write_second(bag, end, chosen_points(scan, second & begun), pair)
+        end = chosen_points(scan, second & ~begun)
+    bag.bag.close()
+    return path
+
+
+def chosen_points(scan: Scan, chosen: Bool) -> Scan:
+    """The scan with the ``chosen`` points (n,) alone."""
+    assert scan.time_s is not None
+    fields = {name: values[chosen] for name, values in scan.fields.items()}
+    return Scan(scan.stamp_ns, scan.points[chosen], scan.time_s[chosen], fields)
+
+
+def _write_second(bag: Recorder, end: Scan, begin: Scan, pair: LidarPair) -> None:
+    """One cloud of the second LiDAR: the end of one revolution of the first and the begin of the next one."""
+    scan = replace(Scan.sweep(end.stamp_ns, [end, begin]), others=())
+    assert scan.time_s is not None
+    late_ns = round(1e9 * pair.phase_s)
+    R = from_xyz_rpy(0.0, 0.0, 0.0, 0.0, 0.0, -pair.yaw_rad)[:3, :3].astype(np.float32)
+    time_s = scan.time_s - np.float32(pair.phase_s)
+    turned = Scan(scan.stamp_ns + late_ns, scan.points @ R.T, time_s, scan.fields)
+    bag.write_raw("/second", CLOUD, turned.stamp_ns, cloud_message(turned, "second"))
+
+
+def lidars(drive_path: str, map_path: str, runs: int = 3) -> None:
+    """Scans that vote, and CPU from the bag to the ballot, of one LiDAR and of pairs with the same points, in turns."""
+    drive = open_drive(Path(drive_path))
+    point_map = read_map(Path(map_path))
+    with tempfile.TemporaryDirectory() as home:
+        bags: dict[str, tuple[Path, dict[str, str]]] = {
+            "one LiDAR": (record_lidars(Path(home) / "one", drive, None), {})
+        }
+        for k, (name, pair) in enumerate(LIDAR_PAIRS.items()):
+            topics = {"topic": "/points,/second"}
+            bags[f"two LiDARs, {name}"] = record_lidars(Path(home) / f"two_{k}", drive, pair), topics
+        taken: dict[str, list[float]] = {name: [] for name in bags}
+        for run in range(runs + 1):  # the first one compiles
+            for name, (bag, options) in bags.items():
+                start_s = time.process_time()
+                recorded = open_drive(bag, as_live=True, sensor=drive.sensor.name, **options)
+                _, report = vote_drive(recorded, point_map)
+                if run:
+                    taken[name].append(time.process_time() - start_s)
+                else:
+                    print(f"{name}: {report.scans - len(report.lost)} of {report.scans} scans voted", flush=True)
+    one_s = np.array(taken["one LiDAR"])
+    for name, seconds in taken.items():
+        ratio = np.array(seconds) / one_s
+        print(
+            f"{name}: {np.median(seconds):.2f} s of CPU, {np.median(ratio):.3f} times {np.round(ratio, 2)}", flush=True
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["drive", "kills", "laps", "priors", "packets"])
+    parser.add_argument("what", choices=["drive", "kills", "laps", "priors", "packets", "lidars"])
     parser.add_argument("paths", nargs="*")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--rate", type=float, default=1.0)
@@ -289,6 +379,7 @@ def main() -> None:
         "kills": lambda: kills(*o.paths, o.kills, (o.shortest, o.longest)),
         "priors": lambda: priors(*o.paths),
         "packets": lambda: packets(*o.paths),
+        "lidars": lambda: lidars(*o.paths),
         "laps": lambda: laps(o.domain, o.paths[0], Path(o.paths[1])),
     }
     runs[o.what]()

@@ -181,7 +181,8 @@ class Scan:
 
     def seen_from(self, T_first_other: F64) -> Scan:
         """The scan of another LiDAR of the vehicle in the frame of its first one."""
-        points = (self.points @ T_first_other[:3, :3].T + T_first_other[:3, 3]).astype(np.float32)
+        T = T_first_other.astype(np.float32)  # points are floats of 32 bits, and rounded to them in the end
+        points = self.points @ T[:3, :3].T + T[:3, 3]
         return replace(self, points=points, origin=T_first_other[:3, 3].copy())
 
     def __post_init__(self) -> None:

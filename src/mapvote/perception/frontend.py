@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
 from math import ceil
 from typing import Protocol
 
@@ -27,7 +27,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, PosePrior, Reference, Scan
 from mapvote.matching.localiser import Localise
 from mapvote.matching.odometry import Fix
-from mapvote.perception.placement import cells_and_obstacles, place_points
+from mapvote.perception.placement import ONE_LIDAR, LidarPart, cells_and_obstacles, lidar_parts, place_points
 from mapvote.perception.raycast import ScanView, Sky, cast_rays
 
 
@@ -47,7 +47,9 @@ SPREAD = Spread()
 class MoversFilter(Protocol):
     """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
 
-    def push(self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]: ...
+    def push(
+        self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int, lidars: tuple[LidarPart, ...] = ONE_LIDAR
+    ) -> list[Bool]: ...
 
     def flush(self) -> list[Bool]: ...
 
@@ -138,7 +140,7 @@ class PlacedScan:
     rows: F32
     """(3, n) metres from ``origin_map`` along the map's axes, de-skewed."""
     origin_map: F64
-    """(3,) the sensor, map metres."""
+    """(3,) the sensor, map metres; of a sweep the first LiDAR."""
     up_map: F64
     """(3,) the sensor's own upward axis, in the map's frame."""
     sigma_m: float
@@ -151,8 +153,8 @@ class PlacedScan:
     """(n,) points that stand above the ground of ``reference``; none outside it."""
     cell: I32
     """(n,) each point's cell in ``reference``, row * cols + col; -1 outside it."""
-    by_first: bool = True
-    """Whether the vehicle's first LiDAR took it, which the drive's sensor is."""
+    lidars: tuple[LidarPart, ...] = ONE_LIDAR
+    """The LiDARs that took it: their rays begin at different places."""
     fields: Fields = field(default_factory=dict)
     """Attributes (n,) of the points that the sensor measures."""
     forward_map: F64 = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
@@ -212,7 +214,6 @@ class Frontend:
         self._with_sight = with_sight
         self._sky = None if sensor is None else Sky(sensor)
         self._waiting: deque[PlacedScan] = deque()
-        self._observed = -1
         self._ended = False
 
     def observe(self, scan: Scan, prior: PosePrior | None = None) -> list[Observation]:
@@ -250,7 +251,6 @@ class Frontend:
         n = self.done
         self.report = done.split(n)
         self._waiting = deque(replace(scan, index=scan.index - n) for scan in self._waiting)
-        self._observed -= n
         return done
 
     def go_on_in(self, point_map: PointMap) -> None:
@@ -274,27 +274,23 @@ class Frontend:
         if not fix.trusted:
             report.lost.append(index)
             return []
-        out = []
-        # The LiDARs of a sweep are placed together, but their rays begin at different places: each is a scan by itself.
-        for k, (_, scan) in enumerate(fix.scan.by_lidar()):
-            with report.timed("ground"):
-                placed = self._place(fix, scan, index)
-            self._waiting.append(placed)
-            with report.timed("moving"):
-                stamp_ns = scan.stamp_ns + k
-                decided = self._movers.push(placed.rows, placed.origin_map, placed.obstacle, stamp_ns)
-            out += self._see(decided)
-        return out
+        with report.timed("ground"):
+            placed = self._place(fix, index)
+        self._waiting.append(placed)
+        with report.timed("moving"):
+            stamp_ns = fix.scan.stamp_ns
+            decided = self._movers.push(placed.rows, placed.origin_map, placed.obstacle, stamp_ns, placed.lidars)
+        return self._see(decided)
 
-    def _place(self, fix: Fix, scan: Scan, index: int) -> PlacedScan:
-        """``scan``: of one LiDAR of the fix."""
+    def _place(self, fix: Fix, index: int) -> PlacedScan:
+        scan = fix.scan
         T_map_lidar = fix.registration.T_map_lidar
         origin_map = scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         rows, cell, obstacle = place_points(scan, fix.twist, T_map_lidar, origin_map, reference)
         forward_map, _, up_map = T_map_lidar[:3, :3].T
-        by_first = scan.origin is None
+        lidars = lidar_parts(scan, T_map_lidar[:3, :3])
         return PlacedScan(
             index,
             rows,
@@ -305,7 +301,7 @@ class Frontend:
             outer,
             obstacle,
             cell,
-            by_first,
+            lidars,
             scan.fields,
             forward_map,
         )
@@ -315,17 +311,21 @@ class Frontend:
         out = []
         for moving in decided:
             scan = self._waiting.popleft()
-            if scan.index != self._observed:  # the parts of a sweep are one scan
-                self.report.sigmas_m.append(scan.sigma_m)
-                self._observed = scan.index
+            self.report.sigmas_m.append(scan.sigma_m)
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
-                cell = scan.cell if self._compared is None else None
-                sky = None
-                if self._sky is not None and scan.by_first:
-                    sky = partial(self._sky.rays, scan.up_map, scan.forward_map)
-                view = cast_rays(
-                    scan.rows, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight, sky
-                )
+                views = [self._view_of(scan, lidar, moving, reference) for lidar in scan.lidars]
+                view = reduce(ScanView.joined, views)
             out.append(Observation(scan, moving, view, reference))
         return out
+
+    def _view_of(self, scan: PlacedScan, lidar: LidarPart, moving: Bool, reference: Reference) -> ScanView:
+        """The view of one of the scan's LiDARs."""
+        own = lidar.part
+        cell = scan.cell[own] if self._compared is None else None
+        sky = None
+        if self._sky is not None and lidar.by_first:
+            sky = partial(self._sky.rays, scan.up_map, scan.forward_map)
+        rows = lidar.own_rows(scan.rows)
+        origin_map = lidar.origin_map(scan.origin_map)
+        return cast_rays(rows, origin_map, scan.obstacle[own], moving[own], reference, cell, self._with_sight, sky)

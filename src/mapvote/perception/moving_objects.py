@@ -39,6 +39,7 @@ from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, U8, U16, Bool
 from mapvote.core.voxels import grouped, voxel_key
+from mapvote.perception.placement import ONE_LIDAR, LidarPart
 
 
 @record(votes=True)
@@ -292,14 +293,23 @@ class Movers:
 MOVERS = Movers()
 
 
+class _Image(NamedTuple):
+    """The ranges that one LiDAR measured."""
+
+    origin_map: F64
+    """(3,) where its rays begin, map metres."""
+    nearest: U16
+    """(azimuths, slopes) horizontal range of the nearest return around each direction, see ``range_image``."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Scan:
     """One scan in the window."""
 
     stamp_ns: int
     origin_map: F64
-    nearest: U16
-    """(azimuths, slopes) horizontal range of the nearest return around each direction, see ``range_image``."""
+    images: tuple[_Image, ...]
+    """One for each LiDAR of a sweep."""
     points: int
     """How many points it has."""
     chosen: I32
@@ -332,21 +342,23 @@ class MovingFilter:
         self._waiting = 0
         """How many of the window's youngest scans are undecided."""
 
-    def push(self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
+    def push(
+        self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int, lidars: tuple[LidarPart, ...] = ONE_LIDAR
+    ) -> list[Bool]:
         """Take one scan; return what can now be decided: the masks of moving points (n,) of the oldest scans that
         were still undecided, in their order.
 
         ``rows`` (3, n) metres from the sensor, which is at ``origin_map`` (3,), map metres, along the map's axes;
         ``obstacle`` (n,) says which points stand more than 0.3 m above the ground: only they can be called moving, but
-        all of them prove what is free.
+        all of them prove what is free. ``lidars``: those that took the points, each from where its rays begin.
         Raises ValueError if stamps do not increase.
         """
         if self._window and stamp_ns <= self._window[-1].stamp_ns:
             raise ValueError(f"stamps must increase: {stamp_ns} after {self._window[-1].stamp_ns}")
         origin = np.asarray(origin_map, dtype=np.float64)
-        nearest = range_image(rows, self._pixels)
+        images = tuple(_Image(one.origin_map(origin), range_image(one.own_rows(rows), self._pixels)) for one in lidars)
         chosen, voxel_of, samples = voxels(rows, obstacle, origin, self.movers.reach_m, CELL_SIZE)
-        self._window.append(_Scan(stamp_ns, origin, nearest, len(obstacle), chosen, voxel_of, samples))
+        self._window.append(_Scan(stamp_ns, origin, images, len(obstacle), chosen, voxel_of, samples))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
@@ -378,7 +390,7 @@ class MovingFilter:
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         sought = room_to_look(m)
         # Each of the other scans counts what it saw at the samples.
-        for other in self._witnesses(at):
+        for other in (image for scan in self._witnesses(at) for image in scan.images):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = movers.margin_m, movers.height_m, movers.enough
             left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)

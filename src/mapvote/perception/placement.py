@@ -18,6 +18,45 @@ from mapvote.core.types import F32, F64, I32, Bool, Reference, Scan
 from mapvote.matching.prepare import deskew_into
 
 
+class LidarPart(NamedTuple):
+    """The points of one LiDAR in a scan: all of them, unless the scan is a sweep of several."""
+
+    part: slice = slice(None)
+    """Indices of its points."""
+    offset_m: F64 | None = None
+    """(3,) where its rays begin, metres from the scan's origin along the map's axes; None: there."""
+    by_first: bool = True
+    """Whether it is the vehicle's first LiDAR, which the drive's sensor is."""
+
+    def own_rows(self, rows: F32) -> F32:
+        """(3, m) metres from where its rays begin, of the scan's ``rows`` (3, n) from the scan's origin."""
+        if self.part == slice(None):
+            return rows
+        own = rows[:, self.part]
+        return np.ascontiguousarray(own if self.offset_m is None else own - self.offset_m.astype(np.float32)[:, None])
+
+    def origin_map(self, of_scan: F64) -> F64:
+        """(3,) where its rays begin, map metres; ``of_scan`` (3,): the scan's origin."""
+        return of_scan if self.offset_m is None else of_scan + self.offset_m
+
+
+ONE_LIDAR = (LidarPart(),)
+"""The parts of a scan that the vehicle's first LiDAR took alone."""
+
+
+def lidar_parts(scan: Scan, R_map_lidar: F64) -> tuple[LidarPart, ...]:
+    """The LiDARs of a scan whose frame is turned by ``R_map_lidar`` (3, 3)."""
+    by_first = scan.origin is None
+    if not scan.others:
+        return (LidarPart(by_first=by_first),)
+    begin = np.zeros(3) if scan.origin is None else scan.origin
+    starts = [start for start, _ in scan.others]
+    parts = [LidarPart(slice(0, starts[0]), None, by_first)]
+    for (start, origin), end in zip(scan.others, [*starts[1:], len(scan.points)], strict=True):
+        parts.append(LidarPart(slice(start, end), np.asarray(R_map_lidar @ (origin - begin)), False))
+    return tuple(parts)
+
+
 class PlacedPoints(NamedTuple):
     """The points of a scan in the map's frame."""
 

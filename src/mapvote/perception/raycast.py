@@ -68,6 +68,12 @@ class ScanView:
     sight: U8
     """:class:`Sight` of the cell; (0, 0) if not requested."""
 
+    def joined(self, other: ScanView) -> ScanView:
+        """The view of two LiDARs of one sweep, over the same grid."""
+        counts = self.counts + other.counts
+        sight = np.maximum(self.sight, other.sight)
+        return ScanView(self.grid, counts, self.hit | other.hit, self.passed | other.passed, sight)
+
 
 def enter_hits(up: F32, origin_z: float, cell: I32, keep: Bool, base: I32, counts: I32, hit: U64) -> None:
     """Stationary obstacle points, ``up`` (n,) metres from ``origin_z``, into ``counts`` and ``hit`` words (flat planes,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import get_args
 
 import numpy as np
@@ -171,10 +171,15 @@ def _clear_of_cells(seen: Observation, chosen: Bool, n_min: int) -> U8:
 def _cast(seen: Observation, chosen: Bool, obstacle: Bool) -> ScanView:
     """The rays of the ``chosen`` points (n,) alone; ``obstacle`` (n,): those that occlude the cells behind them."""
     scan = seen.scan
-    still = np.zeros(int(chosen.sum()), dtype=np.bool_)
-    rows = np.ascontiguousarray(scan.rows[:, chosen])
-    cell = scan.cell[chosen]
-    return cast_rays(rows, scan.origin_map, obstacle[chosen], still, seen.reference, cell)
+    views = []
+    for lidar in scan.lidars:
+        own = chosen[lidar.part]
+        still = np.zeros(int(own.sum()), dtype=np.bool_)
+        rows = np.ascontiguousarray(lidar.own_rows(scan.rows)[:, own])
+        origin_map = lidar.origin_map(scan.origin_map)
+        cell = scan.cell[lidar.part][own]
+        views.append(cast_rays(rows, origin_map, obstacle[lidar.part][own], still, seen.reference, cell))
+    return reduce(ScanView.joined, views)
 
 
 @lru_cache(maxsize=64)
