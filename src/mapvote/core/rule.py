@@ -51,10 +51,10 @@ PAPER = Rule(
     min_votes=1,
     needs_sight=True,
     takes_points_beyond=False,
-    version="1",
+    version="2",
 )
 """Paper III and IV."""
-SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True, version="1")
+SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True, version="2")
 """Height at the cost of a 2D grid: a word of 0.3 m voxels a cell (docs/method.md)."""
 RULES: dict[str, Rule] = {"paper": PAPER, "surfaces": SURFACES}
 """The rules of this package. :func:`rule_names` and :func:`rule_named` know those of other distributions too."""
