@@ -28,7 +28,7 @@ def check_bag(path: Path, **said: Unpack[SaidOfDrive]) -> list[Finding]:
     """Topics, rates, clocks and frames of the bag at ``path``; nothing of what its scans show."""
     try:
         bag = Bag(path)
-        times = {topic: stamps_of(bag, topic) for topic in bag.topics(*CLOUDS, *POSES, *GNSS)}
+        times = stamps_of(bag, bag.topics(*CLOUDS, *POSES, *GNSS))
         orders = {topic: in_order_of_stamps(rows[:, 0], rows[:, 1]) for topic, rows in times.items()}
         files = [Finding("warning", line) for line in bag.mended]
         poses = _poses(bag, orders, drive_options(path, **said))

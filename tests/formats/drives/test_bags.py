@@ -17,6 +17,7 @@ from bag_recorder import CLOUD, START, Recorder
 from mapvote.core import geometry
 from mapvote.core.types import F32, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive
+from mapvote.formats.drives.bag import Bag, NextMessages, stamps_of
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.messages import GNSS, IMU, ODOMETRY, TF, blank_message, from_cdr, header_of, to_cdr
@@ -168,6 +169,24 @@ def test_a_lidar_that_misses_a_revolution_leaves_the_other_s_scan_by_itself(tmp_
     drive = open_drive(two_lidars(tmp_path / "bag", lost=3), topic=BOTH, sensor="hdl32e")
     assert [len(scan.by_lidar()) for scan in drive] == [2, 2, 2, 1, 2, 2]
     assert drive.read_scan(3).origin is not None
+
+
+def test_messages_come_in_any_order_and_those_of_several_lidars_in_one_pass(tmp_path: Path) -> None:
+    bag = Bag(two_lidars(tmp_path / "bag"))
+    topics = BOTH.split(",")
+    rows = [(topic, received, header) for topic, of in stamps_of(bag, topics).items() for header, received, _ in of]
+    clouds = NextMessages(bag, topics)
+    for seed in range(5):
+        for topic, received, header in np.random.default_rng(seed).permutation(np.array(rows, object)):
+            found = clouds.read(topic, received, header)
+            assert found is not None
+            assert (found[0].topic, bag.stamp_ns(found[1])) == (topic, header)
+    assert clouds.read(topics[0], START + 1, START) is None
+    before = bag.passes
+    assert all(clouds.read(*row) for row in sorted(rows, key=lambda row: (round(row[2], -8), row[0])))
+    assert bag.passes == before + 1
+    list(bag.raw("/tf_static"))  # reads the file elsewhere
+    assert clouds.read(*rows[1]) is not None
 
 
 def test_which_lidars_are_meant_and_where_they_sit_must_be_known(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.extras import require
+from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
 from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
@@ -54,6 +56,8 @@ class Bag:
             ) from error
         weakref.finalize(self, self.reader.close)
         self.path = path
+        self.passes = 0
+        """How often reading began: a pass over an MCAP without an index is lost where another one begins."""
         self.mended = files.mended
         """Faults of its files that do not stop the reading."""
 
@@ -70,16 +74,21 @@ class Bag:
         """Topics of these message types, with their number of messages."""
         return {name: t.msgcount for name, t in sorted(self.reader.topics.items()) if t.msgtype in types}
 
-    def raw(self, topic: str, **window: int) -> Iterator[tuple[Any, int, bytes]]:
+    def raw(self, *topics: str, **window: int) -> Iterator[tuple[Any, int, bytes]]:
         """(connection, receive time ns, bytes) one by one; ``start``, ``stop`` bound the receive time."""
-        connections = [c for c in self.reader.connections if c.topic == topic]
+        self.passes += 1
+        return self._read(topics, window)
+
+    def _read(self, topics: Sequence[str], window: dict[str, int]) -> Iterator[tuple[Any, int, bytes]]:
+        connections = [c for c in self.reader.connections if c.topic in topics]
         try:
             yield from self.reader.messages(connections=connections, **window)
         except MapvoteError:
             raise
         except Exception as error:  # whatever zstd, lz4, sqlite and struct raise
             raise MapvoteError(
-                f"{self.path}: {topic}: damaged ({type(error).__name__}: {first_line(error)}); copy it again"
+                f"{self.path}: {', '.join(topics)}: damaged ({type(error).__name__}: {first_line(error)}); copy it "
+                f"again"
             ) from error
 
     def messages(self, topic: str, **window: int) -> Iterator[tuple[int, Any]]:
@@ -102,11 +111,75 @@ class Bag:
         return serialised_stamp_ns(str(self.path), data, ros2=self.reader.is2)
 
 
-def stamps_of(bag: Bag, topic: str) -> I64:
-    """(n, 3) the stamp in the header and the time of receipt of every message, nanoseconds, and its size in bytes, as
-    received."""
-    rows = [(bag.stamp_ns(data), received_ns, len(data)) for _, received_ns, data in bag.raw(topic)]
-    return np.array(rows, dtype=np.int64).reshape(-1, 3)
+@record()
+@dataclass(frozen=True, slots=True)
+class ReadAhead:
+    """How far messages are read ahead of those that are wanted."""
+
+    opened_ns: int = 2_000_000_000
+    """The part of a file that is opened at a time, nanoseconds of receipt."""
+    kept: int = 4
+    """Messages a topic that are kept when they are passed over: others were received before them."""
+
+
+READ_AHEAD = ReadAhead()
+
+
+class NextMessages:
+    """Messages of some topics that are wanted nearly in the order of their receipt: the parts of a file in which they
+    lie are read and decompressed once, not once for each message."""
+
+    def __init__(self, bag: Bag, topics: Sequence[str], rule: ReadAhead = READ_AHEAD) -> None:
+        self._bag = bag
+        self._topics = topics
+        self._rule = rule
+        self._rows: Iterator[tuple[Any, int, bytes]] = iter(())
+        self._pass = -1
+        self._at_ns = 0
+        """Receipt of the last message that was read."""
+        self._until_ns = 0
+        self._kept: dict[tuple[str, int, int], tuple[Any, bytes]] = {}
+
+    def read(self, topic: str, received_ns: int, header_ns: int) -> tuple[Any, bytes] | None:
+        """(connection, bytes) of the message that was received then with this stamp in its header; None without one.
+        MapvoteError if the file is damaged there."""
+        wanted = topic, received_ns, header_ns
+        found = self._read_on(wanted)
+        if found is None:
+            self._kept.clear()
+            self._rows = self._bag.raw(*self._topics, start=received_ns, stop=received_ns + self._rule.opened_ns)
+            self._pass = self._bag.passes
+            self._at_ns = received_ns
+            self._until_ns = received_ns + self._rule.opened_ns
+            found = self._read_on(wanted)
+        return found
+
+    def _read_on(self, wanted: tuple[str, int, int]) -> tuple[Any, bytes] | None:
+        """The same, among what was kept and what follows in the open part."""
+        if wanted in self._kept:
+            return self._kept.pop(wanted)
+        if self._pass != self._bag.passes or not self._at_ns <= wanted[1] < self._until_ns:
+            return None
+        for connection, received_ns, data in self._rows:
+            self._at_ns = received_ns
+            read = connection.topic, received_ns, self._bag.stamp_ns(data)
+            if read == wanted:
+                return connection, data
+            self._kept[read] = connection, data
+            if len(self._kept) > self._rule.kept * len(self._topics):
+                del self._kept[next(iter(self._kept))]
+            if received_ns > wanted[1]:
+                break
+        return None
+
+
+def stamps_of(bag: Bag, topics: Iterable[str]) -> dict[str, I64]:
+    """(n, 3) of each topic: the stamp in the header and the time of receipt of every message, nanoseconds, and its size
+    in bytes, as received."""
+    rows: dict[str, list[tuple[int, int, int]]] = {topic: [] for topic in topics}
+    for connection, received_ns, data in bag.raw(*rows):
+        rows[connection.topic].append((bag.stamp_ns(data), received_ns, len(data)))
+    return {topic: np.array(of_topic, dtype=np.int64).reshape(-1, 3) for topic, of_topic in rows.items()}
 
 
 def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:

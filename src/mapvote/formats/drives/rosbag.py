@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.bag import CLOUD, CLOUDS, Bag, frame_id, stamps_of, static_frames
+from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.drives.bag import CLOUD, CLOUDS, Bag, NextMessages, frame_id, stamps_of, static_frames
 from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
@@ -40,7 +40,8 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other, options.mounts) for other in topics[1:])]
     own = _mount_in(options.mounts, topics[0], str(path))
     left_out: list[str] = []
-    sweeps = _sweeps(bag, topics, left_out)
+    clouds = NextMessages(bag, topics)
+    sweeps = _sweeps(bag, topics, clouds, left_out)
     stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
     poses = choose_poses(bag, options, topics[0], own)
     prior = prior_of_bag(bag, options, stamps_ns, poses)
@@ -48,7 +49,7 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
 
     def read_cloud(i: int, message: _Message, sensor: Sensor) -> Scan:
         source = f"{path} {topics[message.topic]}, scan {i}"
-        table = _points_of(bag, topics[message.topic], message, source)
+        table = _points_of(bag, clouds, topics[message.topic], message, source)
         return readers[message.topic].scan(source, i, message.stamp_ns, table, sensor)
 
     def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
@@ -124,12 +125,12 @@ class _Message:
     """The packets of a revolution, of which this is the first; () if it came whole."""
 
 
-def _sweeps(bag: Bag, topics: list[str], left_out: list[str]) -> list[list[_Message]]:
+def _sweeps(bag: Bag, topics: list[str], clouds: NextMessages, left_out: list[str]) -> list[list[_Message]]:
     """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution. Sentences on
     scans without a point are added to ``left_out``."""
     messages: list[_Message] = []
-    for k, topic in enumerate(topics):
-        messages += _revolutions(bag, topic, _messages_of(bag, topic, k, left_out))
+    for k, (topic, stamps) in enumerate(stamps_of(bag, topics).items()):
+        messages += _revolutions(bag, topic, clouds, _messages_of(bag, topic, k, clouds, stamps, left_out))
     if not messages:
         raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; {mend_of(bag.path)}")
     if len(topics) == 1:
@@ -146,22 +147,21 @@ def _sweeps(bag: Bag, topics: list[str], left_out: list[str]) -> list[list[_Mess
     return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
 
 
-def _points_of(bag: Bag, topic: str, message: _Message, source: str) -> NDArray[np.void]:
+def _points_of(bag: Bag, clouds: NextMessages, topic: str, message: _Message, source: str) -> NDArray[np.void]:
     """The points (n,) of one cloud of a topic. MapvoteError if it is not there any more, or damaged."""
-    start_ns = message.received_ns
-    for connection, _, data in bag.raw(topic, start=start_ns, stop=start_ns + 1):
-        if bag.stamp_ns(data) == message.header_ns:
-            return bag.points(source, connection, data)
-    raise MapvoteError(f"{source}: gone; the bag changed while it was read")
+    found = clouds.read(topic, message.received_ns, message.header_ns)
+    if found is None:
+        raise MapvoteError(f"{source}: gone; the bag changed while it was read")
+    return bag.points(source, *found)
 
 
-def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Message]:
+def _revolutions(bag: Bag, topic: str, clouds: NextMessages, messages: list[_Message]) -> list[_Message]:
     """The clouds of a topic, or, if each is a part of a revolution, the first of each revolution with its packets. The
     last revolution, whose end nothing shows, is left out, as on the road."""
     packets: Packets[_Message] = Packets()
     for message in messages[: PACKET_RULE.looked_at]:
         with suppress(MapvoteError):  # a damaged cloud is reported when it is read as a scan
-            direction = direction_of(_points_of(bag, topic, message, f"{bag.path} {topic}"))
+            direction = direction_of(_points_of(bag, clouds, topic, message, f"{bag.path} {topic}"))
             packets.add(message, message.stamp_ns, lambda looked=direction: looked)  # type: ignore[misc]
     if not packets.is_packets:
         return messages
@@ -180,25 +180,28 @@ def _revolutions(bag: Bag, topic: str, messages: list[_Message]) -> list[_Messag
     return out
 
 
-def _messages_of(bag: Bag, topic: str, k: int, left_out: list[str]) -> list[_Message]:
-    """The messages of the ``k``-th topic by their stamps; those that are left out are counted and reported."""
-    headers, received, sizes = stamps_of(bag, topic).T
+def _messages_of(
+    bag: Bag, topic: str, k: int, clouds: NextMessages, stamps: I64, left_out: list[str]
+) -> list[_Message]:
+    """The messages of the ``k``-th topic by their stamps; those that are left out are counted and reported. ``stamps``
+    (n, 3): as :func:`stamps_of`."""
+    headers, received, sizes = stamps.T
     order = in_order_of_stamps(headers, received)
     for line in order.told:
         log.warning("%s: %s %s", bag.path, topic, line)
     rows = zip(order.stamps_ns.tolist(), order.chosen.tolist(), strict=True)
     every = [(_Message(stamp_ns, k, int(received[i]), int(headers[i])), int(sizes[i])) for stamp_ns, i in rows]
-    empty = {message.stamp_ns for message, size in every if _is_empty(bag, topic, message, size)}
+    empty = {message.stamp_ns for message, size in every if _is_empty(bag, clouds, topic, message, size)}
     if empty:
-        stamps = [f"{ns / 1e9:.3f} s" for ns in sorted(empty)]
-        left_out.append(tell_without_points(f"{bag.path} {topic}", len(every), stamps))
+        names = [f"{ns / 1e9:.3f} s" for ns in sorted(empty)]
+        left_out.append(tell_without_points(f"{bag.path} {topic}", len(every), names))
     return [message for message, _ in every if message.stamp_ns not in empty]
 
 
-def _is_empty(bag: Bag, topic: str, message: _Message, size: int) -> bool:
+def _is_empty(bag: Bag, clouds: NextMessages, topic: str, message: _Message, size: int) -> bool:
     """Whether a cloud, ``size`` bytes serialised, holds no point, as of a driver that started before its sensor."""
     with suppress(MapvoteError):  # a damaged cloud is reported when it is read as a scan
-        return size < SMALL_CLOUD_BYTES and len(_points_of(bag, topic, message, str(bag.path))) == 0
+        return size < SMALL_CLOUD_BYTES and len(_points_of(bag, clouds, topic, message, str(bag.path))) == 0
     return False
 
 
