@@ -281,13 +281,19 @@ class LidarPair:
     """By how much the second one's clouds begin later."""
     yaw_rad: float = 0.0
     """How the second one is turned on the vehicle."""
+    lost: int = 0
+    """Each cloud of the second one whose number is a multiple of this is lost; 0: none."""
+    first_until: float = 1.0
+    """The share of the drive after which the first one is silent."""
 
 
 LIDAR_PAIRS = {
     "in phase": LidarPair(),
-    "a quarter of a turn later, turned by 180 deg": LidarPair(0.025, np.pi),
-    "half a turn later": LidarPair(0.05),
-    "three quarters of a turn later": LidarPair(0.075),
+    "13 ms later, turned by 180 deg": LidarPair(0.013, np.pi),
+    "50 ms later": LidarPair(0.05),
+    "90 ms later": LidarPair(0.09),
+    "50 ms later, each third cloud of the second lost": LidarPair(0.05, lost=3),
+    "13 ms later, the first silent after a half": LidarPair(0.013, first_until=0.5),
 }
 
 
@@ -306,9 +312,10 @@ def record_lidars(path: Path, drive: Drive, pair: LidarPair | None) -> Path:
             continue
         assert scan.time_s is not None
         second = np.arange(len(scan.points)) % 2 == 1
-        bag.write_raw("/points", CLOUD, ns, cloud_message(chosen_points(scan, ~second), BASE_FRAME))
+        if i < pair.first_until * len(drive):
+            bag.write_raw("/points", CLOUD, ns, cloud_message(chosen_points(scan, ~second), BASE_FRAME))
         begun = scan.time_s - scan.time_s.min() < pair.phase_s
-        if end is not None:
+        if end is not None and not (pair.lost and i % pair.lost == 0):
             _write_second(bag, end, chosen_points(scan, second & begun), pair)
         end = chosen_points(scan, second & ~begun)
     bag.bag.close()
