@@ -178,9 +178,9 @@ def test_messages_come_in_any_order_and_those_of_several_lidars_in_one_pass(tmp_
     clouds = NextMessages(bag, topics)
     for seed in range(5):
         for topic, received, header in np.random.default_rng(seed).permutation(np.array(rows, object)):
-            found = clouds.read(topic, received, header)
-            assert found is not None
-            assert (found[0].topic, bag.stamp_ns(found[1])) == (topic, header)
+            message = clouds.read(topic, received, header)
+            assert message is not None
+            assert (message[0].topic, bag.stamp_ns(message[1])) == (topic, header)
     assert clouds.read(topics[0], START + 1, START) is None
     before = bag.passes
     assert all(clouds.read(*row) for row in sorted(rows, key=lambda row: (round(row[2], -8), row[0])))

@@ -144,15 +144,15 @@ class NextMessages:
         """(connection, bytes) of the message that was received then with this stamp in its header; None without one.
         MapvoteError if the file is damaged there."""
         wanted = topic, received_ns, header_ns
-        found = self._read_on(wanted)
-        if found is None:
+        message = self._read_on(wanted)
+        if message is None:
             self._kept.clear()
             self._rows = self._bag.raw(*self._topics, start=received_ns, stop=received_ns + self._rule.opened_ns)
             self._pass = self._bag.passes
             self._at_ns = received_ns
             self._until_ns = received_ns + self._rule.opened_ns
-            found = self._read_on(wanted)
-        return found
+            message = self._read_on(wanted)
+        return message
 
     def _read_on(self, wanted: tuple[str, int, int]) -> tuple[Any, bytes] | None:
         """The same, among what was kept and what follows in the open part."""

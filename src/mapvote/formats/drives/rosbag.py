@@ -149,10 +149,10 @@ def _sweeps(bag: Bag, topics: list[str], clouds: NextMessages, left_out: list[st
 
 def _points_of(bag: Bag, clouds: NextMessages, topic: str, message: _Message, source: str) -> NDArray[np.void]:
     """The points (n,) of one cloud of a topic. MapvoteError if it is not there any more, or damaged."""
-    found = clouds.read(topic, message.received_ns, message.header_ns)
-    if found is None:
+    serialised = clouds.read(topic, message.received_ns, message.header_ns)
+    if serialised is None:
         raise MapvoteError(f"{source}: gone; the bag changed while it was read")
-    return bag.points(source, *found)
+    return bag.points(source, *serialised)
 
 
 def _revolutions(bag: Bag, topic: str, clouds: NextMessages, messages: list[_Message]) -> list[_Message]:
