@@ -26,6 +26,7 @@ from mapvote_server.api import (
     vehicle_routes,
 )
 from mapvote_server.api.event_routes import deliver
+from mapvote_server.api.heads import Heads
 from mapvote_server.api.openapi import complete_document
 from mapvote_server.api.problems import failed, not_allowed, unknown_path, unreadable, unusable
 from mapvote_server.api.proxies import Proxies
@@ -99,6 +100,7 @@ def create_app(
     complete_document(app)
     hosts = Hosts(parts.settings.server.hosts)
     guard = Guard(parts, opened=opened, owner=owner)
+    app.add_middleware(Heads)
     app.add_middleware(Watch, hosts=hosts, guard=guard, proxies=Proxies(parts.settings.server.proxies), parts=parts)
     return app
 

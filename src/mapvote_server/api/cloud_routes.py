@@ -9,7 +9,7 @@ from mapvote_server.api.lanes import on
 from mapvote_server.api.problems import problems
 from mapvote_server.api.ranges import answer_part
 from mapvote_server.api.schemas import AS_YOU_HAVE, Number
-from mapvote_server.api.services import Parts, Services
+from mapvote_server.api.services import Parts
 from mapvote_server.errors import NotFound
 from mapvote_server.questions.catalogue import catalogue_at, item_at
 from mapvote_server.questions.cloud_files import CloudFile
@@ -33,16 +33,6 @@ async def cloud(request: Request, parts: Parts, number: Number) -> Response:
     """A file that viewers read a place and a level of detail at a time (Range, RFC 9110). Every point has its class,
     its intensity if the map has one, the version that brought it, and the vehicles that voted for it. The first request
     for a version makes the file."""
-    return await _cloud(request, parts, number)
-
-
-@router.head("/v1/map/versions/{number}/cloud.copc.laz", include_in_schema=False)
-async def cloud_head(request: Request, parts: Parts, number: Number) -> Response:
-    """Size and tag of the same file."""
-    return await _cloud(request, parts, number)
-
-
-async def _cloud(request: Request, parts: Services, number: int) -> Response:
     opened = await parts.questions.run(parts.cloud_files.ready, number)
     if opened is None:
         opened = await parts.files.run(parts.cloud_files.open, number)

@@ -6,7 +6,9 @@ unknown parameter is 400, as Part 1 has it.
 
 from __future__ import annotations
 
+import gzip
 import html
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +19,9 @@ import msgspec
 from fastapi import APIRouter, Request, Response
 
 from mapvote.core.times import utc
+from mapvote_server.api.encodings import prefers_html, takes
 from mapvote_server.api.lanes import on
-from mapvote_server.api.problems import PROBLEM_JSON
+from mapvote_server.api.ogc_document import GEOJSON, HTML, JSON, LARGEST_PAGE, OPENAPI, USUAL_PAGE, document_at
 from mapvote_server.api.schemas import LEAST, MOST
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import BadRequest, Forbidden, NotFound
@@ -32,7 +35,7 @@ from mapvote_server.questions.features import (
     Source,
     Whole,
     during,
-    extent,
+    extent_of,
     placed,
     within,
 )
@@ -46,9 +49,6 @@ CONFORMANCE = [
     ),
     "http://www.opengis.net/spec/ogcapi-features-2/1.0/conf/crs",
 ]
-_JSON, _GEOJSON, _HTML = "application/json", "application/geo+json", "text/html"
-_USUAL_PAGE, _LARGEST_PAGE = 100, 10_000
-"""Features of a page if no limit is stated; at most."""
 _ITEMS = ("bbox", "bbox-crs", "crs", "datetime", "limit", "offset")
 router = APIRouter(include_in_schema=False)
 
@@ -58,11 +58,11 @@ async def landing(request: Request) -> Response:
     """The first page: where the rest is."""
     _check(request)
     links = [
-        _link(request, "", "self", _JSON, "this page"),
-        _link(request, "/api", "service-desc", "application/vnd.oai.openapi+json;version=3.0", "the API"),
-        _link(request, "/api.html", "service-doc", _HTML, "the API for people"),
-        _link(request, "/conformance", "conformance", _JSON, "what this server conforms to"),
-        _link(request, "/collections", "data", _JSON, "the collections"),
+        *_both(request, "", JSON),
+        _link(request, "/api", "service-desc", OPENAPI, "the API"),
+        _link(request, "/api.html", "service-doc", HTML, "the API for people"),
+        _link(request, "/conformance", "conformance", JSON, "what this server conforms to"),
+        _link(request, "/collections", "data", JSON, "the collections"),
     ]
     about = {"title": "mapvote", "description": "A point-cloud map, and what has changed in it", "links": links}
     return _answer(request, about)
@@ -79,13 +79,14 @@ async def conformance(request: Request) -> Response:
 async def definition(request: Request) -> Response:
     """The API by OpenAPI 3.0."""
     _check(request)
-    return Response(msgspec.json.encode(_openapi(request)), media_type="application/vnd.oai.openapi+json;version=3.0")
+    return Response(msgspec.json.encode(document_at(_address(request))), media_type=OPENAPI)
 
 
 @router.get("/ogc/api.html")
 async def documentation(request: Request) -> Response:
     """The API for people."""
-    return _page("API", _openapi(request)["paths"])
+    _check(request)
+    return _page(request, "API", document_at(_address(request))["paths"])
 
 
 @router.get("/ogc/collections")
@@ -94,28 +95,21 @@ def collections(request: Request, parts: Parts, with_names: Known) -> Response:
     """All that the key may see."""
     _check(request)
     place = OnEarth.of(parts.store)
+    box = extent_of(parts.store, place)
     shown = [name for name, kind in COLLECTIONS.items() if with_names or not kind.for_reviewers]
-    listed = [_described(request, name, COLLECTIONS[name], place) for name in shown]
-    links = [_link(request, "/collections", "self", _JSON, "the collections")]
+    listed = [_described(request, name, place, box) for name in shown]
+    links = _both(request, "/collections", JSON)
     return _answer(request, {"links": links, "collections": listed, "crs": place.systems})
 
 
 @router.get("/ogc/collections/{name}")
-async def collection(request: Request, parts: Parts, with_names: Known, name: str) -> Response:
-    """One of them, with its extent."""
-    pending = await _pending(parts, _named(name, with_names))
-    return await parts.questions.run(_collection, request, parts.store, with_names, name, pending)
-
-
-def _collection(request: Request, store: Store, with_names: bool, name: str, pending: Features | None) -> Response:
+@on("questions")
+def collection(request: Request, parts: Parts, with_names: Known, name: str) -> Response:
+    """One of them, as it is in the list."""
     _check(request)
-    kind = COLLECTIONS[name]
-    place = OnEarth.of(store)
-    box = extent(_features(store, kind, with_names, request, pending), place)
-    about = _described(request, name, kind, place)
-    if box is not None:
-        about["extent"] = {"spatial": {"bbox": [box], "crs": CRS84}}
-    return _answer(request, about)
+    _named(name, with_names)
+    place = OnEarth.of(parts.store)
+    return _answer(request, _described(request, name, place, extent_of(parts.store, place)))
 
 
 @router.get("/ogc/collections/{name}/items")
@@ -133,26 +127,23 @@ def _items(request: Request, store: Store, with_names: bool, name: str, pending:
     positions: Sequence[int] = range(len(source))
     if wanted.box is not None:
         positions = within(source, wanted.box, place, wanted.box_crs)
-    if wanted.datetime:
+    if wanted.datetime is not None:
         positions = during(source, positions, wanted.datetime)
     page = source.made(positions[wanted.offset : wanted.offset + wanted.limit])
     shown = [placed(feature, place, wanted.crs) for feature in page]
     path = f"/collections/{name}/items"
     query = dict(request.query_params)
-    links = [
-        _link(request, path, "self", _GEOJSON, "this page", query),
-        _link(request, path, "alternate", _HTML, "this page for people", query | {"f": "html"}),
-        _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
-    ]
+    links = [*_both(request, path, GEOJSON), _link(request, f"/collections/{name}", "collection", JSON, kind.title)]
+    shown_as = HTML if _as_page(request) else GEOJSON
     after = wanted.offset + len(shown)
     if after < len(positions):
-        links.append(_link(request, path, "next", _GEOJSON, "the next page", query | {"offset": str(after)}))
+        links.append(_link(request, path, "next", shown_as, "the next page", query | {"offset": str(after)}))
     if wanted.offset > 0:
         before = query | {"offset": str(max(wanted.offset - wanted.limit, 0))}
-        links.append(_link(request, path, "prev", _GEOJSON, "the page before", before))
+        links.append(_link(request, path, "prev", shown_as, "the page before", before))
     counts = {"numberMatched": len(positions), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
     answer = {"type": "FeatureCollection", "features": shown, "links": links} | counts
-    return _answer(request, answer, _GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
+    return _answer(request, answer, GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
 
 
 @router.get("/ogc/collections/{name}/items/{feature_id}")
@@ -172,13 +163,9 @@ def _item(
     if not named:
         raise NotFound(f"{name} has no feature {feature_id[:80]!r}")
     path = f"/collections/{name}/items/{feature_id}"
-    links = [
-        _link(request, path, "self", _GEOJSON, "this feature"),
-        _link(request, path, "alternate", _HTML, "this feature for people", {"f": "html"}),
-        _link(request, f"/collections/{name}", "collection", _JSON, kind.title),
-    ]
+    links = [*_both(request, path, GEOJSON), _link(request, f"/collections/{name}", "collection", JSON, kind.title)]
     shown = placed(named[0], place, query.crs) | {"links": links}
-    return _answer(request, shown, _GEOJSON, {"Content-Crs": f"<{query.crs}>"})
+    return _answer(request, shown, GEOJSON, {"Content-Crs": f"<{query.crs}>"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +177,7 @@ class _Asked:
     crs: str
     box: list[float] | None
     box_crs: str
-    datetime: str
+    datetime: str | None
 
     @classmethod
     def of(cls, request: Request, kind: Collection, place: OnEarth, names: Sequence[str] = _ITEMS) -> _Asked:
@@ -204,24 +191,27 @@ class _Asked:
             box = [float(v) for v in query["bbox"].split(",")] if "bbox" in query else None
         except ValueError as error:
             raise BadRequest("bbox needs numbers separated by commas") from error
-        limit = min(_integer(query, "limit", _USUAL_PAGE, 1), _LARGEST_PAGE)
+        limit = min(_integer(query, "limit", USUAL_PAGE, 1, math.inf), LARGEST_PAGE)
         offset = _integer(query, "offset", 0, 0)
         crs = query.get("crs", CRS84)
         box_crs = query.get("bbox-crs", CRS84)
-        return cls(limit, offset, crs, box, box_crs, query.get("datetime", ""))
+        return cls(limit, offset, crs, box, box_crs, query.get("datetime"))
 
 
-def _integer(query: Mapping[str, str], name: str, usual: int, least: int) -> int:
+def _integer(query: Mapping[str, str], name: str, usual: int, least: int, most: float = MOST) -> int:
     text = query.get(name, str(usual))
-    if not text.isascii() or not text.isdigit() or not least <= int(text[:12]) <= MOST:
+    number = int(text.lstrip("0")[:12] or "0") if text.isascii() and text.isdigit() else -1
+    if not least <= number <= most:
         raise BadRequest(f"{name}: {text[:40]!r} is no number from {least} on")
-    return int(text)
+    return number
 
 
 def _check(request: Request, names: Sequence[str] = ()) -> None:
     unknown = [name for name in request.query_params if name not in (*names, "f")]
     if unknown:
         raise BadRequest(f"unknown parameter {unknown[0][:40]!r}; known are {', '.join([*names, 'f'])}")
+    if len(request.query_params.multi_items()) > len(request.query_params):
+        raise BadRequest("each parameter can be stated once")
     if request.query_params.get("f", "json") not in ("json", "html"):
         raise BadRequest("f is json or html")
 
@@ -254,9 +244,12 @@ def _features(store: Store, kind: Collection, with_names: bool, request: Request
     return kind.features(store, with_names, old, new)
 
 
-def _described(request: Request, name: str, kind: Collection, place: OnEarth) -> dict[str, Any]:
+def _described(request: Request, name: str, place: OnEarth, box: Sequence[float]) -> dict[str, Any]:
+    """A collection; its extent, if its features lie on tiles, is the ``box`` of these."""
     path = f"/collections/{name}"
-    return {
+    kind = COLLECTIONS[name]
+    extent = {"extent": {"spatial": {"bbox": [box], "crs": CRS84}}} if kind.on_tiles else {}
+    return extent | {
         "id": name,
         "title": kind.title,
         "description": kind.description,
@@ -264,9 +257,9 @@ def _described(request: Request, name: str, kind: Collection, place: OnEarth) ->
         "crs": place.systems,
         "storageCrs": place.systems[-1],
         "links": [
-            _link(request, path, "self", _JSON, kind.title),
-            _link(request, f"{path}/items", "items", _GEOJSON, "its features"),
-            _link(request, f"{path}/items", "items", _HTML, "its features for people", {"f": "html"}),
+            *_both(request, path, JSON),
+            _link(request, f"{path}/items", "items", GEOJSON, "its features"),
+            _link(request, f"{path}/items", "items", HTML, "its features for people", {"f": "html"}),
         ],
     }
 
@@ -274,79 +267,69 @@ def _described(request: Request, name: str, kind: Collection, place: OnEarth) ->
 def _link(
     request: Request, path: str, rel: str, kind: str, title: str, query: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    href = f"{str(request.base_url).rstrip('/')}/ogc{path}" + (f"?{urlencode(query)}" if query else "")
+    href = f"{_address(request)}{path}" + (f"?{urlencode(query)}" if query else "")
     return {"href": href, "rel": rel, "type": kind, "title": title}
 
 
+def _both(request: Request, path: str, kind: str) -> list[dict[str, str]]:
+    """Links to a page as it is and in its other form; ``kind``: the media type of its JSON."""
+    is_page = _as_page(request)
+    query = dict(request.query_params) if request.url.path.endswith(f"/ogc{path}") else {}
+    forms = {"json": (kind, "this page as JSON"), "html": (HTML, "this page for people")}
+    other = "json" if is_page else "html"
+    return [
+        _link(request, path, "self", HTML if is_page else kind, "this page", query),
+        _link(request, path, "alternate", *forms[other], query | {"f": other}),
+    ]
+
+
+def _address(request: Request) -> str:
+    """The address of the first page, as the client knows this server."""
+    return f"{str(request.base_url).rstrip('/')}/ogc"
+
+
+def _as_page(request: Request) -> bool:
+    """Whether the client asks for HTML, by ``f`` or by Accept."""
+    form = request.query_params.get("f")
+    return prefers_html(request) if form is None else form == "html"
+
+
 def _answer(
-    request: Request, content: dict[str, Any], kind: str = _JSON, headers: Mapping[str, str] | None = None
+    request: Request, content: dict[str, Any], kind: str = JSON, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """JSON, or a page if the client asks for one by ``f`` or wants HTML above all."""
-    first = request.headers.get("accept", "").partition(",")[0].partition(";")[0].strip()
-    wanted = request.query_params.get("f") or ("html" if first == _HTML else "json")
+    """JSON, or a page if the client asks for one."""
     count_rows(1 + len(content.get("features", ())))
-    if wanted == "html":
-        return _page(str(content.get("title", request.url.path)), content)
-    return Response(msgspec.json.encode(content), media_type=kind, headers=dict(headers or {}))
+    sent = {"Vary": "Accept, Accept-Encoding", **(headers or {})}
+    if _as_page(request):
+        return _page(request, str(content.get("title", request.url.path)), content, sent)
+    data = msgspec.json.encode(content)
+    if takes(request, "gzip"):
+        sent["Content-Encoding"] = "gzip"
+        data = gzip.compress(data, 1)
+    return Response(data, media_type=kind, headers=sent)
 
 
-def _page(title: str, content: Mapping[str, Any]) -> Response:
+def _page(
+    request: Request, title: str, content: Mapping[str, Any], headers: Mapping[str, str] | None = None
+) -> Response:
     """Any answer as a page: members as a table, links to follow."""
     text = (
         f"<!doctype html><html lang=en><head><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f'<link rel=stylesheet href="/viewer/pages.css"></head><body class=plain><h1>{html.escape(title)}</h1>'
-        f"{_as_html(content)}</body></html>"
+        f'<link rel=stylesheet href="{html.escape(request.base_url.path)}viewer/pages.css"></head>'
+        f"<body class=plain><h1>{html.escape(title)}</h1>{_as_html(content)}</body></html>"
     )
-    return Response(text, media_type=_HTML)
+    return Response(text, media_type=HTML, headers=dict(headers or {}))
 
 
 def _as_html(value: Any) -> str:
     if isinstance(value, Mapping):
         if "href" in value:
             return f'<a href="{html.escape(value["href"])}">{html.escape(value.get("title", value["href"]))}</a>'
-        rows = (
-            f"<tr><th>{html.escape(str(name))}<td>{_as_html(one)}" for name, one in value.items() if name != "geometry"
-        )
+        if "coordinates" in value:
+            corners = msgspec.json.encode(value["coordinates"]).decode()
+            return f"<details><summary>{value['type']}</summary>{corners}</details>"
+        rows = (f"<tr><th>{html.escape(str(name))}<td>{_as_html(one)}" for name, one in value.items())
         return f"<table>{''.join(rows)}</table>"
     if isinstance(value, list):
         return "".join(f"<div>{_as_html(one)}</div>" for one in value)
     return html.escape(str(value))
-
-
-def _openapi(request: Request) -> dict[str, Any]:
-    """OpenAPI 3.0 of the paths above."""
-    text = {"type": "string"}
-    parameters = {
-        "bbox": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 6},
-        "bbox-crs": text | {"format": "uri"},
-        "crs": text | {"format": "uri"},
-        "datetime": text,
-        "limit": {"type": "integer", "minimum": 1, "maximum": _LARGEST_PAGE, "default": _USUAL_PAGE},
-        "offset": {"type": "integer", "minimum": 0, "default": 0},
-    }
-    query = [
-        {"name": name, "in": "query", "required": False, "schema": schema, "style": "form", "explode": False}
-        for name, schema in parameters.items()
-    ]
-    versions = [{"name": n, "in": "query", "required": False, "schema": {"type": "integer"}} for n in ("from", "to")]
-    feature = [{"name": "featureId", "in": "path", "required": True, "schema": text}]
-
-    def get(summary: str, kind: str = _JSON, parameters: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        answers = {"200": {"description": summary, "content": {kind: {"schema": {"type": "object"}}}}}
-        problem = {PROBLEM_JSON: {"schema": {"type": "object"}}}
-        bad = {code: {"description": "refused; the body says why", "content": problem} for code in (400, 401, 404)}
-        return {"get": {"summary": summary, "parameters": [*parameters], "responses": answers | bad}}
-
-    paths = {
-        "/": get("the first page"),
-        "/conformance": get("what is met"),
-        "/collections": get("the collections"),
-    }
-    for name, kind in COLLECTIONS.items():
-        more = versions if kind.of_versions else []
-        paths[f"/collections/{name}"] = get(kind.title)
-        paths[f"/collections/{name}/items"] = get(kind.description, _GEOJSON, [*query, *more])
-        paths[f"/collections/{name}/items/{{featureId}}"] = get("one feature", _GEOJSON, [*feature, query[2], *more])
-    server = {"url": f"{str(request.base_url).rstrip('/')}/ogc"}
-    info = {"title": "mapvote: OGC API - Features", "version": "1"}
-    return {"openapi": "3.0.3", "info": info, "servers": [server], "paths": paths}

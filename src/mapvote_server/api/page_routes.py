@@ -18,7 +18,7 @@ from mapvote.codec.manifest import TileHashes
 from mapvote.codec.planes import compress
 from mapvote.shapes.geojson import Places, places
 from mapvote.shapes.packed_cloud import N_LEVELS
-from mapvote_server.api.encodings import takes_zstd
+from mapvote_server.api.encodings import takes
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
 from mapvote_server.api.paging import BoxAsked, PartAsked
@@ -139,7 +139,7 @@ def driven(
 def packed(request: Request, data: bytes, cache: str) -> Response:
     """Bytes, compressed where the client takes it."""
     headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
-    if takes_zstd(request):
+    if takes(request, "zstd"):
         data = compress(data, 1)
         headers["Content-Encoding"] = "zstd"
     return Response(data, media_type="application/octet-stream", headers=headers)
@@ -177,7 +177,7 @@ async def asset(request: Request, name: str) -> Response:
     headers = {"Cache-Control": "no-cache", "ETag": served.tag, "Vary": "Accept-Encoding"}
     if has_already(request, served.tag):
         return Response(status_code=304, headers=headers)
-    if takes_zstd(request):
+    if takes(request, "zstd"):
         return Response(served.packed, media_type=served.kind, headers=headers | {"Content-Encoding": "zstd"})
     return Response(served.plain, media_type=served.kind, headers=headers)
 

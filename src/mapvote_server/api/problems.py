@@ -123,6 +123,8 @@ async def not_allowed(request: Request, error: Exception) -> Response:
     for route in request.app.routes:
         if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE:
             methods |= route.methods or set()
+    if "GET" in methods:  # mapvote_server.api.heads
+        methods.add("HEAD")
     allow = ", ".join(sorted(methods))
     return problem(405, f"this path takes {allow}", request.url.path, {"Allow": allow})
 

@@ -1,4 +1,5 @@
-"""Which client a request comes from, where reverse proxies stand between: Forwarded (RFC 7239) and X-Forwarded-For.
+"""Which client a request comes from and by which address it reached us, where reverse proxies stand between: Forwarded
+(RFC 7239) and X-Forwarded-For, -Proto, -Host, -Prefix.
 
 Anybody can send these headers, so they count from trusted proxies alone, and only as far back as the proxies are
 trusted: each proxy appends the address that it saw.
@@ -8,12 +9,13 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from starlette.types import Scope
 
 Headers = Iterable[tuple[bytes, bytes]]
-_PAIR = re.compile(r'(?:^|[;,\s])(for|proto)=(?:"([^"]*)"|([^;,\s"]*))', re.IGNORECASE)
+_PAIR = re.compile(r'(?:^|[;,\s])(for|proto|host)=(?:"([^"]*)"|([^;,\s"]*))', re.IGNORECASE)
+_PREFIX = re.compile(r"(/[A-Za-z0-9._~-]+)+")
 _ADDRESS = re.compile(r"\[([0-9A-Fa-f:.]+)\](?::[0-9]+)?|([0-9.]+)(?::[0-9]+)?|([0-9A-Fa-f:.]+)")
 
 
@@ -58,8 +60,23 @@ class Proxies:
         if not self.is_one(peer):
             return
         scope["client"] = self.client(peer, scope["headers"]), port
-        if b"https" in {_last_word(scope["headers"], b"x-forwarded-proto"), _forwarded_scheme(scope["headers"])}:
+        if "https" in {_last_word(scope["headers"], b"x-forwarded-proto"), _last_pair(scope["headers"], "proto")}:
             scope["scheme"] = "https"
+
+    def seen_from_outside(self, scope: Scope, peer: str, is_our_name: Callable[[str], bool]) -> Scope:
+        """The request as it reached the outermost proxy, for the links of its answer: the host, if that is one of our
+        names, and the prefix of the path that the proxy at ``peer`` took away."""
+        if not self.is_one(peer):
+            return scope
+        headers = scope["headers"]
+        host = _last_word(headers, b"x-forwarded-host") or _last_pair(headers, "host")
+        if host and is_our_name(host):
+            kept = [(name, value) for name, value in headers if name != b"host"]
+            scope = {**scope, "headers": [*kept, (b"host", host.encode("latin-1"))]}
+        prefix = _all(headers, b"x-forwarded-prefix").strip().rstrip("/")
+        if _PREFIX.fullmatch(prefix):
+            scope = {**scope, "root_path": prefix, "path": prefix + scope["path"]}
+        return scope
 
 
 def _all(headers: Headers, name: bytes) -> str:
@@ -76,11 +93,11 @@ def _forwarded(headers: Headers) -> list[str]:
     return [quoted or plain for name, quoted, plain in pairs if name.lower() == "for"]
 
 
-def _forwarded_scheme(headers: Headers) -> bytes:
+def _last_pair(headers: Headers, wanted: str) -> str:
     pairs = _PAIR.findall(_all(headers, b"forwarded"))
-    schemes = [quoted or plain for name, quoted, plain in pairs if name.lower() == "proto"]
-    return schemes[-1].lower().encode() if schemes else b""
+    values = [quoted or plain for name, quoted, plain in pairs if name.lower() == wanted]
+    return values[-1].lower() if values else ""
 
 
-def _last_word(headers: Headers, name: bytes) -> bytes:
-    return _all(headers, name).rpartition(",")[2].strip().lower().encode()
+def _last_word(headers: Headers, name: bytes) -> str:
+    return _all(headers, name).rpartition(",")[2].strip().lower()

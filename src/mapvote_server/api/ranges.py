@@ -36,14 +36,14 @@ def asked_bytes(text: str | None, size: int) -> range | None:
 
 
 def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_type: str) -> Response:
-    """The answer to GET or HEAD for an open file, which is closed at its end: 200, 206, 304 or 416."""
+    """The answer to GET for an open file, which is closed at its end: 200, 206, 304 or 416."""
     headers = {"ETag": tag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
     if has_already(request, tag):
         file.close()
         return Response(status_code=304, headers=headers)
     fresh = request.headers.get("if-range", tag) == tag
     try:
-        part = asked_bytes(request.headers.get("range"), size) if fresh and request.method == "GET" else None
+        part = asked_bytes(request.headers.get("range"), size) if fresh else None
     except NotInFile as error:
         file.close()
         refused = refuse(error, request.url.path)
@@ -54,9 +54,6 @@ def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_typ
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     status = 200 if part is None else 206
-    if request.method == "HEAD":
-        file.close()
-        return Response(status_code=status, headers=headers, media_type=media_type)
     return StreamingResponse(_pieces(file, sent), status, headers, media_type)
 
 

@@ -137,7 +137,8 @@ class Hosts:
 
     def __init__(self, allowed: Sequence[str]) -> None:
         self._allowed = frozenset(name.lower() for name in allowed) | {"localhost"}
-        self._ours = lru_cache(maxsize=256)(self._is_ours)
+        self.knows = lru_cache(maxsize=256)(self._is_ours)
+        """Whether a Host is a name of this server."""
 
     def check(self, scope: Scope) -> None:
         """Forbidden for a request to another name, or by a page of another server."""
@@ -155,7 +156,7 @@ class Hosts:
                 host = value.decode("latin-1") if host is None else ""
             elif name == b"origin":
                 origin = value.decode("latin-1")
-        if not host or not self._ours(host):
+        if not host or not self.knows(host):
             raise Forbidden(f"{(host or '')[:80]!r} is not a name of this server: {_MEND}")
         theirs = "" if origin is None else origin.partition("://")[2].lower()
         # An Origin that is an IP address must equal the Host: another machine's page has an address too.
@@ -241,6 +242,7 @@ class Watch:
                 status = message["status"]
             await send(message)
 
+        sender = (scope["client"] or ("",))[0]
         try:
             self._proxies.apply(scope)
             self._hosts.check(scope)
@@ -259,7 +261,8 @@ class Watch:
             if key_hash is not None and key is not None:
                 asker.set(key.name)
                 self._charge(key.name, privileged=privileged)
-            await self._app(scope, receive, watched)
+            outside = self._proxies.seen_from_outside(scope, sender, self._hosts.knows)
+            await self._app(outside, receive, watched)
         except MapvoteError as error:
             if isinstance(error, TooMany):  # a flood waits for its refusals instead of sending more
                 step_aside(with_key=False)

@@ -15,7 +15,7 @@ from fastapi.routing import APIRoute
 from mapvote.codec.planes import unpack_bytes
 from mapvote.codec.tile_planes import TILE_PLANE_SIZES
 from mapvote.core.answers import answer
-from mapvote_server.api.encodings import takes_zstd
+from mapvote_server.api.encodings import takes
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.lanes import on
 from mapvote_server.api.paging import PartAsked
@@ -112,7 +112,7 @@ async def plane(request: Request, digest: Digest) -> Response:
     data = await parts.vehicle.run(parts.store.blob, digest)
     if has_already(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    if takes_zstd(request):
+    if takes(request, "zstd"):
         headers["Content-Encoding"] = "zstd"
     else:
         data = unpack_bytes(data, TILE_PLANE_SIZES.plane_bytes, "tile plane")

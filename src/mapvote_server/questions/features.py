@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, time
 from typing import Any
 
 import msgspec
@@ -130,6 +130,8 @@ class Collection:
     """Whether only reviewers and operators see it."""
     of_versions: bool = False
     """Whether it compares two versions."""
+    on_tiles: bool = True
+    """Whether every feature lies on tiles of the map or of ballots."""
 
 
 def _changes(store: Store, with_names: bool, old: int, new: int) -> Source:
@@ -156,7 +158,11 @@ COLLECTIONS: Mapping[str, Collection] = {
     "pending": Collection("Pending changes", "What a publish would change now", None, for_reviewers=True),
     "coverage": Collection("Coverage", "Tiles that vehicles have seen, and when the last did", _seen),
     "passes": Collection(
-        "Wanted passes", "Stretches of road where one more pass would decide cells", _passes, for_reviewers=True
+        "Wanted passes",
+        "Stretches of road where one more pass would decide cells",
+        _passes,
+        for_reviewers=True,
+        on_tiles=False,
     ),
     "tiles": Collection("Tiles", "All tiles of the map", _tiles),
 }
@@ -202,11 +208,10 @@ class OnEarth:
         return [1, 0] if read_crs(self.frame.crs).axis_info[0].direction == "north" else [0, 1]
 
 
-def extent(source: Source, place: OnEarth) -> list[float] | None:
-    """[west, south, east, north] in degrees of all features, west > east over the date line; None without any."""
-    if not len(source):
-        return None
-    west, south, east, north = _bounds_in(shapely.total_bounds(source.shapes()), place, CRS84).tolist()
+def extent_of(store: Store, place: OnEarth) -> list[float]:
+    """[west, south, east, north] in degrees of all tiles, west > east over the date line."""
+    tiles = TileSquares(tiles_seen(store, False), store.lattice)
+    west, south, east, north = _bounds_in(shapely.total_bounds(tiles.shapes()), place, CRS84).tolist()
     return [(west + 180.0) % 360.0 - 180.0, south, (east + 180.0) % 360.0 - 180.0, north]
 
 
@@ -234,9 +239,7 @@ def within(source: Source, box: Sequence[float], place: OnEarth, crs: str) -> li
 def _bounds_in(bounds_m: F64, place: OnEarth, crs: str) -> F64:
     """(4,) [x0, y0, x1, y1] in a system around a box (4,) of map metres. Longitudes are continuous: over the date line
     they go on above 180 degrees."""
-    side_m = max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
-    outline = shapely.segmentize(shapely.box(*bounds_m), side_m / 8.0)
-    xy = place.out(shapely.get_coordinates(outline), crs)
+    xy = place.out(shapely.get_coordinates(_box(bounds_m[:2], bounds_m[2:])), crs)
     if crs == CRS84:
         xy[:, 0] = (xy[:, 0] - xy[0, 0] + 180.0) % 360.0 - 180.0 + xy[0, 0]
     return np.array([*xy.min(axis=0), *xy.max(axis=0)])
@@ -251,43 +254,61 @@ def _area(corners: F64, bounds: F64, place: OnEarth, crs: str) -> shapely.Geomet
         low = np.maximum(corners[0] + (turn, 0.0), bounds[:2] - margin)
         high = np.minimum(corners[1] + (turn, 0.0), bounds[2:] + margin)
         if (low <= high).all():
-            side = max(*(high - low), 1e-9)
-            parts.append(shapely.segmentize(shapely.box(*low, *high), side / 8.0))
+            parts.append(_box(low, high))
     return shapely.transform(shapely.union_all(parts), lambda xy: place.into(xy, crs))
+
+
+def _box(low: F64, high: F64) -> shapely.Geometry:
+    """The box between two corners (2,), its edges in pieces; a line or a point if it has no area."""
+    corners = [low, (low[0], high[1]), high, (high[0], low[1])]
+    return shapely.segmentize(shapely.convex_hull(shapely.multipoints(corners)), max(*(high - low), 1e-9) / 8.0)
 
 
 def during(source: Source, positions: Sequence[int], interval: str) -> list[int]:
     """Those ``positions`` whose feature's time meets an instant or an interval of RFC 3339 ("../..", "a/b"); features
-    without one stay.
+    without one stay. A date alone is its whole day.
 
     BadRequest if the text is neither.
     """
     ends = interval.split("/")
-    if len(ends) > 2:
+    if len(ends) > 2 or not interval:
         raise BadRequest("datetime is an instant or an interval A/B")
-    low = _instant(ends[0], datetime.min.replace(tzinfo=UTC))
-    high = _instant(ends[-1], datetime.max.replace(tzinfo=UTC))
+    open_end = "" if len(ends) == 1 else ".."
+    low = _EVER[0] if ends[0] in ("", open_end) else _instant(ends[0], time.min)
+    high = _EVER[1] if ends[-1] in ("", open_end) else _instant(ends[-1], time.max)
     if low > high:
         raise BadRequest("datetime: the interval ends before it begins")
 
     def meets(position: int) -> bool:
         first, last = source.times(position)
-        return last is None or (_instant(first or last, low) <= high and _instant(last, high) >= low)
+        return last is None or (datetime.fromisoformat(first or last) <= high and datetime.fromisoformat(last) >= low)
 
     return [position for position in positions if meets(position)]
 
 
-def _instant(text: str, unbounded: datetime) -> datetime:
-    if text in ("", ".."):
-        return unbounded
+_TIME = re.compile(
+    r"([0-9]{4}-[0-9]{2}-[0-9]{2})(?:(T[0-9]{2}:[0-9]{2}:)([0-9]{2})(\.[0-9]+)?(Z|[+-][0-9]{2}:[0-9]{2}))?"
+)
+_EVER = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
+
+
+def _instant(text: str, time_of_day: time) -> datetime:
+    """A time of RFC 3339, a leap second as the end of the second before; of a date alone, that ``time_of_day``, UTC."""
+    parts = _TIME.fullmatch(text.upper())
     try:
-        moment = datetime.fromisoformat(text)
+        day, hours, seconds, fraction, zone = parts.groups("") if parts else ("", "", "", "", "")
+        if not hours:
+            return datetime.combine(date.fromisoformat(day), time_of_day, UTC)
+        if seconds == "60":
+            seconds = "59"
+            fraction = ".999999"
+        return datetime.fromisoformat(f"{day}{hours}{seconds}{fraction}{zone}")
     except ValueError as error:
-        raise BadRequest(f"datetime: {text[:40]!r} is no time of RFC 3339") from error
-    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+        raise BadRequest(f"datetime: {text[:40]!r} is no time of RFC 3339, such as 2026-11-27T12:00:00Z") from error
 
 
 def placed(feature: Mapping[str, Any], place: OnEarth, crs: str) -> dict[str, Any]:
     """A feature with its coordinates in a system."""
-    geometry = shapely.transform(shape(feature["geometry"]), lambda xy: place.out(xy, crs))
+    counterclockwise = shapely.orient_polygons(shape(feature["geometry"]))  # RFC 7946, 3.1.6
+    geometry = shapely.transform(counterclockwise, lambda xy: place.out(xy, crs))
     return dict(feature) | {"geometry": mapping(geometry)}

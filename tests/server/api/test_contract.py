@@ -157,13 +157,32 @@ def test_an_error_of_the_server_itself_is_a_problem_too(new_store: NewStore) -> 
 
 
 @pytest.mark.parametrize(
+    "path", ["/", "/v1/info", "/v1/changes?from=1&to=1", "/v1/changes?from=x", "/nothing", "/stac"]
+)
+def test_head_answers_as_get_without_content(client: TestClient, path: str) -> None:
+    head = client.head(path)
+    got = client.get(path)
+    assert (head.status_code, head.content) == (got.status_code, b"")
+    assert head.headers == got.headers
+
+
+def test_head_of_a_stream_ends(client: TestClient) -> None:
+    head = client.head("/v1/events")
+    assert (head.status_code, head.content, head.headers["content-type"]) == (
+        200,
+        b"",
+        "text/event-stream; charset=utf-8",
+    )
+
+
+@pytest.mark.parametrize(
     ("path", "allow"),
     [
-        ("/v1/keys", "GET, POST"),
-        ("/v1/publish", "DELETE, GET, POST"),
+        ("/v1/keys", "GET, HEAD, POST"),
+        ("/v1/publish", "DELETE, GET, HEAD, POST"),
         ("/v1/ballots/a/d", "DELETE, PUT"),
-        (f"/v1/tiles/{'0' * 64}", "GET, PUT"),
-        ("/v1/map", "GET"),
+        (f"/v1/tiles/{'0' * 64}", "GET, HEAD, PUT"),
+        ("/v1/map", "GET, HEAD"),
     ],
 )
 def test_a_405_names_every_method_of_the_path(client: TestClient, path: str, allow: str) -> None:
