@@ -6,9 +6,6 @@ from collections.abc import Iterator, Sequence
 
 from starlette.requests import Request
 
-_JSON = ("application/json", "application/geo+json")
-_HTML = ("text/html",)
-
 
 def takes(request: Request, coding: str) -> bool:
     """Whether Accept-Encoding names a coding, such as zstd, with a weight above 0."""
@@ -19,7 +16,7 @@ def takes(request: Request, coding: str) -> bool:
 def prefers_html(request: Request) -> bool:
     """Whether Accept gives HTML a higher weight than JSON; of equal weights the more closely named type wins."""
     accepted = dict(_entries(request, "accept"))
-    return _rank(accepted, _HTML) > _rank(accepted, _JSON)
+    return _rank(accepted, ["text/html"]) > _rank(accepted, ["application/json", "application/geo+json"])
 
 
 def _rank(accepted: dict[str, float], kinds: Sequence[str]) -> tuple[float, int]:

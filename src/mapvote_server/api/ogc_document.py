@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from http import HTTPStatus
 from typing import Any
 
@@ -10,15 +11,20 @@ from mapvote_server.api.openapi import SCHEMES
 from mapvote_server.api.problems import PROBLEM_JSON
 from mapvote_server.questions.features import COLLECTIONS
 
-JSON = "application/json"
-GEOJSON = "application/geo+json"
-HTML = "text/html"
-OPENAPI = "application/vnd.oai.openapi+json;version=3.0"
+
+class Media(StrEnum):
+    """Media types of the answers."""
+
+    JSON = "application/json"
+    GEOJSON = "application/geo+json"
+    HTML = "text/html"
+    OPENAPI = "application/vnd.oai.openapi+json;version=3.0"
+
+
 USUAL_PAGE = 100
 """Features of a page if no limit is stated."""
 LARGEST_PAGE = 10_000
 """Features of a page at most."""
-_REFUSALS = (400, 401, 403, 404, 422, 429, 500, 503)
 
 
 def document_at(address: str) -> dict[str, Any]:
@@ -26,19 +32,19 @@ def document_at(address: str) -> dict[str, Any]:
     parameters = _parameters()
     query = [parameters[name] for name in ("bbox", "bbox-crs", "crs", "datetime", "limit", "offset")]
     paths = {
-        "/": _get("the first page", [JSON, HTML]),
-        "/api": _get("this document", [OPENAPI]),
-        "/api.html": _get("this document for people", [HTML]),
-        "/conformance": _get("the classes that are met", [JSON, HTML]),
-        "/collections": _get("the collections", [JSON, HTML]),
+        "/": _get("the first page", [Media.JSON, Media.HTML]),
+        "/api": _get("this document", [Media.OPENAPI]),
+        "/api.html": _get("this document for people", [Media.HTML]),
+        "/conformance": _get("the classes that are met", [Media.JSON, Media.HTML]),
+        "/collections": _get("the collections", [Media.JSON, Media.HTML]),
     }
     for name, kind in COLLECTIONS.items():
         versions = [parameters["from"], parameters["to"]] if kind.of_versions else []
         feature = [parameters["featureId"], parameters["crs"], *versions]
         path = f"/collections/{name}"
-        paths[path] = _get(kind.title, [JSON, HTML])
-        paths[f"{path}/items"] = _get(kind.description, [GEOJSON, HTML], [*query, *versions])
-        paths[f"{path}/items/{{featureId}}"] = _get("one feature", [GEOJSON, HTML], feature)
+        paths[path] = _get(kind.title, [Media.JSON, Media.HTML])
+        paths[f"{path}/items"] = _get(kind.description, [Media.GEOJSON, Media.HTML], [*query, *versions])
+        paths[f"{path}/items/{{featureId}}"] = _get("one feature", [Media.GEOJSON, Media.HTML], feature)
     return {
         "openapi": "3.0.3",
         "info": {"title": "mapvote: OGC API - Features", "version": "1"},
@@ -72,10 +78,10 @@ def _parameters() -> dict[str, dict[str, Any]]:
 
 def _get(summary: str, kinds: Sequence[str], parameters: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """An operation that answers by one of some media types; where it has a choice, ``f`` makes it."""
-    content = {kind: {"schema": {"type": "string" if kind == HTML else "object"}} for kind in kinds}
+    content = {kind: {"schema": {"type": "string" if kind == Media.HTML else "object"}} for kind in kinds}
     answers: dict[str, Any] = {"200": {"description": summary, "content": content}}
     problem = {PROBLEM_JSON: {"schema": {"type": "object"}}}
-    for code in _REFUSALS:
+    for code in (400, 401, 403, 404, 422, 429, 500, 503):
         answers[str(code)] = {"description": HTTPStatus(code).phrase, "content": problem}
     choice = [_parameters()["f"]] if len(kinds) > 1 else []
     return {"get": {"summary": summary, "parameters": [*parameters, *choice], "responses": answers}}

@@ -21,7 +21,7 @@ from fastapi import APIRouter, Request, Response
 from mapvote.core.times import utc
 from mapvote_server.api.encodings import prefers_html, takes
 from mapvote_server.api.lanes import on
-from mapvote_server.api.ogc_document import GEOJSON, HTML, JSON, LARGEST_PAGE, OPENAPI, USUAL_PAGE, document_at
+from mapvote_server.api.ogc_document import LARGEST_PAGE, USUAL_PAGE, Media, document_at
 from mapvote_server.api.schemas import LEAST, MOST
 from mapvote_server.api.services import Known, Parts, Services
 from mapvote_server.errors import BadRequest, Forbidden, NotFound
@@ -58,11 +58,11 @@ async def landing(request: Request) -> Response:
     """The first page: where the rest is."""
     _check(request)
     links = [
-        *_both(request, "", JSON),
-        _link(request, "/api", "service-desc", OPENAPI, "the API"),
-        _link(request, "/api.html", "service-doc", HTML, "the API for people"),
-        _link(request, "/conformance", "conformance", JSON, "what this server conforms to"),
-        _link(request, "/collections", "data", JSON, "the collections"),
+        *_both(request, "", Media.JSON),
+        _link(request, "/api", "service-desc", Media.OPENAPI, "the API"),
+        _link(request, "/api.html", "service-doc", Media.HTML, "the API for people"),
+        _link(request, "/conformance", "conformance", Media.JSON, "what this server conforms to"),
+        _link(request, "/collections", "data", Media.JSON, "the collections"),
     ]
     about = {"title": "mapvote", "description": "A point-cloud map, and what has changed in it", "links": links}
     return _answer(request, about)
@@ -79,7 +79,7 @@ async def conformance(request: Request) -> Response:
 async def definition(request: Request) -> Response:
     """The API by OpenAPI 3.0."""
     _check(request)
-    return Response(msgspec.json.encode(document_at(_address(request))), media_type=OPENAPI)
+    return Response(msgspec.json.encode(document_at(_address(request))), media_type=Media.OPENAPI)
 
 
 @router.get("/ogc/api.html")
@@ -98,7 +98,7 @@ def collections(request: Request, parts: Parts, with_names: Known) -> Response:
     box = extent_of(parts.store, place)
     shown = [name for name, kind in COLLECTIONS.items() if with_names or not kind.for_reviewers]
     listed = [_described(request, name, place, box) for name in shown]
-    links = _both(request, "/collections", JSON)
+    links = _both(request, "/collections", Media.JSON)
     return _answer(request, {"links": links, "collections": listed, "crs": place.systems})
 
 
@@ -133,8 +133,11 @@ def _items(request: Request, store: Store, with_names: bool, name: str, pending:
     shown = [placed(feature, place, wanted.crs) for feature in page]
     path = f"/collections/{name}/items"
     query = dict(request.query_params)
-    links = [*_both(request, path, GEOJSON), _link(request, f"/collections/{name}", "collection", JSON, kind.title)]
-    shown_as = HTML if _as_page(request) else GEOJSON
+    links = [
+        *_both(request, path, Media.GEOJSON),
+        _link(request, f"/collections/{name}", "collection", Media.JSON, kind.title),
+    ]
+    shown_as = Media.HTML if _as_page(request) else Media.GEOJSON
     after = wanted.offset + len(shown)
     if after < len(positions):
         links.append(_link(request, path, "next", shown_as, "the next page", query | {"offset": str(after)}))
@@ -143,7 +146,7 @@ def _items(request: Request, store: Store, with_names: bool, name: str, pending:
         links.append(_link(request, path, "prev", shown_as, "the page before", before))
     counts = {"numberMatched": len(positions), "numberReturned": len(shown), "timeStamp": utc(time.time_ns())}
     answer = {"type": "FeatureCollection", "features": shown, "links": links} | counts
-    return _answer(request, answer, GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
+    return _answer(request, answer, Media.GEOJSON, {"Content-Crs": f"<{wanted.crs}>"})
 
 
 @router.get("/ogc/collections/{name}/items/{feature_id}")
@@ -163,9 +166,12 @@ def _item(
     if not named:
         raise NotFound(f"{name} has no feature {feature_id[:80]!r}")
     path = f"/collections/{name}/items/{feature_id}"
-    links = [*_both(request, path, GEOJSON), _link(request, f"/collections/{name}", "collection", JSON, kind.title)]
+    links = [
+        *_both(request, path, Media.GEOJSON),
+        _link(request, f"/collections/{name}", "collection", Media.JSON, kind.title),
+    ]
     shown = placed(named[0], place, query.crs) | {"links": links}
-    return _answer(request, shown, GEOJSON, {"Content-Crs": f"<{query.crs}>"})
+    return _answer(request, shown, Media.GEOJSON, {"Content-Crs": f"<{query.crs}>"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,9 +263,9 @@ def _described(request: Request, name: str, place: OnEarth, box: Sequence[float]
         "crs": place.systems,
         "storageCrs": place.systems[-1],
         "links": [
-            *_both(request, path, JSON),
-            _link(request, f"{path}/items", "items", GEOJSON, "its features"),
-            _link(request, f"{path}/items", "items", HTML, "its features for people", {"f": "html"}),
+            *_both(request, path, Media.JSON),
+            _link(request, f"{path}/items", "items", Media.GEOJSON, "its features"),
+            _link(request, f"{path}/items", "items", Media.HTML, "its features for people", {"f": "html"}),
         ],
     }
 
@@ -275,10 +281,10 @@ def _both(request: Request, path: str, kind: str) -> list[dict[str, str]]:
     """Links to a page as it is and in its other form; ``kind``: the media type of its JSON."""
     is_page = _as_page(request)
     query = dict(request.query_params) if request.url.path.endswith(f"/ogc{path}") else {}
-    forms = {"json": (kind, "this page as JSON"), "html": (HTML, "this page for people")}
+    forms = {"json": (kind, "this page as JSON"), "html": (Media.HTML, "this page for people")}
     other = "json" if is_page else "html"
     return [
-        _link(request, path, "self", HTML if is_page else kind, "this page", query),
+        _link(request, path, "self", Media.HTML if is_page else kind, "this page", query),
         _link(request, path, "alternate", *forms[other], query | {"f": other}),
     ]
 
@@ -295,7 +301,7 @@ def _as_page(request: Request) -> bool:
 
 
 def _answer(
-    request: Request, content: dict[str, Any], kind: str = JSON, headers: Mapping[str, str] | None = None
+    request: Request, content: dict[str, Any], kind: str = Media.JSON, headers: Mapping[str, str] | None = None
 ) -> Response:
     """JSON, or a page if the client asks for one."""
     count_rows(1 + len(content.get("features", ())))
@@ -318,7 +324,7 @@ def _page(
         f'<link rel=stylesheet href="{html.escape(request.base_url.path)}viewer/pages.css"></head>'
         f"<body class=plain><h1>{html.escape(title)}</h1>{_as_html(content)}</body></html>"
     )
-    return Response(text, media_type=HTML, headers=dict(headers or {}))
+    return Response(text, media_type=Media.HTML, headers=dict(headers or {}))
 
 
 def _as_html(value: Any) -> str:

@@ -274,8 +274,8 @@ def during(source: Source, positions: Sequence[int], interval: str) -> list[int]
     if len(ends) > 2 or not interval:
         raise BadRequest("datetime is an instant or an interval A/B")
     open_end = "" if len(ends) == 1 else ".."
-    low = _EVER[0] if ends[0] in ("", open_end) else _instant(ends[0], time.min)
-    high = _EVER[1] if ends[-1] in ("", open_end) else _instant(ends[-1], time.max)
+    low = datetime.min.replace(tzinfo=UTC) if ends[0] in ("", open_end) else _instant(ends[0], time.min)
+    high = datetime.max.replace(tzinfo=UTC) if ends[-1] in ("", open_end) else _instant(ends[-1], time.max)
     if low > high:
         raise BadRequest("datetime: the interval ends before it begins")
 
@@ -289,7 +289,6 @@ def during(source: Source, positions: Sequence[int], interval: str) -> list[int]
 _TIME = re.compile(
     r"([0-9]{4}-[0-9]{2}-[0-9]{2})(?:(T[0-9]{2}:[0-9]{2}:)([0-9]{2})(\.[0-9]+)?(Z|[+-][0-9]{2}:[0-9]{2}))?"
 )
-_EVER = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
 
 
 def _instant(text: str, time_of_day: time) -> datetime:
