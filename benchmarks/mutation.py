@@ -27,7 +27,8 @@ ROOT = Path(__file__).parents[1]
 DECIDING = [
     "core/voting", "core/ground", "fusion/fuse", "fusion/tile_vote", "fusion/edit", "fusion/distrust", "fusion/copies",
     "fusion/loss_budget", "fusion/neighbour_noise", "fusion/change_time", "rules/paper", "rules/evidence",
-    "rules/packed_tiles", "rules/surfaces", "perception/fans", "perception/raycast", "survey/clean_map",
+    "rules/packed_tiles", "rules/voxel_counts", "rules/surfaces", "perception/fans", "perception/raycast",
+    "survey/clean_map",
     "mapvote_server/store/votes", "mapvote_server/store/publish", "matching/odometry", "matching/pose_check",
     "doctor/map_fit", "doctor/prior_fit", "formats/drives/trajectory", "formats/geo/units",
 ]  # fmt: skip

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
-from mapvote.core.grid import TILE_CELLS, Grid, Lattice
+from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.process_memory import seldom_collecting
 from mapvote.core.record import record
@@ -33,7 +33,6 @@ from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
 from mapvote.fusion.gravity import Remains, fall_within
 from mapvote.matching.localiser import GivenPoses
-from mapvote.rules.packed_tiles import PackedTiles
 from mapvote.survey.build import build_map
 from mapvote.vehicle import vote_drive
 
@@ -126,17 +125,11 @@ def _let_fall() -> None:
 
 
 def _go_far(drive: Drive) -> None:
-    """Compile the checks of drive and map; points without times; a tile left and come back to; more voxels than a table
-    takes."""
+    """Compile the checks of drive and map; points without times; more voxels than a table takes."""
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     for columns in _FIELDS_OF_TABLES:
         spinning_time_s(xyz_view("warmup", _table(np.zeros((2, 3), np.float32), columns)), drive.sensor.rate_hz)
-    tiles = PackedTiles(Lattice(), 1)
-    far = 10 * TILE_CELLS
-    tiles.near((0, 0))[:] = 1
-    tiles.leave(Grid(Lattice(), far, far, 1, 1))
-    tiles.near((0, 0))
     VoxelCloud(Lattice()).enter(np.repeat(np.arange(40_000.0)[:, None], 3, axis=1))
 
 

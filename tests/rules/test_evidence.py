@@ -22,12 +22,7 @@ from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.placement import find_obstacles
 from mapvote.perception.raycast import ScanView
 from mapvote.rules.evidence import (
-    CROSSED,
-    HIT,
-    PASSED,
-    PASSES,
     SURFACE_RULE,
-    WORDS,
     Facts,
     count_scan,
     enough,
@@ -37,7 +32,8 @@ from mapvote.rules.evidence import (
     near_hits,
     weigh_voxels,
 )
-from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, count_of
+from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, count_of
+from mapvote.rules.voxel_counts import CROSSED, HIT, PASSED, PASSES, WORDS, VoxelCounts
 
 ROWS, COLS = range(100, 104), range(100, 105)
 FULL = 2**COUNT_PLANES - 1
@@ -65,11 +61,12 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
     def has(plane: np.ndarray, k: int = bit) -> bool:
         return bool(int(plane[r, c]) >> k & 1)
 
-    passed, (near, apart) = seen.view.passed, near_hits(seen)
+    passed, (near, hits, apart) = seen.view.passed, near_hits(seen)
     above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
     below = bit <= 1 or has(passed, bit - 1)
     crossed = has(passed) and above and below and not has(near)
     hit = has(near) if has(seen.reference.occupied) else has(apart)
+    assert hit == has(hits)
     return crossed, hit, has(passed) and not has(near), has(passed)
 
 
@@ -81,14 +78,15 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
 def test_the_counts_of_a_voxel_follow_from_each_scan(offsets: list[tuple[float, float, float]], seed: int) -> None:
     point_map = street()
     seen = seen_from(point_map, np.array(offsets), seed)
-    evidence = PackedTiles(point_map.lattice, WORDS)
-    count_scan(evidence, seen)
+    counts = VoxelCounts(point_map.lattice)
+    count_scan(counts, seen)
+    counted = counts.settled()[0, 0]
     for r in ROWS:
         for c in COLS:
-            cell = evidence[0, 0][r, c]
+            cell = counted[r, c]
             for bit in range(1, TOP_BIT):
-                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
-                assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
+                often = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
+                assert (*often, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
 
 
 def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
@@ -100,22 +98,23 @@ def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
     for (row, col), bit in places.items():
         passed[row + 5, col - 7] = np.uint64(1 << bit)
     view = ScanView(window, none.astype(np.int32), none, passed, np.zeros((0, 0), np.uint8))
-    evidence = PackedTiles(point_map.lattice, WORDS)
-    count_scan(evidence, replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
+    counts = VoxelCounts(point_map.lattice)
+    count_scan(counts, replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
+    counted = counts.settled()
     for (row, col), bit in places.items():
-        planes = evidence[row // TILE_CELLS, 0]
+        planes = counted[row // TILE_CELLS, 0]
         assert planes[row % TILE_CELLS, col, PASSED] == np.uint64(1 << bit)
-    assert sum(np.count_nonzero(evidence[tile][..., PASSED]) for tile in evidence) == len(places)
+    assert sum(np.count_nonzero(counted[tile][..., PASSED]) for tile in counted) == len(places)
 
 
 def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_stay() -> None:
     point_map = street()
-    evidence = PackedTiles(point_map.lattice, WORDS)
+    counts = VoxelCounts(point_map.lattice)
     hit = np.array([[102.5 * 0.3, 102.5 * 0.3, 1.05]])  # where nothing is mapped
     empty = np.array([[104.5 * 0.3, 104.5 * 0.3, 1.05]])
     for scan in range(FULL + 1):
-        count_scan(evidence, one_scan(point_map, hit if scan % 4 == 0 else empty))
-    cell = evidence[0, 0][102, 102]
+        count_scan(counts, one_scan(point_map, hit if scan % 4 == 0 else empty))
+    cell = counts.settled()[0, 0][102, 102]
     assert count_of(cell, PASSES, 10) == (FULL + 1) // 2, "128 do not fit"
     assert count_of(cell, HIT, 3) == 32 // 2
     assert count_of(cell, PASSES, 3) == 96 // 2
@@ -157,9 +156,9 @@ def test_cells_with_unknown_ground_count_nothing() -> None:
     point_map = street()
     seen = one_scan(point_map, np.array([[30.7, 30.7, 1.05]]))
     unknown = replace(seen.reference, ground_z=np.full_like(seen.reference.ground_z, np.nan))
-    evidence = PackedTiles(point_map.lattice, WORDS)
-    count_scan(evidence, replace(seen, reference=unknown))
-    assert not any(planes.any() for planes in evidence.values())
+    counts = VoxelCounts(point_map.lattice)
+    count_scan(counts, replace(seen, reference=unknown))
+    assert not any(planes.any() for planes in counts.settled().values())
 
 
 SIDE = 7
@@ -210,7 +209,7 @@ def test_a_return_hits_every_mapped_voxel_near_it_else_the_voxel_it_lies_in(seed
             row, col = divmod(int(here.scan.cell[k]), SIDE)
             layer = int(points[k, 2] // CELL_SIZE) - base[row, col]
             struck[row, col] |= np.uint64(1) << np.uint64(np.clip(layer, 0, TOP_BIT))
-    near, apart = near_hits(here)
+    near, _, apart = near_hits(here)
     assert np.array_equal(near, by_boxes(here))
     assert np.array_equal(apart, struck)
 

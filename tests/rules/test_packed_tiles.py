@@ -15,9 +15,9 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, MapvoteError
-from mapvote.rules.evidence import CROSSED, HIT, PASSED, PASSES
 from mapvote.rules.packed_tiles import COUNT_PLANES, PackedTiles, Shelf, TilePacking, add_one, count_of
 from mapvote.rules.surfaces import SurfaceVoter
+from mapvote.rules.voxel_counts import CROSSED, HIT, PASSED, PASSES
 
 LATTICE = Lattice()
 
@@ -74,7 +74,7 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
     """Walls were crossed seven times or met, or half of both or neither, and things rose, at random."""
     voter, rng = SurfaceVoter(VotingSettings(), point_map), np.random.default_rng(6)
     for tile in point_map.tiles:
-        planes, mapped = voter.evidence.near(tile), point_map.tiles[tile].obstacle_words
+        planes, mapped = voter.counts.settled().near(tile), point_map.tiles[tile].obstacle_words
         fate = rng.random(mapped.shape)
         planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
         planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))

@@ -45,7 +45,8 @@ from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.perception.frontend import Observation
 from mapvote.perception.placement import cells_and_obstacles
-from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, add_one, count_of
+from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, count_of
+from mapvote.rules.voxel_counts import CROSSED, HIT, PASSED, PASSES, ScanWords, VoxelCounts
 
 
 @record(votes=True)
@@ -76,52 +77,44 @@ class SurfaceRule:
 
 SURFACE_RULE = SurfaceRule()
 
-CROSSED, HIT, PASSES, PASSED = 0, COUNT_PLANES, 2 * COUNT_PLANES, 3 * COUNT_PLANES
-"""First plane of each counter of a cell, and the last of its WORDS: voxels through which any ray ever went."""
-WORDS = PASSED + 1
 NO_VOXELS = np.uint64(0)
-_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
-def count_scan(evidence: PackedTiles, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
-    """Count one scan in the ``evidence`` of a drive, a vehicle's or a survey's: WORDS words a cell. Returns (rows,
-    cols) words of the voxels that hold a return which the map does not explain."""
-    view = seen.view
-    here = seen.reference
-    grid = view.grid
-    near, apart = near_hits(seen, rule)
-    for planes, part in evidence.under(grid):
-        _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
-    evidence.leave(grid)
+def count_scan(counts: VoxelCounts, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
+    """Count one scan in the ``counts`` of a drive, a vehicle's or a survey's. Returns (rows, cols) words of the voxels
+    that hold a return which the map does not explain."""
+    near, hit, apart = near_hits(seen, rule)
+    ground_z = np.ascontiguousarray(seen.reference.ground_z)
+    counts.enter(seen.view.grid, ScanWords(seen.view.passed, near, hit, ground_z))
     return apart
 
 
-def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64, U64]:
-    """(near, apart), words (rows, cols) of one scan: the voxels within ``hit_reach_m``, along each axis, of a return
-    that stands still, and the voxel of each such return that has none of the map's so near."""
+def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64, U64, U64]:
+    """(near, hit, apart), words (rows, cols) of one scan: the voxels within ``hit_reach_m``, along each axis, of a
+    return that stands still; the voxels that are hit; those of them that are not the map's."""
     here = seen.reference
     scan = seen.scan
     grid = seen.view.grid
-    near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
+    near, hit, apart = np.zeros((3, *grid.shape), dtype=np.uint64)
     cell = scan.cell if here is scan.reference else cells_and_obstacles(scan.rows, scan.origin_map, here)[0]
     from_corner = scan.origin_map - np.array([grid.x0, grid.y0, 0.0])
     chosen = np.empty(len(cell) + 1, np.int32)
-    planes = np.ascontiguousarray(here.base).reshape(-1), near.reshape(-1), apart.reshape(-1)
+    planes = np.ascontiguousarray(here.base).reshape(-1), near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
     reach = rule.hit_reach_m / CELL_SIZE
     _mark_near(scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, here.occupied, planes, chosen)
-    return near, apart
+    return near, hit, apart
 
 
 @kernel
 def _mark_near(
     points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: F64, reach: float, occupied: U64,
-    planes: tuple[I32, U64, U64], chosen: I32,
+    planes: tuple[I32, U64, U64, U64], chosen: I32,
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of ``occupied`` (rows,
-    cols) and of the flat ``planes``: base, near, apart. ``reach``: cells, below a half, so that a return reaches two
-    cells or one along each axis. Four are always entered, be they one: no branch to predict. ``chosen`` (n + 1,):
+    cols) and of the flat ``planes``: base, near, hit, apart. ``reach``: cells, below a half, so that a return reaches
+    two cells or one along each axis. Four are always entered, be they one: no branch to predict. ``chosen`` (n + 1,):
     scratch."""
-    base, near, apart = planes
+    base, near, hit, apart = planes
     rows, cols = occupied.shape
     east = points[0]
     north = points[1]
@@ -153,11 +146,20 @@ def _mark_near(
         near[b] |= of_b
         near[c] |= of_c
         near[d] |= of_d
-        mapped = occupied[first, left] & of_a | occupied[first, right] & of_b
-        if not mapped | occupied[last, left] & of_c | occupied[last, right] & of_d:
+        of_a &= occupied[first, left]
+        of_b &= occupied[first, right]
+        of_c &= occupied[last, left]
+        of_d &= occupied[last, right]
+        hit[a] |= of_a
+        hit[b] |= of_b
+        hit[c] |= of_c
+        hit[d] |= of_d
+        if not of_a | of_b | of_c | of_d:
             at = np.uint64(cell[p])
             layer = np.int64(np.floor(z))
-            apart[at] |= _layers(layer, layer, np.int64(base[at]))
+            of_a = _layers(layer, layer, np.int64(base[at]))
+            apart[at] |= of_a
+            hit[at] |= of_a
 
 
 @inlined
@@ -166,22 +168,6 @@ def _layers(lowest: np.int64, highest: np.int64, base: np.int64) -> np.uint64:
     low = np.uint64(layer_bit(lowest, base))
     high = np.uint64(layer_bit(highest, base))
     return (np.uint64(2) << high) - (np.uint64(1) << low)
-
-
-@kernel
-def _enter_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
-    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it. Where the ground is unknown heights
-    mean nothing, and nothing is counted."""
-    for r in range(part.row, part.end_row):
-        for c in range(part.col, part.end_col):
-            if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
-                continue
-            cell = planes[r + part.down, c + part.right]
-            rays = passed[r, c]
-            missed = passed[r, c] & ~near[r, c]
-            cell[PASSED] |= rays
-            crossed = missed & (rays >> np.uint64(1) | _HIGHEST) & (rays << np.uint64(1) | _LOWEST)
-            add_one(cell, (crossed, (near[r, c] & occupied[r, c]) | apart[r, c], missed))
 
 
 @kernel

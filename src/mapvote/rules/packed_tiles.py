@@ -124,11 +124,6 @@ class PackedTiles(Mapping[TileIndex, U64]):
             self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
         return self._open[tile]
 
-    def under(self, view: Grid) -> Iterator[tuple[U64, Overlap]]:
-        """The planes of each tile that ``view`` lies on, as :meth:`near` has them, and where it lies in them."""
-        for tile in view.tiles():
-            yield self.near(tile), self.overlap(tile, view)
-
     def overlap(self, tile: TileIndex, view: Grid) -> Overlap:
         """The overlap of ``view`` and a tile."""
         window = self.lattice.tile(tile)
@@ -160,17 +155,9 @@ class PackedTiles(Mapping[TileIndex, U64]):
         """``planes``, which come empty, with the packed words."""
         data = self._shelf.read(place)
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
-        _lay(raw.reshape(self.words + 1, -1), planes.reshape(CELLS, self.words))
+        cells, *words = raw.reshape(self.words + 1, -1)
+        planes.reshape(CELLS, self.words)[cells.astype(np.int64)] = np.stack(words, axis=1)
         return planes
-
-
-@kernel
-def _lay(packed: U64, flat: U64) -> None:
-    """Words (words + 1, n), the cells first, to where they were in (cells, words)."""
-    for i in range(packed.shape[1]):
-        cell = np.int64(packed[0, i])
-        for k in range(flat.shape[1]):
-            flat[cell, k] = packed[k + 1, i]
 
 
 def _packed(planes: U64, zstd_level: int) -> bytes:
@@ -181,29 +168,52 @@ def _packed(planes: U64, zstd_level: int) -> bytes:
 
 
 @kernel
+def add_four(cell: U64, first: int, a: np.uint64, b: np.uint64, c: np.uint64, d: np.uint64) -> np.uint64:
+    """Add to a counter of a cell (words,), whose first plane is ``first``, 1 for each of four words that has the
+    voxel: bits are summed to numbers of three bits, these are added by full adders. Returns the voxels whose count
+    exceeds its planes; the others, and these modulo 2 ** COUNT_PLANES, are right."""
+    odd = a ^ b ^ c
+    pair = a & b | c & (a ^ b)
+    ones = odd ^ d
+    carry = odd & d
+    twos = pair ^ carry
+    fours = pair & carry
+    plane = cell[first]
+    cell[first] = plane ^ ones
+    carry = plane & ones
+    plane = cell[first + 1]
+    either = twos ^ carry
+    cell[first + 1] = plane ^ either
+    carry = twos & carry | plane & either
+    plane = cell[first + 2]
+    either = fours ^ carry
+    cell[first + 2] = plane ^ either
+    carry = fours & carry | plane & either
+    k = first + 3
+    while carry and k < first + COUNT_PLANES:
+        plane = cell[k]
+        cell[k] = plane ^ carry
+        carry &= plane
+        k += 1
+    return carry
+
+
+@kernel
 def add_one(cell: U64, words: tuple[np.uint64, np.uint64, np.uint64]) -> None:
     """Add 1 to the counts that the first, second and third counter of a cell (words,) keep of the voxels of ``words``.
     If one would exceed its planes, all counts of the cell are halved: their ratios stay."""
-    full = _carry(cell, 0, words[0]), _carry(cell, COUNT_PLANES, words[1]), _carry(cell, 2 * COUNT_PLANES, words[2])
+    none = np.uint64(0)
+    full = (
+        add_four(cell, 0, words[0], none, none, none),
+        add_four(cell, COUNT_PLANES, words[1], none, none, none),
+        add_four(cell, 2 * COUNT_PLANES, words[2], none, none, none),
+    )
     if full[0] | full[1] | full[2]:
         for counter in range(3):
             first = counter * COUNT_PLANES
             for k in range(first, first + COUNT_PLANES - 1):
                 cell[k] = cell[k + 1]
             cell[first + COUNT_PLANES - 1] = full[counter]
-
-
-@kernel
-def _carry(cell: U64, first: int, word: np.uint64) -> np.uint64:
-    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once. Returns the carry: the
-    voxels whose count would exceed COUNT_PLANES bits."""
-    for k in range(first, first + COUNT_PLANES):
-        carry = cell[k] & word
-        cell[k] ^= word
-        word = carry
-        if not word:
-            break
-    return word
 
 
 @kernel

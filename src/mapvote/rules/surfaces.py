@@ -33,7 +33,6 @@ from mapvote.perception.frontend import Observation
 from mapvote.rules.evidence import (
     NO_VOXELS,
     SURFACE_RULE,
-    WORDS,
     Facts,
     SurfaceRule,
     count_scan,
@@ -43,6 +42,7 @@ from mapvote.rules.evidence import (
 )
 from mapvote.rules.packed_tiles import PackedTiles
 from mapvote.rules.voter import Counted
+from mapvote.rules.voxel_counts import VoxelCounts
 
 
 @record(votes=True)
@@ -102,26 +102,25 @@ class SurfaceVoter:
         self.rule = rule
         self.judged = judged
         self.odds = odds
-        self.evidence = PackedTiles(point_map.lattice, WORDS)
+        self.counts = VoxelCounts(point_map.lattice)
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        return count_scan(self.evidence, seen, self.rule)
+        return count_scan(self.counts, seen, self.rule)
 
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, Counted]]:
         """Every tile with evidence, block by block; ``only``: of these tiles."""
-        counted = self.evidence
+        counted = self.counts.settled()
         wanted = counted if only is None else counted.keys() & set(only)
         for tiles, window in blocks(self.point_map.lattice, wanted, self.judged):
-            yield from self._judge(tiles, window)
+            yield from self._judge(counted, tiles, window)
 
-    def _judge(self, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, Counted]]:
+    def _judge(self, counted: PackedTiles, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, Counted]]:
         # The evidence of all tiles of the window, weighed by the map.
         here = reference_window(self.point_map, window)
         known_free = here.free if here.free is not None else above_ground_points(self.point_map, window)
         height_m = here.top_z - here.ground_z
         weighed = Facts.none(window.shape)
-        counted = self.evidence
         free = {}
         for tile in window.tiles():
             if tile in counted:

@@ -57,8 +57,9 @@ from mapvote.core.voxels import BESIDE, VoxelCloud, slot_of, thin, voxel_keys
 from mapvote.matching.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation
 from mapvote.perception.moving_objects import MOVERS, MovingFilter
-from mapvote.rules.evidence import HIT, PASSES, WORDS, count_scan, free_words, least_passed
-from mapvote.rules.packed_tiles import PackedTiles, count_of
+from mapvote.rules.evidence import count_scan, free_words, least_passed
+from mapvote.rules.packed_tiles import count_of
+from mapvote.rules.voxel_counts import HIT, PASSES, VoxelCounts
 from mapvote.survey.pose_graph import DriveTrack
 
 
@@ -111,7 +112,7 @@ class Mapper:
         self.settings = settings
         self.numbers = numbers
         self.cloud = VoxelCloud(draft.lattice)
-        self.evidence = PackedTiles(draft.lattice, WORDS)
+        self.counts = VoxelCounts(draft.lattice)
         self._driven = [np.zeros((0, 3))]
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
@@ -146,7 +147,7 @@ class Mapper:
             places = points_map, scan.origin_map, reach2, self.numbers.road_m
             _leave_out(*places, moving, scan.obstacle, scan.cell, ground_z, beside, left_out)
             self.cloud.enter(points_map, left_out)
-            count_scan(self.evidence, observation)
+            count_scan(self.counts, observation)
 
     def finish(self) -> PointMap:
         """The map of all points added so far."""
@@ -178,22 +179,24 @@ class Mapper:
     def _counts(self, points: F64) -> I64:
         """(n, 3) scans that hit, passed and crossed the voxels of points (n, 3); 0 outside columns."""
         out = np.zeros((len(points), 3), dtype=np.int64)
+        counted = self.counts.settled()
         for index, within in cut_tiles(points, self.draft.lattice):
-            if index in self.evidence:
+            if index in counted:
                 tile = self.draft.tile(index)
                 rows, cols, _ = tile.window.indices_of(points[within])
                 bits = np.floor(points[within, 2] / CELL_SIZE).astype(np.int64) - tile.base[rows, cols]
                 counts = np.zeros((len(within), 3), dtype=np.int64)
-                _counts_of(self.evidence[index], rows, cols, bits, counts)
+                _counts_of(counted[index], rows, cols, bits, counts)
                 out[within] = counts
         return out
 
     def _free(self, after: Tile) -> U64:
         """Known-free columns of one tile of the finished map, on its own ground."""
-        if after.index not in self.evidence:
+        counted = self.counts.settled()
+        if after.index not in counted:
             return np.zeros(after.window.shape, dtype=np.uint64)
         before = self.draft.tile(after.index).base
-        free = free_words(self.evidence[after.index])
+        free = free_words(counted[after.index])
         after = replace(after)  # a copy: the columns that it computes for this alone are freed with it
         out = rebased(free, before - after.base) & ~after.obstacle_words
         out[np.isnan(after.ground_z)] = 0
