@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import laspy
+import numpy as np
 import pystac
 import pytest
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
@@ -40,13 +41,22 @@ def test_a_catalogue_of_all_versions_is_valid_and_each_is_derived_from_the_one_b
     said = typed("export", store, tmp_path / "catalogue", "--stac")
     assert "2 versions" in said
     catalog = pystac.Catalog.from_file(str(tmp_path / "catalogue" / "catalog.json"))
-    first, second = sorted(catalog.get_items(), key=lambda item: item.id)
+    first, second = sorted(catalog.get_items(recursive=True), key=lambda item: item.id)
     for item in (first, second):
         core = item.to_dict(transform_hrefs=False) | {"stac_extensions": []}  # their schemas are on the network
         JsonSchemaSTACValidator().validate(core, pystac.STACObjectType.ITEM, core["stac_version"], [], None)
         with laspy.CopcReader.open(item.assets["cloud"].get_absolute_href()) as reader:
             assert reader.header.point_count == item.properties["pc:count"]
         assert (item.geometry is None) == (not georeference)
+    if georeference:
+        (collection,) = catalog.get_children()
+        core = collection.to_dict(transform_hrefs=False) | {"stac_extensions": []}
+        JsonSchemaSTACValidator().validate(core, pystac.STACObjectType.COLLECTION, core["stac_version"], [], None)
+        boxes = np.array([first.bbox, second.bbox])
+        assert collection.extent.spatial.bboxes == [[*boxes[:, :2].min(axis=0), *boxes[:, 3:5].max(axis=0)]]
+        assert collection.extent.temporal.intervals == [[first.datetime, second.datetime]]
+        assert collection.summaries.to_dict()["proj:code"] == ["EPSG:32654"]
+        assert {item.collection_id for item in (first, second)} == {collection.id}
     (derived,) = second.get_links("derived_from")
     assert Path(derived.get_absolute_href()) == Path(first.get_self_href())
     changes = json.loads(Path(second.assets["changes"].get_absolute_href()).read_text())
@@ -74,7 +84,7 @@ def test_the_catalogue_names_every_item_that_was_ever_added_with_its_derivation(
     for version in order:
         typed("export", store, folder, "--stac", *(() if version is None else ("--version", str(version))))
     catalog = pystac.Catalog.from_file(str(folder / "catalog.json"))
-    items = {item.id: item for item in catalog.get_items()}
+    items = {item.id: item for item in catalog.get_items(recursive=True)}
     assert sorted(items) == ["v1", "v2"]
     if order != (2, 1):  # nobody asked for version 2 once its parent was there
         (derived,) = items["v2"].get_links("derived_from")
@@ -95,7 +105,7 @@ def test_a_map_of_files_is_one_item_and_a_folder_of_other_things_is_left_alone(t
     write_map(replace(two_walls(), georeference=GEOREFERENCE), tmp_path / "my_map")
     typed("export", tmp_path / "my_map", tmp_path / "catalogue", "--stac")
     catalog = pystac.Catalog.from_file(str(tmp_path / "catalogue" / "catalog.json"))
-    assert [item.id for item in catalog.get_items()] == ["v1"]
+    assert [item.id for item in catalog.get_items(recursive=True)] == ["v1"]
     with pytest.raises(MapvoteError, match="holds other files"):
         typed("export", tmp_path / "my_map", tmp_path / "my_map", "--stac")
     store = store_of_two_versions(tmp_path / "fleet.db", {})

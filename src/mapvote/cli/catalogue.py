@@ -104,5 +104,14 @@ def _write(folder: Path, point_map: PointMap, about: Mapping[str, Any], *, has_c
         corners = box_of(home, point_map)
         frame = frame_of(point_map.georeference)
         created = about["created"]
-        version = MapVersion(about["number"], created, about["parent"], point_map.n_points, corners, frame, has_changes)
+        version = MapVersion(
+            about["number"],
+            created,
+            about["parent"],
+            point_map.n_points,
+            corners,
+            frame,
+            has_changes,
+            point_map.map_id,
+        )
         write_item(folder, version)

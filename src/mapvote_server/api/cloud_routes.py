@@ -11,7 +11,7 @@ from mapvote_server.api.ranges import answer_part
 from mapvote_server.api.schemas import AS_YOU_HAVE, Number
 from mapvote_server.api.services import Parts
 from mapvote_server.errors import NotFound
-from mapvote_server.questions.catalogue import catalogue_at, item_at
+from mapvote_server.questions.catalogue import catalogue_at, collection_at, item_at
 from mapvote_server.questions.cloud_files import CloudFile
 
 router = APIRouter()
@@ -50,8 +50,17 @@ async def cloud(request: Request, parts: Parts, number: Number) -> Response:
 @router.get("/stac/catalog.json", include_in_schema=False)
 @on("questions")
 def catalogue(request: Request, parts: Parts) -> Response:
-    """STAC 1.1: a link to the item of each version that is kept."""
+    """STAC 1.1: a link to the collection of all versions that are kept; to each, if the map's place on Earth is
+    unknown."""
     return Response(msgspec.json.encode(catalogue_at(parts.store, _address(request))), media_type="application/json")
+
+
+@router.get("/stac/collection.json", include_in_schema=False)
+@on("questions")
+def collection(request: Request, parts: Parts) -> Response:
+    """STAC 1.1: where and when the versions are, and a link to the item of each that is kept."""
+    address = _address(request, "collection.json")
+    return Response(msgspec.json.encode(collection_at(parts.store, address)), media_type="application/json")
 
 
 @router.get(
@@ -71,5 +80,5 @@ def stac_item_of(request: Request, parts: Parts, number: Number, same: Number) -
     return Response(msgspec.json.encode(item), media_type="application/geo+json")
 
 
-def _address(request: Request) -> str:
-    return f"{str(request.base_url).rstrip('/')}/stac/catalog.json"
+def _address(request: Request, name: str = "catalog.json") -> str:
+    return f"{str(request.base_url).rstrip('/')}/stac/{name}"

@@ -14,7 +14,9 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.times import utc
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import frame_of
-from mapvote.formats.geo.stac import MapVersion, stac_catalog, stac_item
+from mapvote.formats.geo.stac import Extent, MapVersion, stac_catalog, stac_collection, stac_item
+from mapvote_server.errors import NotFound
+from mapvote_server.questions.features import OnEarth, extent_of
 from mapvote_server.store.queries import load_blob, points_of, tiles_of, version_of
 from mapvote_server.store.store import PerStore, Store
 from mapvote_server.work import check_time
@@ -22,8 +24,27 @@ from mapvote_server.work import check_time
 
 def catalogue_at(store: Store, url: str) -> dict[str, Any]:
     """The catalogue of all versions that are kept, as if ``url`` were its address; all links are absolute."""
-    kept = [version.number for version in store.versions() if version.cleared_seq is None]
-    return _absolute(stac_catalog(store.map_id, kept), url)
+    numbers, extent = _kept(store)
+    return _absolute(stac_catalog(store.map_id, numbers, extent), url)
+
+
+def collection_at(store: Store, url: str) -> dict[str, Any]:
+    """Its collection. NotFound if the map's place on Earth is unknown."""
+    numbers, extent = _kept(store)
+    if extent is None:
+        raise NotFound("the map's place on Earth is unknown, so there is no collection: the catalogue lists the items")
+    return _absolute(stac_collection(store.map_id, numbers, extent), url)
+
+
+def _kept(store: Store) -> tuple[list[int], Extent | None]:
+    """(versions that are kept, their extent)."""
+    kept = [version for version in store.versions() if version.cleared_seq is None]
+    numbers = [version.number for version in kept]
+    frame = frame_of(store.georeference)
+    if frame.is_local:
+        return numbers, None
+    crs = frame.crs if frame.crs.startswith("EPSG:") else None
+    return numbers, Extent(extent_of(store, OnEarth(frame)), [utc(version.created_ns) for version in kept], crs)
 
 
 def item_at(store: Store, number: int, url: str) -> dict[str, Any]:
@@ -38,19 +59,27 @@ def item_at(store: Store, number: int, url: str) -> dict[str, Any]:
     before = None if parent is None or parent.cleared_seq is not None else parent.number
     frame = frame_of(store.georeference)
     about = MapVersion(
-        number, utc(version.created_ns), before, sum(counts.values()), corners, frame, has_changes=before is not None
+        number,
+        utc(version.created_ns),
+        before,
+        sum(counts.values()),
+        corners,
+        frame,
+        has_changes=before is not None,
+        map_id=store.map_id,
     )
     item = stac_item(about)
-    item["assets"]["cloud"]["href"] = f"/v1/map/versions/{number}/cloud.copc.laz"
+    item["assets"]["cloud"]["href"] = f"../../v1/map/versions/{number}/cloud.copc.laz"
     if before is not None:
-        item["assets"]["changes"]["href"] = f"/v1/changes?from={before}&to={number}&lonlat=true&limit=10000"
+        item["assets"]["changes"]["href"] = f"../../v1/changes?from={before}&to={number}&lonlat=true&limit=10000"
     return _absolute(item, urljoin(url, f"{item['id']}/{item['id']}.json"))
 
 
 def _absolute(content: dict[str, Any], url: str) -> dict[str, Any]:
     """The same with links from ``url``, and a link to itself."""
     links = [link | {"href": urljoin(url, link["href"])} for link in content["links"]]
-    links.append({"rel": "self", "href": url, "type": "application/json"})
+    kind = "application/geo+json" if content["type"] == "Feature" else "application/json"
+    links.append({"rel": "self", "href": url, "type": kind})
     assets = {name: asset | {"href": urljoin(url, asset["href"])} for name, asset in content.get("assets", {}).items()}
     return content | {"links": links} | ({"assets": assets} if assets else {})
 

@@ -211,7 +211,7 @@ class OnEarth:
 def extent_of(store: Store, place: OnEarth) -> list[float]:
     """[west, south, east, north] in degrees of all tiles, west > east over the date line."""
     tiles = TileSquares(tiles_seen(store, False), store.lattice)
-    west, south, east, north = _bounds_in(shapely.total_bounds(tiles.shapes()), place, CRS84).tolist()
+    west, south, east, north = _bounds_in(shapely.total_bounds(tiles.shapes()), place, CRS84).round(8).tolist()
     return [(west + 180.0) % 360.0 - 180.0, south, (east + 180.0) % 360.0 - 180.0, north]
 
 

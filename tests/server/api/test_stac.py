@@ -62,7 +62,7 @@ def test_pystac_walks_the_versions_and_each_item_is_that_of_the_export(
         typed("export", tmp_path / "s.db", typed_out, "--stac")
         with TestClient(create_app(store, opened=True), base_url="http://localhost") as client:
             catalog = pystac.Catalog.from_file("http://localhost/stac", Asked(client))
-            first, second = sorted(catalog.get_items(), key=lambda item: item.id)
+            first, second = sorted(catalog.get_items(recursive=True), key=lambda item: item.id)
             for number, item in ((1, first), (2, second)):
                 JsonSchemaSTACValidator().validate(
                     item.to_dict(transform_hrefs=False) | {"stac_extensions": []},
@@ -79,6 +79,22 @@ def test_pystac_walks_the_versions_and_each_item_is_that_of_the_export(
                 assert (cloud.status_code, cloud.headers["Content-Type"]) == (200, item.assets["cloud"].media_type)
             (derived,) = second.get_links("derived_from")
             assert derived.get_absolute_href() == first.get_self_href()
+            if georeference:
+                (collection,) = catalog.get_children()
+                JsonSchemaSTACValidator().validate(
+                    client.get("/stac/collection.json").json() | {"stac_extensions": []},
+                    pystac.STACObjectType.COLLECTION,
+                    "1.1.0",
+                    [],
+                    None,
+                )
+                assert collection.id == first.collection_id == store.map_id
+                ((west, south, east, north),) = collection.extent.spatial.bboxes
+                assert west <= first.bbox[0] <= first.bbox[3] <= east
+                assert south <= first.bbox[1] <= first.bbox[4] <= north
+                assert collection.extent.temporal.intervals == [[first.datetime, second.datetime]]
+            else:
+                assert client.get("/stac/collection.json").status_code == 404
             features = client.get(second.assets["changes"].href).json()["features"]
             assert [f["properties"]["kind"] for f in features] == ["demolished"]
             assert client.get("/stac/v1/v2.json").status_code == client.get("/stac/v9/v9.json").status_code == 404
@@ -90,9 +106,9 @@ def test_a_version_that_was_cleared_away_is_in_no_catalogue(tmp_path: Path) -> N
         clear(store, dry_run=False)
         typed("export", tmp_path / "s.db", tmp_path / "catalogue", "--stac")
         with TestClient(create_app(store, opened=True), base_url="http://localhost") as client:
-            links = client.get("/stac").json()["links"]
+            links = client.get("/stac/collection.json").json()["links"]
             assert [link["href"] for link in links if link["rel"] == "item"] == ["http://localhost/stac/v2/v2.json"]
             assert "derived_from" not in {link["rel"] for link in client.get("/stac/v2/v2.json").json()["links"]}
-        (item,) = pystac.Catalog.from_file(str(tmp_path / "catalogue" / "catalog.json")).get_items()
+        (item,) = pystac.Catalog.from_file(str(tmp_path / "catalogue" / "catalog.json")).get_items(recursive=True)
         assert item.id == "v2"
         assert "changes" not in item.assets
