@@ -45,7 +45,7 @@ class Network:
 
     def publish(self, topic: str, kind: str, *, patience_s: float) -> Any:
         kept = self.sent.setdefault(topic, [])
-        return SimpleNamespace(send=kept.append)
+        return SimpleNamespace(send=kept.append, readers=1)
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_a_reader_that_takes_nothing_does_not_end_the_drive(caplog: pytest.LogCa
     def refused(data: bytes) -> None:
         raise MapvoteError("DDS refuses a message")
 
-    ros = RosStatus(SimpleNamespace(publish=lambda *_, **__: SimpleNamespace(send=refused)), "car")  # type: ignore[arg-type]
+    ros = RosStatus(SimpleNamespace(publish=lambda *_, **__: SimpleNamespace(send=refused, readers=1)), "car")  # type: ignore[arg-type]
     fixed = [Fixed(10**9, np.eye(4), np.zeros((6, 6), np.float32))] * 2
     live = SimpleNamespace(fixes=deque(fixed), T_base_upright=np.eye(4))
     ros.poses(live, SimpleNamespace(map_frame="map"))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ not darken the rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,16 +78,22 @@ class Brightness:
             self.negative += int((values < 0).sum()) if values.dtype.kind == "i" else 0
             self.highest = max(self.highest, float(values.max(initial=0)))
             return
-        self.real = True
-        finite = values[np.isfinite(values)]
-        self.n += len(finite)
-        self.undefined += len(values) - len(finite)
-        self.negative += int((finite < 0).sum())
-        self.highest = max(self.highest, float(finite.max(initial=0.0)))
-        self.whole = self.whole and bool((finite == np.floor(finite)).all())
+        finite = self._note(values)
         beyond = finite[finite > _EDGES[0]]  # few or none of most columns
         self._counts[0] += len(finite) - len(beyond)
         self._counts += np.bincount(np.searchsorted(_EDGES, beyond), minlength=len(self._counts))
+
+    def _note(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Count a piece (n,) of reals, but for their bins; returns the finite ones."""
+        self.real = True
+        is_finite = np.isfinite(values)
+        finite = values if is_finite.all() else values[is_finite]
+        self.n += len(finite)
+        self.undefined += len(values) - len(finite)
+        self.negative += int(np.count_nonzero(finite < 0))
+        self.highest = max(self.highest, float(finite.max(initial=0.0)))
+        self.whole = self.whole and bool((finite == np.floor(finite)).all())
+        return finite
 
     @property
     def is_count(self) -> bool:
@@ -101,22 +108,30 @@ class Brightness:
     @property
     def full(self) -> float:
         """The value that means 1.0."""
+        return self._full(lambda most: int(np.searchsorted(np.cumsum(self._counts), most)))
+
+    def _full(self, bin_of: Callable[[int], int]) -> float:
+        """The value that means 1.0; ``bin_of`` gives the first bin up to whose end so many of the reals lie."""
         if self.whole and (not self.real or self.highest > 1.0):
             return next((scale for scale in BRIGHTNESS_RULE.scales[1:] if self.highest <= scale), self.highest)
-        bright = min(self._bright_end(), self.highest)
+        # The value that all but a few of the reals do not exceed, rounded up to the end of a bin.
+        last = bin_of(self.n - int(BRIGHTNESS_RULE.outliers * self.n))
+        bright = min(float(_EDGES[last]) if last < len(_EDGES) else self.highest, self.highest)
         scale = next((s for s in BRIGHTNESS_RULE.scales if bright <= s * (1.0 + BRIGHTNESS_RULE.rounding)), bright)
         return bright if scale > 1.0 and bright < BRIGHTNESS_RULE.darkest * scale else scale
 
-    def _bright_end(self) -> float:
-        """The value that all but a few of the reals do not exceed, rounded up to the end of a bin."""
-        most = self.n - int(BRIGHTNESS_RULE.outliers * self.n)
-        last = int(np.searchsorted(np.cumsum(self._counts), most))
-        return float(_EDGES[last]) if last < len(_EDGES) else self.highest
-
 
 def full_scale(values: NDArray[Any]) -> float:
-    """The value of a column (n,) that means 1.0."""
-    return Brightness.of(values).full
+    """The value of a column (n,) that means 1.0: that of :class:`Brightness`, without bins, which take longer."""
+    if values.dtype.kind != "f":
+        return Brightness.of(values).full
+    counted = Brightness()
+    finite = counted._note(values)
+
+    def bin_of(most: int) -> int:
+        return int(np.searchsorted(_EDGES, np.partition(finite, most - 1)[most - 1])) if most else 0
+
+    return counted._full(bin_of)
 
 
 def shares(values: NDArray[Any], full: float | None = None) -> NDArray[np.floating]:
@@ -124,7 +139,9 @@ def shares(values: NDArray[Any], full: float | None = None) -> NDArray[np.floati
     negative is 0. ``full``: the value that means 1.0, where it is known."""
     scale = max(full_scale(values) if full is None else full, 1e-9)
     out = values / np.asarray(scale, np.float32 if values.dtype == np.float32 else np.float64)
-    out[~np.isfinite(out)] = 0.0
+    is_finite = np.isfinite(out)
+    if not is_finite.all():
+        out[~is_finite] = 0.0
     return np.clip(out, 0.0, 1.0, out=out)
 
 

@@ -228,6 +228,8 @@ class LiveDrive:
         """The last votes on single tiles that went to the journal. The reader that shows them removes them."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
+        self._next_piece_s = 0.0
+        """When the next of them may go there, by the steady clock."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
         self._period_ns = 0
         """Between scans: the shortest recent step."""
@@ -318,15 +320,13 @@ class LiveDrive:
         a tile's votes have been unwritten for too long, a tile goes to the journal."""
         start = time.monotonic()
         ready = self._is_ready(ended)
-        overdue_s = start - min(self._touched.values(), default=np.inf) - self._outbox.sizes.journal_s
-        if self.vehicle is not None and overdue_s > (2.0 if ready else 0.0):
-            tile = min(self._touched, key=lambda index: self._touched[index])
-            del self._touched[tile]
-            kept = self.vehicle.ballot([tile])
-            if self.doubt is not None:
-                kept = self.doubt.marked(self.drive_id, kept, self.vehicle.point_map.lattice)
-            self._outbox.keep(self.drive_id, kept)
-            self.kept.append(kept)
+        sizes = self._outbox.sizes
+        overdue_s = start - min(self._touched.values(), default=np.inf) - sizes.journal_s
+        due = start >= self._next_piece_s or overdue_s > sizes.journal_s
+        if self.vehicle is not None and due and overdue_s > (2.0 if ready else 0.0):
+            self._keep_tile(self.vehicle)
+            now = time.monotonic()
+            self._next_piece_s = now + (now - start) / sizes.journal_share
         if not ready:
             return False
         waiting = self._waiting.popleft()
@@ -335,6 +335,16 @@ class LiveDrive:
         self._thinning.cost(time.monotonic() - start)
         self.counts.left_out += self._thinning.shed(self._waiting)
         return True
+
+    def _keep_tile(self, vehicle: Vehicle) -> None:
+        """Give the votes of the tile that has waited longest to the journal."""
+        tile = min(self._touched, key=lambda index: self._touched[index])
+        del self._touched[tile]
+        kept = vehicle.ballot([tile])
+        if self.doubt is not None:
+            kept = self.doubt.marked(self.drive_id, kept, vehicle.point_map.lattice)
+        self._outbox.keep(self.drive_id, kept)
+        self.kept.append(kept)
 
     def end(self) -> None:
         """No scan comes any more: every scan that arrived is decided. No ballot leaves yet."""

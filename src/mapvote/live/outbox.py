@@ -49,6 +49,8 @@ class OutboxSizes:
     journal_s: float = 8.0
     """Time after which a tile with new votes is written to the journal, seconds. With the waiting scans, and with tiles
     that are written one at a time, a crash costs less than 30 s of road."""
+    journal_share: float = 0.05
+    """Share of the time that this takes at most, while no tile waits for more than twice as long."""
     held: int = 64
     """Closed ballots that are held in memory while the disk is full: with cuts of 10 minutes half a day."""
     queued: int = 256

@@ -263,7 +263,10 @@ class RosStatus:
 
     def poses(self, live: LiveDrive, topics: Subscriptions) -> None:
         """Publish the poses of the scans that have voted since the last time: of what odometry tracks, in the map's
-        frame. The covariance is that of the sensor's position and of the rotation, in map axes."""
+        frame. The covariance is that of the sensor's position and of the rotation, in map axes. Nothing is made while
+        nobody listens."""
+        if live.fixes and not self._poses.readers:
+            live.fixes.clear()
         while live.fixes:
             fixed = live.fixes.popleft()
             message = blank_message(POSE, header=header_of(fixed.stamp_ns, topics.map_frame or "map"))

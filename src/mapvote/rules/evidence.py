@@ -290,22 +290,31 @@ def enough(voxels: U64, a_cell: int, others: Bool, balance: I32, rule: SurfaceRu
     cell, and no negative ``balance``. Two voxels on top of each other are enough for a separate small object on the
     ground (a bollard): it touches none of the ``others``, and its columns begin within 1.2 m of the ground."""
     cells = voxels != 0
-    tall = voxels & (voxels >> np.uint64(1)) != 0
+    here = voxels[cells]
     near_ground = np.uint64(0b1111)
-    tied = ndimage.binary_dilation(others, np.ones((3, 3))) | (voxels & near_ground == 0)
-    size, count, talls, ties, left = over_groups(cells, np.bitwise_count(voxels), cells, tall, tied, balance)
+    tall = here & (here >> np.uint64(1)) != 0
+    tied = ndimage.binary_dilation(others, np.ones((3, 3)))[cells] | (here & near_ground == 0)
+    one = np.ones(len(here), np.bool_)
+    amounts = np.bitwise_count(here), one, tall, tied, balance[cells]
+    size, count, talls, ties, left = over_groups(cells, *amounts)
     large = size >= np.minimum(rule.support + a_cell * (count - 1), rule.new_enough)
-    return np.asarray(cells & (left >= 0) & (large | ((talls > 0) & (ties == 0))))
+    out = np.zeros(cells.shape, np.bool_)
+    out[cells] = (left >= 0) & (large | ((talls > 0) & (ties == 0)))
+    return out
 
 
 def grown(strong: Bool, weak: Bool) -> Bool:
     """(rows, cols) ``strong`` cells, and ``weak`` ones connected to them (8): hysteresis (Canny 1986).
     Few rays cross the far wall of a demolished house."""
     both = strong | weak
-    return np.asarray(both & (over_groups(both, strong)[0] > 0))
+    out = np.zeros(both.shape, np.bool_)
+    out[both] = over_groups(both, strong[both])[0] > 0
+    return out
 
 
 def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
-    """For each of ``amounts`` (rows, cols) its sum over the 8-connected group of ``cells`` that a cell is in."""
+    """For each of ``amounts`` (m,), of the m ``cells`` (rows, cols) row by row, its sums (m,) over the 8-connected
+    group that a cell is in."""
     group, count = ndimage.label(cells, structure=np.ones((3, 3)))
-    return [np.bincount(group.ravel(), amount.ravel(), count + 1)[group] for amount in amounts]
+    of_cell = group[cells]
+    return [np.bincount(of_cell, amount, count + 1)[of_cell] for amount in amounts]

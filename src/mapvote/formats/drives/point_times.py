@@ -189,11 +189,13 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
         return Refusal("holds no numbers", varies=False)
     # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
     is_number = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
-    if not is_number.any():
+    numbers = int(np.count_nonzero(is_number))
+    if numbers == 0:
         return Refusal("holds no number", varies=False)
-    reference = raw[is_number][int(is_number.sum()) // 2]
+    places = np.arange(len(raw)) if numbers == len(raw) else np.flatnonzero(is_number)
+    reference = raw[places[numbers // 2]]
     steps = _minus(raw, reference)
-    sample = np.flatnonzero(is_number)[:: max(1, int(is_number.sum()) // JUDGEMENT.sample)]
+    sample = places[:: max(1, numbers // JUDGEMENT.sample)]
     distinct, counts = np.unique(steps[sample], return_counts=True)
     values = len(distinct)
     if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
@@ -246,23 +248,27 @@ def read_times(
     to_s = UNITS_NS[chosen] * 1e-9
     # Outliers, by the longest duration of a scan.
     reach = JUDGEMENT.reach * max(1.0 / rate_hz / to_s if turn is None else turn, spread)
-    good = values.is_number & (np.abs(steps - median) <= reach)
-    length_s = float(np.ptp(steps[good])) * to_s
+    off = steps - median
+    good = values.is_number & (np.abs(off, out=off) <= reach)
+    kept = steps if good.all() else steps[good]  # nearly always all: no copy
+    first = float(kept.min())
+    length_s = (float(kept.max()) - first) * to_s
     turns = (length_s if turn is None else turn * to_s) * rate_hz
     one_turn = abs(turns - 1.0) <= JUDGEMENT.off_rate and (turn is not None or chosen == "ms")
-    if unit is None and not one_turn and _counts(steps[good], raw.dtype):
+    if unit is None and not one_turn and _counts(kept, raw.dtype):
         return Refusal("holds whole numbers one after the other: a counter, a column or a ring, no time")
     refusal = _refusal(turn is not None, turns, length_s, rate_hz)
     if unit is None and refusal is not None:
         return refusal
     # The moment from which it counts.
-    starts_ns = round(float(steps[good].min()) * UNITS_NS[chosen])
+    starts_ns = round(first * UNITS_NS[chosen])
     middle_ns = round(median * UNITS_NS[chosen])
     value_ns, wraps_ns = _value_ns(reference, raw.dtype, chosen)
     off_ns, origin = _origin((value_ns, wraps_ns), middle_ns, starts_ns, stamp_ns, rate_hz)
     after = steps * to_s
     after += off_ns * 1e-9
-    after[~good] = np.nan
+    if kept is not steps:
+        after[~good] = np.nan
     clock_off_ns = value_ns + starts_ns - stamp_ns if origin == TimeOrigin.ANOTHER else 0
     return FieldTimes(name, chosen, after, origin, clock_off_ns, wraps_ns, turn is not None, turns)
 
