@@ -325,8 +325,8 @@ class LiveDrive:
         due = start >= self._next_piece_s or overdue_s > sizes.journal_s
         if self.vehicle is not None and due and overdue_s > (2.0 if ready else 0.0):
             self._keep_tile(self.vehicle)
-            now = time.monotonic()
-            self._next_piece_s = now + (now - start) / sizes.journal_share
+            taken_s = time.monotonic() - start
+            self._next_piece_s = start + taken_s / sizes.journal_share
         if not ready:
             return False
         waiting = self._waiting.popleft()
