@@ -137,6 +137,14 @@ def unpacked_words(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.cumsum(ways), np.ascontiguousarray(raw[2 * n :].reshape(8, n).T).view("<u8").reshape(-1)
 
 
+def unpacked_voxels(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """(flat cells, layers) of new points, see codec/ballot.py: what the peer needs to know of where they lie."""
+    planes = np.frombuffer(zstd.decompress(data), np.uint8).reshape(9, -1).astype(np.int64)
+    cells = np.cumsum(planes[0] + (planes[1] << 8)) & (SHAPE[0] * SHAPE[1] - 1)
+    ways = planes[2] + (planes[3] << 8) + (planes[4] << 16) + (planes[5] << 24)
+    return cells, (np.cumsum(ways) + (1 << 31) & 0xFFFFFFFF) - (1 << 31)
+
+
 def numpy_whole_tile(connection: sqlite3.Connection, tile: TileIndex) -> tuple[U8, np.ndarray, np.ndarray, np.ndarray]:
     """The peer with all planes: (states, bits that go, voxels that come, bits that are free), each by two vehicles."""
     decided = numpy_tile(connection, tile)
@@ -150,11 +158,9 @@ def numpy_whole_tile(connection: sqlite3.Connection, tile: TileIndex) -> tuple[U
             cells, words = cells[counts[cells]], words[counts[cells]]
             reached[1][cells] |= reached[0][cells] & words
             reached[0][cells] |= words
-        xyz = np.frombuffer(zstd.decompress(points), "<f4").reshape(-1, 3)
-        layers = np.floor(xyz.astype(np.float64) / 0.3).astype(np.int64)
-        cells = layers[:, 1] * 256 + layers[:, 0]
+        cells, layers = unpacked_voxels(points)
         counts = (own[cells] == 2) & (decided[cells] == 2)
-        offered.append(np.unique(cells[counts] * 1024 + layers[counts, 2]))
+        offered.append(np.unique(cells[counts] * 1024 + layers[counts]))
     voxels, vehicles = np.unique(np.concatenate(offered), return_counts=True)
     return decided, gone[1], voxels[vehicles >= 2], free[1]
 

@@ -134,21 +134,29 @@ def wrapped(angles_rad: F64) -> F64:
     return np.asarray((angles_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> F64:
-    """Metres and radians; R = Rz(yaw) Ry(pitch) Rx(roll)."""
+def from_xyz_rpy(
+    x: ArrayLike, y: ArrayLike, z: ArrayLike, roll: ArrayLike = 0.0, pitch: ArrayLike = 0.0, yaw: ArrayLike = 0.0
+) -> F64:
+    """(..., 4, 4) of metres and radians, numbers or arrays of one shape; R = Rz(yaw) Ry(pitch) Rx(roll)."""
     cr = np.cos(roll)
     sr = np.sin(roll)
     cp = np.cos(pitch)
     sp = np.sin(pitch)
     cy = np.cos(yaw)
     sy = np.sin(yaw)
-    T = np.eye(4)
-    T[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    T[:3, 3] = x, y, z
+    T = np.tile(np.eye(4), (*np.broadcast_shapes(np.shape(x), cr.shape, cp.shape, cy.shape), 1, 1))
+    T[..., 0, 0] = cy * cp
+    T[..., 0, 1] = cy * sp * sr - sy * cr
+    T[..., 0, 2] = cy * sp * cr + sy * sr
+    T[..., 1, 0] = sy * cp
+    T[..., 1, 1] = sy * sp * sr + cy * cr
+    T[..., 1, 2] = sy * sp * cr - cy * sr
+    T[..., 2, 0] = -sp
+    T[..., 2, 1] = cp * sr
+    T[..., 2, 2] = cp * cr
+    T[..., 0, 3] = x
+    T[..., 1, 3] = y
+    T[..., 2, 3] = z
     return T
 
 

@@ -125,14 +125,28 @@ def _alike(drives: Sequence[Vote], least: float, rule: CopyRule) -> Bool:
     find_alike(*_look(masks), whose, least, rule.least_moved, alike)
     for marks_of in (point_marks, free_marks):
         marks = [marks_of(drive, rule.least_shared) for drive in drives]
-        if sum(len(one) > 0 for one in marks) > 1:
-            find_shared(np.concatenate(marks), _bounds(marks), whose, rule.shared, alike)
+        sizes = np.array([len(own) for own in marks])
+        # Honest drives share next to none, so that the pairs below have nothing to compare.
+        marks = held_twice(marks)
+        find_shared(np.concatenate(marks), _bounds(marks), sizes, whose, rule.shared, alike)
     return alike
 
 
 def _bounds(parts: Sequence[U64]) -> I64:
     """(n + 1,) where each of n arrays begins, once they are joined."""
     return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def held_twice(marks: Sequence[U64]) -> list[U64]:
+    """The marks of each drive that another drive has too. All are ascending; no drive has one twice."""
+    in_order = np.sort(np.concatenate(marks))
+    common = np.unique(in_order[1:][in_order[1:] == in_order[:-1]])
+    shared = []
+    for own in marks:
+        place = own.searchsorted(common)
+        inside = place < len(own)
+        shared.append(common[inside][own[place[inside]] == common[inside]])
+    return shared
 
 
 def _groups(alike: Bool) -> I64:
@@ -152,13 +166,14 @@ def point_marks(drive: Vote, least: int) -> U64:
     if drive.new_points is None or len(drive.new_points) < least:
         return _NO_MARKS
     steps = np.floor(drive.new_points.astype(np.float64) / CELL_SIZE * PLACES).astype(np.int64)
-    cells = (steps[:, 1] // PLACES) * TILE_CELLS + steps[:, 0] // PLACES
-    places = ((steps[:, 1] % PLACES) * PLACES + steps[:, 0] % PLACES) + PLACES * PLACES * steps[:, 2]
-    order = np.lexsort((places, cells))
-    above = np.flatnonzero(np.diff(cells[order]) == 0)
-    lower = places[order[above]].astype(np.uint64)
-    upper = places[order[above + 1]].astype(np.uint64)
-    return _enough(np.unique(lower << np.uint64(32) | (upper & np.uint64(0xFFFFFFFF))), least)
+    voxel, place = np.divmod(steps[:, :2], PLACES)
+    cells = voxel[:, 1] * TILE_CELLS + voxel[:, 0]
+    places = place[:, 1] * PLACES + place[:, 0] + PLACES * PLACES * steps[:, 2]
+    # By cell, then by place: one number of both, since a ballot's heights (1e5 m) need 34 bits.
+    in_order = np.sort((cells << 40) + places)
+    above = np.flatnonzero(np.diff((in_order + (1 << 39)) >> 40) == 0)
+    places = in_order & 0xFFFFFFFF
+    return _enough(np.unique((places[above] << 32 | places[above + 1]).view(np.uint64)), least)
 
 
 def free_marks(drive: Vote, least: int) -> U64:
@@ -198,12 +213,13 @@ def _patterns(cells: NDArray[np.intp], words: U64, marks: U64) -> int:
 
 
 @kernel
-def find_shared(marks: U64, first: I64, whose: I64, share: float, alike: Bool) -> None:
-    """Set ``alike`` (n, n), lower half, where drives of two vehicles share at least ``share`` of the smaller one's
-    ``marks``: ascending, those of drive i from ``first[i]`` to ``first[i + 1]``. ``whose`` (n,): the vehicles."""
+def find_shared(marks: U64, first: I64, sizes: I64, whose: I64, share: float, alike: Bool) -> None:
+    """Set ``alike`` (n, n), lower half, where drives of two vehicles share at least ``share`` of the marks of the
+    smaller one. ``marks``: ascending, from ``first[i]`` to ``first[i + 1]`` those of drive i that others have too, of
+    ``sizes[i]`` in all. ``whose`` (n,): the vehicles."""
     for i in range(len(whose)):
         for k in range(i):
-            smaller = min(first[i + 1] - first[i], first[k + 1] - first[k])
+            smaller = min(sizes[i], sizes[k])
             if whose[i] == whose[k] or alike[i, k] or smaller == 0:
                 continue
             a = first[i]

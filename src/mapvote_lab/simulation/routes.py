@@ -101,7 +101,7 @@ class Route:
         pitch = -np.arctan2(ahead[0] - ahead[1], 2.8) + np.radians(0.12) * np.sin(7.5 * time_s + p[2])
         roll = np.arctan2(across[0] - across[1], 1.6) + np.radians(0.10) * np.sin(5.9 * time_s + p[3])
         height = 0.25 * sum(ahead + across) + 0.008 * np.sin(8.3 * time_s + p[4])
-        T = _from_xyz_rpy(x, y, height, roll, pitch, yaw)
+        T = from_xyz_rpy(x, y, height, roll, pitch, yaw)
         T[:, :3, 3] += self.mount_height_m * T[:, :3, 2]
         return T
 
@@ -147,28 +147,3 @@ def make_routes(scenario: Scenario, terrain: Terrain, seed: int, plan: DrivePlan
             )
         )
     return routes
-
-
-def _from_xyz_rpy(x: F64, y: F64, z: F64, roll: F64, pitch: F64, yaw: F64) -> F64:
-    """core.geometry.from_xyz_rpy over (n,) arrays: (n, 4, 4)."""
-    cr = np.cos(roll)
-    sr = np.sin(roll)
-    cp = np.cos(pitch)
-    sp = np.sin(pitch)
-    cy = np.cos(yaw)
-    sy = np.sin(yaw)
-    T = np.zeros((len(x), 4, 4))
-    T[:, 0, 0] = cy * cp
-    T[:, 0, 1] = cy * sp * sr - sy * cr
-    T[:, 0, 2] = cy * sp * cr + sy * sr
-    T[:, 1, 0] = sy * cp
-    T[:, 1, 1] = sy * sp * sr + cy * cr
-    T[:, 1, 2] = sy * sp * cr - cy * sr
-    T[:, 2, 0] = -sp
-    T[:, 2, 1] = cp * sr
-    T[:, 2, 2] = cp * cr
-    T[:, 0, 3] = x
-    T[:, 1, 3] = y
-    T[:, 2, 3] = z
-    T[:, 3, 3] = 1.0
-    return T
