@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mapvote.codec.ballot import Odds
 from mapvote.codec.planes import compress, raw_plane, unpack_bytes, unpack_plane
 from mapvote.core.grid import CELLS, TILE_CELLS
-from mapvote.core.types import I32, I64, N_STATES, U8, MapvoteError
+from mapvote.core.types import I64, N_STATES, U8, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.edit import EditVotes
 from mapvote.fusion.gravity import Fallen
@@ -78,9 +78,9 @@ class Record:
         return unpack_decided(self.packed_states)
 
     @cached_property
-    def tally(self) -> I32:
-        """(256, 256, 5) in VOTE_UNITs."""
-        return unpack_tally_plane(self.packed_tally)
+    def votes(self) -> NDArray[Any]:
+        """(256, 256, 5) whole votes per CellState, as :func:`unpack_votes`."""
+        return unpack_votes(self.packed_tally)
 
     @cached_property
     def odds(self) -> Odds:
@@ -121,12 +121,15 @@ def pack_tally(tally: NDArray[Any]) -> bytes:
     return compress(raw_plane(votes, "|u1") if votes.max() <= _BYTE_MAX else raw_plane(planes, "<u2"), 1)
 
 
-def unpack_tally_plane(data: bytes) -> I32:
-    """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
+def unpack_votes(data: bytes) -> NDArray[Any]:
+    """The whole votes of a packed tally, (256, 256, 5) uint8, uint16 or int32, whichever holds them: a view of planes,
+    so that who asks for some cells pays for these."""
     raw = unpack_bytes(data, 4 * N_STATES * CELLS, "decision: tally")
-    dtype, unit = {N_STATES * CELLS: ("|u1", VOTE_UNIT), 2 * N_STATES * CELLS: ("<u2", 1)}.get(len(raw), ("<i4", 1))
+    dtype, unit = {N_STATES * CELLS: ("|u1", 1), 2 * N_STATES * CELLS: ("<u2", VOTE_UNIT)}.get(
+        len(raw), ("<i4", VOTE_UNIT)
+    )
     planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
-    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32) * unit
+    return np.moveaxis(planes if unit == 1 else planes // unit, 0, -1)
 
 
 _EDIT_FIELDS = ("cells", "<u2"), ("states", "|u1"), ("votes", "<u2"), ("against", "<u2")

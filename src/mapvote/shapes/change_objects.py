@@ -17,7 +17,6 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
-from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.decision_record import Record
 from mapvote.fusion.loss_budget import alike_beside, change_probability
@@ -278,9 +277,9 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> dict[str, An
     fell = np.zeros(n, dtype=np.bool_)
     for decision, drives in decided:
         said = decision.states.reshape(-1)[flat]
-        tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat] // VOTE_UNIT
-        counted = tally[np.arange(n), states]
-        others = tally[:, : CellState.UNDETERMINED].sum(axis=1) - counted
+        every_state = decision.votes[flat // TILE_CELLS, flat % TILE_CELLS].astype(np.int64)
+        counted = every_state[np.arange(n), states]
+        others = every_state[:, : CellState.UNDETERMINED].sum(axis=1) - counted
         # Cells that the version edited though it states no change of them have votes of their own.
         edits = decision.edit_votes
         _, row, edit = np.intersect1d(flat, edits.cells, assume_unique=True, return_indices=True)

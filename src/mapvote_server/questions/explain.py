@@ -23,7 +23,7 @@ from mapvote.core.rule import rule_named
 from mapvote.core.tile import Tile
 from mapvote.core.times import utc
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
-from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
+from mapvote.core.voting import decide_cells, plurality
 from mapvote.fusion.change_time import expected_days
 from mapvote.fusion.decision_record import Record, unpack_decided
 from mapvote.fusion.edit import EditVotes
@@ -427,7 +427,7 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     record states no change or cannot be read any more."""
     try:
         states = record.states
-        counted = record.tally[cell].astype(np.int64) // VOTE_UNIT
+        counted = record.votes[cell].astype(np.int64)
         odds = record.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
     except MapvoteError:
         return None

@@ -15,7 +15,6 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import LazyTiles, PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I64, CellState
-from mapvote.core.voting import VOTE_UNIT
 from mapvote.core.voxels import found_among
 from mapvote.fusion.decision_record import Record
 from mapvote_server.store import schema
@@ -66,8 +65,8 @@ def _origins(connection: sa.Connection, tile: Tile, number: int) -> Mapping[str,
 
 def _votes_for(record: Record, state: CellState) -> NDArray[np.uint16]:
     """(65536,) vehicles that voted for a state of each flat cell."""
-    votes = record.tally[..., int(state)].reshape(-1) // VOTE_UNIT
-    return votes.clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
+    votes = record.votes[..., int(state)].reshape(-1)
+    return np.minimum(votes, np.iinfo(np.uint16).max, dtype=np.int64).astype(np.uint16)
 
 
 def _sources(connection: sa.Connection, tile: Tile, number: int) -> I64:

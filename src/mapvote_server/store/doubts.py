@@ -9,20 +9,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, CellState, MapvoteError
-from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import DAY_NS, Vote, by_voter, one_each
 from mapvote_server.errors import Unavailable
 from mapvote_server.store import schema
 from mapvote_server.store.fusion_jobs import Fused
-from mapvote_server.store.queries import tile_as_of
+from mapvote_server.store.queries import memory_of
 from mapvote_server.store.store import Store
 from mapvote_server.store.votes import Electorate, recent_votes
 
@@ -85,7 +85,9 @@ def doubts_about(
         veterans = _KnownVehicles(connection, electorate)
         for fused in changed if electorate.policy.round.stage == "two-stage" else ():
             try:
-                tile = tile_as_of(connection, store.lattice.tile(fused.index), newest)
+                # Only what the tile remembers makes votes spent.
+                memory = memory_of(connection, newest, fused.index)
+                tile = replace(Tile.empty(store.lattice.tile(fused.index)), memory=memory)
                 by_tile.append(
                     _on_tile(fused, tile, recent_votes(connection, tile, electorate), electorate.settings, veterans)
                 )
@@ -133,8 +135,7 @@ def _on_tile(
     assert record is not None
     states = record.states.reshape(-1)
     cells = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
-    tally = record.tally.reshape(len(states), -1)[cells] // VOTE_UNIT
-    votes_for = tally[np.arange(len(cells)), states[cells]]
+    votes_for = record.votes[cells // TILE_CELLS, cells % TILE_CELLS, states[cells]].astype(np.int64)
     # The last word of every voter, also of those that are no more among the latest.
     named = by_voter(drives, settings)
     vehicle_of = {voter.vehicle: drive.vehicle for voter, drive in zip(named, drives, strict=True)}

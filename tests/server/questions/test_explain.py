@@ -220,5 +220,5 @@ def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(new_store: NewSt
     assert [page[TIE][3], page[CLEAR][3]] == [NO_VOTE, CellState.CHANGED_EMPTY]
     (fused,) = preview(store).fused
     assert fused.record is not None
-    assert fused.record.tally[TIE].any()
+    assert fused.record.votes[TIE].any()
     assert fused.record.states[TIE] == CellState.UNDETERMINED

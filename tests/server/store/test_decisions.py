@@ -19,7 +19,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.rule import rule_named
 from mapvote.core.types import N_STATES, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.decision_record import Record, pack_standings, pack_tally, unpack_standings, unpack_tally_plane
+from mapvote.fusion.decision_record import Record, pack_standings, pack_tally, unpack_standings, unpack_votes
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import REASONS, Vote
 from mapvote_server.store import schema
@@ -76,7 +76,7 @@ def test_a_record_names_those_that_counted_and_why_the_others_did_not(store: Sto
     (record,) = records(store)
     assert {s.ballot: s.why for s in record.standings} == {old: "window", a: "", b: "", c: "", young: "young"}
     assert record.states[CELL] == CE
-    assert record.tally[CELL].sum() > 0
+    assert record.votes[CELL].sum() > 0
 
 
 def test_of_a_spent_and_of_a_reviewed_cell_the_record_says_so(store: Store, clock: Clock) -> None:
@@ -170,7 +170,7 @@ def _sent(connection: sa.Connection, seqs: list[int]) -> dict[int, list[int]]:
     ],
     ids=["few votes", "whole votes", "more than a byte holds", "as one-stage sums them", "large sums"],
 )
-def test_a_tally_comes_back_as_it_was_whatever_it_is_written_in(
+def test_whole_votes_come_back_as_they_were_whatever_they_are_written_in(
     dtype: DTypeLike, unit: int, most: int, width: int
 ) -> None:
     rng = np.random.default_rng(1)
@@ -178,6 +178,6 @@ def test_a_tally_comes_back_as_it_was_whatever_it_is_written_in(
     planes.flat[0] = (most - 1) * unit
     packed = pack_tally(np.moveaxis(planes, 0, -1))
     assert len(unpack_bytes(packed, 4 * N_STATES * CELLS, "tally")) == width * N_STATES * CELLS
-    again = unpack_tally_plane(packed)
-    assert again.dtype == np.int32
-    np.testing.assert_array_equal(again, np.moveaxis(planes, 0, -1))
+    again = unpack_votes(packed)
+    assert again.dtype.itemsize == width
+    np.testing.assert_array_equal(again, np.moveaxis(planes, 0, -1) // VOTE_UNIT)
