@@ -65,11 +65,12 @@ class Outcome(NamedTuple):
 
 @contextmanager
 def cpu_group(name: str, share: float) -> Iterator[Path]:
-    """A group of processes that may use this share of a core; 0: all."""
+    """A group of processes that may use this share of a core; 0: all. One in another has the weight of a process."""
     group = CPU_GROUPS / name
     group.mkdir()
     try:
-        (group / "cpu.shares").write_text(str(MOST_WEIGHT))
+        if "/" not in name:
+            (group / "cpu.shares").write_text(str(MOST_WEIGHT))
         if share:
             (group / "cpu.cfs_period_us").write_text(str(PERIOD_US))
             (group / "cpu.cfs_quota_us").write_text(str(round(share * PERIOD_US)))
