@@ -24,6 +24,7 @@ from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.points import Values, attributes_among, point_field
+from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.rule import rule_named
 from mapvote.core.sensors import Sensor
@@ -141,6 +142,8 @@ class Vehicle:
     def finish(self) -> None:
         """The drive has ended: the scans that still wait vote now."""
         self._vote(self._frontend.finish())
+        self._hold_to(self.point_map)  # nothing of it is laid out any more: the ballot needs the memory
+        give_back_free_pages()
 
     def cut(self, next_drive_id: str, point_map: PointMap | None = None) -> ClosedStretch:
         """End this ballot and begin the next one on the same track: the drive goes on.
@@ -162,12 +165,16 @@ class Vehicle:
         ended = ClosedStretch(self.drive_id, written, report, self.point_map, self.prior_in_map)
         self.drive_id = next_drive_id
         if point_map is not None and point_map is not self.point_map:
-            self.point_map = point_map
-            if isinstance(self._localise, Localiser):
-                self._localise.go_on_in(point_map)
-            self._frontend.go_on_in(point_map)
+            self._hold_to(point_map)
         self._count_anew()
         return ended
+
+    def _hold_to(self, point_map: PointMap) -> None:
+        """Take this version of the map from here on."""
+        self.point_map = point_map
+        if isinstance(self._localise, Localiser):
+            self._localise.go_on_in(point_map)
+        self._frontend.go_on_in(point_map)
 
     def _vote(self, observations: list[Observation]) -> None:
         for seen in observations:

@@ -20,7 +20,7 @@ from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.process_memory import seldom_collecting
+from mapvote.core.process_memory import give_back_free_pages, seldom_collecting
 from mapvote.core.record import record
 from mapvote.core.rule import RULES
 from mapvote.core.sensors import SENSORS
@@ -56,6 +56,7 @@ WARMUP_STREET = WarmupStreet()
 def warm_vehicle(settings: Settings) -> None:
     """Load the kernels of a vehicle's first scans: of live ones none is to wait for them."""
     vote_drive(_drive(_street(demolished=True), turning=True), map_from_points(_street(demolished=False)), settings)
+    give_back_free_pages()
 
 
 def warm_up() -> Iterator[tuple[str, float]]:

@@ -56,7 +56,6 @@ def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
         np.testing.assert_array_equal(tiles[tile], some_planes(seed, share))
         np.testing.assert_array_equal(tiles.near(tile), some_planes(seed, share))
     tiles.leave(far)
-    assert tiles._spare
     assert not tiles.near((5, 5)).any(), "whatever another tile left behind"
 
 

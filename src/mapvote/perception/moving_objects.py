@@ -364,7 +364,9 @@ class MovingFilter:
 
     def flush(self) -> list[Bool]:
         """Decide what is left, with less than the full look ahead: the drive has ended."""
-        return self._decide(self._window[-1].stamp_ns) if self._window else []
+        decided = self._decide(self._window[-1].stamp_ns) if self._window else []
+        self._window.clear()
+        return decided
 
     def _decide(self, up_to_ns: int) -> list[Bool]:
         """Masks of all waiting scans not younger than ``up_to_ns``; forgets what no later scan will ask for."""

@@ -9,6 +9,7 @@ in an unnamed file.
 
 from __future__ import annotations
 
+import mmap
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
@@ -100,8 +101,6 @@ class PackedTiles(Mapping[TileIndex, U64]):
         self._open: dict[TileIndex, U64] = {}
         self._shelf = Shelf(packing)
         self._packed = dict[TileIndex, Slot]()
-        self._spare: list[U64] = []
-        """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
     def __getitem__(self, tile: TileIndex) -> U64:
         return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile], self._new())
@@ -120,7 +119,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
         """The planes of a tile, to be changed in place; zeros if there were none."""
         if tile not in self._open:
             packed = self._packed.pop(tile, None)
-            planes = self._zeros()
+            planes = self._new()
             self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
         return self._open[tile]
 
@@ -137,19 +136,15 @@ class PackedTiles(Mapping[TileIndex, U64]):
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
                 self._packed[tile] = self._shelf.put(_packed(planes, self.packing.zstd_level))
-                self._spare.append(self._open.pop(tile))
+                del self._open[tile]
                 give_back_free_pages()
                 return
 
     def _new(self) -> U64:
-        return np.zeros((TILE_CELLS, TILE_CELLS, self.words), dtype=np.uint64)
-
-    def _zeros(self) -> U64:
-        if not self._spare:
-            return self._new()
-        planes = self._spare.pop()
-        planes[:] = 0
-        return planes
+        """Zeros in pages of their own. The system gives each page at its first count, and takes all back once the tile
+        is left: no holes in the heap."""
+        pages = mmap.mmap(-1, 8 * CELLS * self.words)
+        return np.frombuffer(pages, np.uint64).reshape(TILE_CELLS, TILE_CELLS, self.words)
 
     def _unpacked(self, place: Slot, planes: U64) -> U64:
         """``planes``, which come empty, with the packed words."""
@@ -164,7 +159,10 @@ def _packed(planes: U64, zstd_level: int) -> bytes:
     """The cells in which anything was counted, and their words plane by plane: most of the higher ones are empty."""
     flat = planes.reshape(CELLS, -1)
     cells = np.flatnonzero(flat.any(axis=1))
-    return compress(np.concatenate([cells.astype(np.uint64)[None], flat[cells].T]).tobytes(), zstd_level)
+    out = np.empty((flat.shape[1] + 1, len(cells)), np.uint64)
+    out[0] = cells
+    out[1:] = flat[cells].T
+    return compress(out.data, zstd_level)
 
 
 @kernel
