@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -112,6 +113,9 @@ class RunRule:
     least_fit: float = 0.55
     """Share of inliers of a registered scan, at least. Sound scans, a step apart, agree in .75 to .95 of their points;
     scans of different places in .2 to .5."""
+    sure_m: float = 0.1
+    """Median difference between the steps of a run that is registered forwards and backwards, up to which a sensor
+    without rings shows its motion, metres. Sparse scans and cones differ by up to .05 m, a rosette's by .2 m to 5 m."""
     brakes_mps2: float = 8.0
     """Largest acceleration of a vehicle, metres per second squared."""
 
@@ -201,7 +205,7 @@ class DriveEvidence:
         chosen = np.linspace(0, len(self.readable) - 1, min(len(self.readable), ROAD_PLANE.scans)).astype(np.int64)
         return self.readable[chosen]
 
-    def _points(self, i: int) -> F32:
+    def points(self, i: int) -> F32:
         """(p, 3) of scan i, turned over where the sensor is upside down: other faults show only then."""
         points = self.drive.read_scan(int(i)).points
         return points @ _TURNED_OVER if self.road.up == "-z" else points
@@ -229,7 +233,19 @@ class DriveEvidence:
     @property
     def can_be_registered(self) -> bool:
         """Else whatever seems wrong with the motion may be its consequence."""
+        return self._is_sound and self._steps_differ_m <= RUN_RULE.sure_m
+
+    @property
+    def _is_sound(self) -> bool:
         return len(self.readable) > 2 and 1.5 <= self.looks.median_m <= 150.0 and self.road_below.up == "+z"
+
+    @cached_property
+    def _steps_differ_m(self) -> float:
+        """Error of the steps from scan to scan, metres, median of the runs; 0 for a sensor with rings, whose scans show
+        it by how well they fit."""
+        if self.drive.sensor.rings:
+            return 0.0
+        return float(np.median([self._steps_differ_of(run) for run in self.every_run]))
 
     @cached_property
     def every_run(self) -> list[Run]:
@@ -282,33 +298,78 @@ class DriveEvidence:
     @cached_property
     def leaps(self) -> list[Finding]:
         """Faults of the scans' own motion; while there is any, a prior cannot be compared with it."""
-        return list(_check_motion(self.every_run, self.drive)) if self.can_be_registered else []
+        if self.can_be_registered:
+            return list(_check_motion(self.every_run, self.drive))
+        if self._is_sound:
+            problem = (
+                f"the scans of this sensor do not show its motion: registered forwards and backwards, their steps "
+                f"differ by {self._steps_differ_m:.2f} m"
+            )
+            return [Finding("note", problem, "the order of its scans and its prior are checked on a map alone")]
+        return []
 
     def _follow(self, start: int, scans: int = RUN_RULE.scans) -> Run:
         """The run of at most ``scans`` scans that begins at readable scan ``start``."""
-        ndt_map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=RUN_RULE.half_window_m))
-        ndt_map.enter(_near(self._points(self.readable[start])))
-        indices = [start]
-        poses = [np.eye(4)]
-        fits = [1.0]
-        i = start
+        registering = _Registering(self, start)
         step = 1
-        while len(indices) < scans and i + step < len(self.readable):
-            i += step
-            clouds = thin_for_levels(_near(self._points(self.readable[i])))
-            registration = _registered(
-                ndt_map, clouds, _guesses(indices, poses, i, _UPS[self.road_below.up]), self.road_below
-            )
-            indices.append(i)
-            poses.append(registration.T_map_lidar)
-            fits.append(registration.inlier_share)
-            position = registration.T_map_lidar[:3, 3]
-            if not ndt_map.is_central(position):
-                ndt_map.recentre(position)
-            ndt_map.enter(transform(registration.T_map_lidar, clouds[-1].T))
-            a_scan_m = float(np.linalg.norm((inverse(poses[-2]) @ poses[-1])[:3, 3])) / (indices[-1] - indices[-2])
-            step = 1 if len(indices) < 3 else int(np.clip(RUN_RULE.step_m / max(a_scan_m, 0.01), 1, RUN_RULE.most_step))
-        return Run(self.readable[indices], np.array(poses), np.array(fits))
+        while len(registering.numbers) < scans and registering.numbers[-1] + step < len(self.readable):
+            registering.add(registering.numbers[-1] + step)
+            step = registering.next_step
+        return registering.run()
+
+    def _steps_differ_of(self, run: Run) -> float:
+        """By how much the steps of a run differ if it is registered from its last scan to its first one, median: the
+        error of the registration, which no fit shows. A pattern that moves with the sensor draws every scan towards
+        the one before it."""
+        numbers = np.searchsorted(self.readable, run.indices)
+        registering = _Registering(self, int(numbers[-1]))
+        for number in numbers[-2::-1]:
+            registering.add(int(number))
+        back = registering.run().T_first_lidar[::-1]
+        steps_m = [
+            np.array([(inverse(a) @ b)[:3, 3] for a, b in pairwise(T_first_lidar)])
+            for T_first_lidar in (run.T_first_lidar, back)
+        ]
+        return float(np.median(np.linalg.norm(steps_m[0] - steps_m[1], axis=1)))
+
+
+class _Registering:
+    """Scans of a run, each registered to those before it."""
+
+    def __init__(self, evidence: DriveEvidence, first: int) -> None:
+        self._evidence = evidence
+        self._map = NdtMap(np.zeros(3), numbers=replace(NDT_WINDOW, half_window_m=RUN_RULE.half_window_m))
+        self._map.enter(_near(evidence.points(evidence.readable[first])))
+        self.numbers = [first]
+        """Places among the readable scans, up or down."""
+        self._poses = [np.eye(4)]
+        self._fits = [1.0]
+
+    def add(self, number: int) -> None:
+        """Register the readable scan ``number``."""
+        road = self._evidence.road_below
+        clouds = thin_for_levels(_near(self._evidence.points(self._evidence.readable[number])))
+        registration = _registered(self._map, clouds, _guesses(self.numbers, self._poses, number, _UPS[road.up]), road)
+        self.numbers.append(number)
+        self._poses.append(registration.T_map_lidar)
+        self._fits.append(registration.inlier_share)
+        position = registration.T_map_lidar[:3, 3]
+        if not self._map.is_central(position):
+            self._map.recentre(position)
+        self._map.enter(transform(registration.T_map_lidar, clouds[-1].T))
+
+    @property
+    def next_step(self) -> int:
+        """After how many scans the vehicle has moved on far enough."""
+        if len(self.numbers) < 3:
+            return 1
+        moved_m = float(np.linalg.norm((inverse(self._poses[-2]) @ self._poses[-1])[:3, 3]))
+        a_scan_m = moved_m / (self.numbers[-1] - self.numbers[-2])
+        return int(np.clip(RUN_RULE.step_m / max(a_scan_m, 0.01), 1, RUN_RULE.most_step))
+
+    def run(self) -> Run:
+        """The scans so far."""
+        return Run(self._evidence.readable[self.numbers], np.array(self._poses), np.array(self._fits))
 
 
 def find_road(scans: Sequence[F32]) -> Road:
