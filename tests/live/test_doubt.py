@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, in_steps, pack_odds
 from mapvote.codec.planes import pack_plane
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import Lattice
-from mapvote.core.types import F32, NO_VOTE, CellState
+from mapvote.core.types import F32, NO_VOTE, CellState, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.bag import Bag
 from mapvote.live import doubt as doubt_module
@@ -100,8 +101,8 @@ def test_a_disk_that_is_slow_or_full_costs_clouds_and_never_the_vehicle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     stuck = threading.Event()
-    monkeypatch.setattr(doubt_module, "write_mcap", lambda *_: stuck.wait(30.0))
     keeper = DoubtKeeper(tmp_path / "slow", 10**8, DoubtRule(jobs=1))
+    monkeypatch.setattr(doubt_module, "write_mcap", lambda *_: stuck.wait(30.0))
     driven(keeper)
     marks = [
         keeper.marked("d", ballot_of(voted(0.5, tile=(row, 0))), Lattice(0.0, -76.8 * row)).tiles[0].clouds
@@ -129,6 +130,20 @@ def test_files_that_a_crash_left_half_written_are_deleted_and_a_jump_of_the_cloc
     assert not keeper.marked("d", ballot_of(voted(0.5)), Lattice()).tiles[0].clouds
     keeper.close()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_write_is_told_before_the_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise MapvoteError("no space left")
+
+    monkeypatch.setattr(doubt_module, "write_mcap", full)
+    DoubtKeeper(tmp_path, 10**8).close()
+    assert "no clouds are kept of a doubtful change: no space left" in caplog.text
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(MapvoteError, match=r"--keep-doubt: .*mapvote\[ros\]"):
+        DoubtKeeper(tmp_path, 10**8)
 
 
 def test_a_ballot_of_before_says_nothing_of_clouds() -> None:

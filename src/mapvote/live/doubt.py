@@ -14,7 +14,7 @@ import queue
 import shutil
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +24,7 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.codec.ballot import Ballot, BallotTile, Odds, in_nats, unpack_planes
+from mapvote.core.extras import require
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.record import record
@@ -53,6 +54,9 @@ class DoubtRule:
     """Points farther from the change are left out, metres."""
     jobs: int = 2
     """Changes that wait to be written at most."""
+    pause_s: float = 0.02
+    """Pause of the writer after each message, seconds: on a busy machine it would keep the interpreter from the scans.
+    """
     overhead: int = 200
     """Bytes of a message in an MCAP file beside its data: record, index, and its share of the summary."""
     definitions: int = 20_000
@@ -82,7 +86,7 @@ class DoubtKeeper:
     """Keeps the clouds of one vehicle in a folder, of so many bytes at most: the oldest files go first."""
 
     def __init__(self, folder: Path, most_bytes: int, rule: DoubtRule = DOUBT_RULE) -> None:
-        """MapvoteError if the folder cannot be made."""
+        """MapvoteError if the folder cannot be made, or without rosbags (extra ``ros``)."""
         self._folder = folder
         self._most_bytes = most_bytes
         self._rule = rule
@@ -92,14 +96,27 @@ class DoubtKeeper:
         self._kept: set[str] = set()
         self._repeated = Repeated(log.warning)
         self._jobs: queue.Queue[_Job | None] = queue.Queue(rule.jobs)
+        self._closing = threading.Event()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for left in folder.glob(f"{HIDDEN}*"):  # of a crash
                 shutil.rmtree(left, ignore_errors=True)
         except OSError as error:
             raise MapvoteError(f"--keep-doubt {folder}: {error.strerror}; name a folder that can be written") from error
+        require("rosbags.rosbag2", "ros", "--keep-doubt")
+        self._try_out()
         self._thread = threading.Thread(target=self._write, name="doubt", daemon=True)
         self._thread.start()
+
+    def _try_out(self) -> None:
+        """Write a file and delete it: what the first one loads, 0.3 s of CPU, is loaded before there are scans."""
+        cloud = PlacedCloud(0, np.zeros((1, 3), np.float32), np.eye(4))
+        trial = self._folder / f"{HIDDEN}trial"
+        try:
+            write_mcap(trial, _messages(_Job(trial, np.zeros(2), [cloud]), self._rule.near_m))
+            trial.unlink()
+        except (MapvoteError, OSError) as error:
+            self._repeated("disk", f"no clouds are kept of a doubtful change: {error}")
 
     def add(self, stamp_ns: int, points: F32) -> None:
         """A scan that has no place yet, (n, 3) in the lidar frame; some are skipped, so that the held ones span the
@@ -158,19 +175,26 @@ class DoubtKeeper:
 
     def close(self) -> None:
         """Write what waits."""
+        self._closing.set()
         self._jobs.put(None)
         self._thread.join()
 
     def _write(self) -> None:
         while (job := self._jobs.get()) is not None:
             try:
-                messages = list(_messages(job, self._rule.near_m))
+                messages = list(self._slowly(_messages(job, self._rule.near_m)))
                 size = sum(len(message.data) + self._rule.overhead for message in messages)
                 self._make_room(size + self._rule.definitions)
-                write_mcap(job.path, messages)
+                write_mcap(job.path, self._slowly(messages))
             except (MapvoteError, OSError) as error:
                 self._kept.discard(job.path.name)
                 self._repeated("disk", f"no clouds are kept of a doubtful change: {error}")
+
+    def _slowly(self, messages: Iterable[FileMessage]) -> Iterator[FileMessage]:
+        """The messages, with a pause after each while nobody waits for the last file."""
+        for message in messages:
+            yield message
+            self._closing.wait(self._rule.pause_s)
 
     def _make_room(self, size: int) -> None:
         """Delete the oldest files until ``size`` bytes more are within the bound. MapvoteError if they never are."""
@@ -215,10 +239,11 @@ def _messages(job: _Job, near_m: float) -> Iterator[FileMessage]:
     """Place of each cloud, and its points near the change."""
     for cloud in job.clouds:
         points_map = transform(cloud.T_map_lidar, cloud.points)
-        near = np.hypot(points_map[:, 0] - job.place[0], points_map[:, 1] - job.place[1]) <= near_m
-        if not near.any():
+        away_m = points_map[:, :2] - job.place
+        near = np.flatnonzero(np.einsum("ij,ij->i", away_m, away_m) <= near_m * near_m)
+        if not len(near):
             continue
-        columns = {axis: cloud.points[near, k] for k, axis in enumerate("xyz")}
+        columns = dict(zip("xyz", cloud.points.take(near, axis=0).T, strict=True))
         data = to_cdr(CLOUD, cloud_of(columns, cloud.stamp_ns, LIDAR_FRAME))
         way = frames_message(cloud.stamp_ns, {LIDAR_FRAME: cloud.T_map_lidar}, MAP_FRAME)
         yield FileMessage("/tf", TF, cloud.stamp_ns, way)
