@@ -17,10 +17,11 @@ from faults import TIME_MENDS, Recording, broken, kinds_of, mounted, serious, so
 from mapvote.core import geometry
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
-from mapvote.core.sensors import SENSORS
+from mapvote.core.sensors import NAMED, SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.doctor.diagnosis import diagnose, examine_drive
+from mapvote.doctor.drive_evidence import DriveEvidence
 from mapvote.doctor.map_fit import MapEvidence, check_on_map, in_another_unit, peak_of
 from mapvote.doctor.maps import examine_points
 from mapvote.doctor.reading_on_map import ReadOnMap, confirmed
@@ -252,6 +253,31 @@ def test_a_healthy_drive_through_another_street_raises_no_alarm(weave_m: float, 
 
 def test_a_healthy_drive_without_a_prior_gets_that_note_only() -> None:
     assert serious(examine_drive(drive_along(path(24), 2))[0]) == [NO_PRIOR.what]
+
+
+@pytest.mark.parametrize(
+    ("cone_deg", "every", "swapped", "finding"),
+    [(70, 4, False, ""), (70, 8, False, "note: .*do not show its motion"), (360, 1, True, "error: the scans leap")],
+)
+def test_scans_without_rings_are_an_alarm_only_where_they_show_the_motion(
+    cone_deg: float, every: int, swapped: bool, finding: str
+) -> None:
+    """Of a sparse cone the registration errs by .7 m a step, which says nothing of the order of its scans."""
+    whole = drive_along(path(24), 2)
+    order = np.arange(24).reshape(-1, 2)[:, ::-1].ravel() if swapped else np.arange(24)
+
+    def read_scan(i: int) -> Scan:
+        scan = whole.read_scan(int(order[i]))
+        assert scan.time_s is not None
+        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        chosen = np.flatnonzero(np.abs(azimuth) < 0.5 * cone_deg)[::every]
+        return Scan(scan.stamp_ns, scan.points[chosen], scan.time_s[chosen])
+
+    evidence = DriveEvidence(replace(whole, sensor=NAMED["rosette70"], read_scan=read_scan))
+    findings = [f"{f.severity}: {f.what}" for f in evidence.leaps]
+    assert len(findings) == bool(finding)
+    assert all(re.match(finding, one) for one in findings), findings
+    assert evidence.can_be_registered == (every < 8)
 
 
 @pytest.mark.slow
