@@ -266,6 +266,12 @@ def lack_of_odometry(published: Sequence[PublishedTopic], wish: Wish, waits: Wai
             f"no {ODOMETRY} or other pose is sent. {waits.odometry_s:.0f} s after the first cloud the drive begins "
             f"with the fixes of {fixes[0].topic}; or type --odometry {fixes[0].topic}"
         )
+    moving = _moving_frames(published, wish)
+    if moving:
+        return (
+            f"no {ODOMETRY} or other pose is sent. {waits.odometry_s:.0f} s after the first cloud the drive begins "
+            f"with the frames that move on {moving[0].topic}; or type --odometry {moving[0].topic}"
+        )
     useless = [one.topic for one in _of_kinds(published, (GNSS,), (), wish.names)]
     reason = (
         f" {useless[0]} is of no use: the map's place on Earth is unknown (import --crs EPSG:n)." if useless else ""

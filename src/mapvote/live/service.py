@@ -135,7 +135,7 @@ def _lack(topics: Subscriptions, plan: Plan) -> str:
         instead = f"; {heard} sends: type --points {heard}" if heard else ""
         return f"{', '.join(silent)} is announced but sends no cloud: is the LiDAR on{instead}?"
     first = topics.lidar_frames[0]
-    frames = ", ".join(topics.frames.names) or f"none, is {topics.tf_static} sent? (--tf-static TOPIC)"
+    frames = ", ".join(topics.frames.names) or _no_frames(topics)
     if topics.mounts() is None:
         others = ", ".join(topics.lidar_frames[1:])
         return (
@@ -148,6 +148,16 @@ def _lack(topics: Subscriptions, plan: Plan) -> str:
             f"type --mount x,y,z,roll,pitch,yaw. Frames heard: {frames}"
         )
     return ""
+
+
+def _no_frames(topics: Subscriptions) -> str:
+    """That no frames are heard, and what to type or to mend."""
+    keeps_nothing = [
+        one for one in topics.network.published() if one.topic == topics.tf_static and not one.transient_local
+    ]
+    if keeps_nothing:
+        return f"none, {topics.tf_static} is not sent as transient local: start its sender again after this drive"
+    return f"none, is {topics.tf_static} sent? (--tf-static TOPIC)"
 
 
 def run(

@@ -17,7 +17,7 @@ from mapvote.core.mount import Mount, mount_of_base
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
-from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of
+from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matrix_of, two_frames
 from mapvote.formats.drives.packets import scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
@@ -34,7 +34,7 @@ from mapvote.live.dds import Network
 from mapvote.live.drive import WaitingScan
 from mapvote.live.fix_topics import FixTopics
 from mapvote.live.log_lines import Repeated
-from mapvote.live.messages import CLOCK, CLOUD, GNSS, IMU, MAP_FRAME, POSES, TF, from_cdr, stamp_ns, time_ns
+from mapvote.live.messages import CLOCK, CLOUD, GNSS, IMU, MAP_FRAME, POSES, TF, from_cdr, header_of, stamp_ns, time_ns
 from mapvote.live.names import RosNames
 from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 
@@ -100,6 +100,36 @@ class Clocks:
         )
 
 
+class Headers:
+    """Stamps and frames in the headers of one topic."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._has_stamps = False
+        self._told = False
+        self.frame = ""
+        """The frame of its first message."""
+
+    def stamp_ns(self, header_ns: int, sent_ns: int) -> int:
+        """The stamp of a message, nanoseconds; the time of sending while the topic had no stamp. MapvoteError for a
+        stamp of 0 after others."""
+        if header_ns:
+            self._has_stamps = True
+            return header_ns
+        if self._has_stamps:
+            raise MapvoteError("its stamp is 0, those before were not")
+        if not self._told:
+            self._told = True
+            log.warning("%s has no stamps in its headers: the times of sending are used", self._topic)
+        return sent_ns
+
+    def check_frame(self, frame: str) -> None:
+        """MapvoteError for another frame than that of the first message: two LiDARs on one topic."""
+        self.frame = self.frame or frame
+        if frame != self.frame:
+            raise MapvoteError(two_frames(self._topic, self.frame, frame))
+
+
 class Subscriptions:
     """The topics of one vehicle. Writers may appear and vanish."""
 
@@ -139,8 +169,12 @@ class Subscriptions:
         """Clouds and poses that arrived; messages of any topic that cannot be used."""
         self.last_unusable = ""
         """Why the last message could not be used."""
+        self._unusable_firsts: set[int] = set()
+        """Stamps of the first LiDAR's clouds in which its sensor cannot be measured."""
         self._repeated = Repeated(log.warning)
         self._readers = [PointReader(one.topic, rules) for one in chosen.points]
+        self._headers = [Headers(one.topic) for one in chosen.points]
+        self._pose_headers = Headers("odometry" if chosen.odometry is None else chosen.odometry.topic)
         self._sweeps = Sweeps(len(chosen.points))
         self._revolutions = [Revolutions() for _ in chosen.points]
         self._points, self._odometry = (
@@ -157,7 +191,10 @@ class Subscriptions:
         ]
         self.tf = self._frames_topic("tf")
         self.tf_static = self._frames_topic("tf_static")
-        self._tf_static = network.subscribe(self.tf_static, TF, reliable=True, transient_local=True)
+        self._tf_static = [
+            network.subscribe(self.tf_static, TF, reliable=True, transient_local=True),
+            network.subscribe(self.tf_static, TF, reliable=False),  # of a sender that keeps nothing, but repeats it
+        ]
         self._tf = network.subscribe(self.tf, TF, reliable=False, depth=SUBSCRIPTION_RULE.depth)
         self._clock = network.subscribe(self.names.resolve("/clock"), CLOCK, reliable=False, depth=1)
         self.sim_time = sim_time
@@ -192,12 +229,15 @@ class Subscriptions:
             with self._some_unusable(kind):
                 message = from_cdr(kind, data)
                 if kind == GNSS:
+                    fix_ns = self._pose_headers.stamp_ns(stamp_ns(message.header), sent_ns)
+                    message.header = header_of(fix_ns, message.header.frame_id)
                     self.receiver.add_fix(message)
                     self.map_frame = MAP_FRAME
                     self.poses += 1
-                    self.clocks.pose(sent_ns, stamp_ns(message.header), time.monotonic())
+                    self.clocks.pose(sent_ns, fix_ns, time.monotonic())
                     continue
-                poses = self._poses_of_tf(message) if kind == TF else [self._pose_of(message)]
+                sent = self._poses_of_tf(message) if kind == TF else [self._pose_of(message)]
+                poses = [(self._pose_headers.stamp_ns(header_ns, sent_ns), T) for header_ns, T in sent]
                 out += poses
                 for pose_ns, _ in poses:
                     self.clocks.pose(sent_ns, pose_ns, time.monotonic())
@@ -248,7 +288,7 @@ class Subscriptions:
 
     def take_scans(self) -> list[list[Cloud]]:
         """Clouds that arrived, joined to scans."""
-        for _, data in self._tf_static.take():
+        for _, data in (received for reader in self._tf_static for received in reader.take()):
             self._add_frames(data, fixed=True)
         if self.mounts() is None or self.T_base_lidar() is None:  # a joint that is fixed, but sent on /tf
             self._take_moving_frames()
@@ -257,8 +297,14 @@ class Subscriptions:
             for sent_ns, data in reader.take():
                 with self._some_unusable(CLOUD):
                     message = from_cdr(one.kind, data)
-                    self.lidar_frames[lidar] = message.header.frame_id.strip("/")
-                    clouds.append(Cloud(lidar, stamp_ns(message.header), sent_ns, message))
+                    if message.width * message.height == 0:
+                        raise MapvoteError("it holds no points")
+                    headers = self._headers[lidar]
+                    headers.check_frame(message.header.frame_id.strip("/"))
+                    self.lidar_frames[lidar] = headers.frame
+                    cloud_ns = headers.stamp_ns(stamp_ns(message.header), sent_ns)
+                    message.header = header_of(cloud_ns, message.header.frame_id)
+                    clouds.append(Cloud(lidar, cloud_ns, sent_ns, message))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
         self.clouds += len(clouds)
         now_s = time.monotonic()
@@ -318,12 +364,19 @@ class Subscriptions:
 
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
-        firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
+        firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0 and sweep[0].stamp_ns not in self._unusable_firsts]
         if self.sensor is None and len(firsts) >= RING_RULE.scans:
             del firsts[RING_RULE.scans :]  # how many arrive together does not matter
             rate_hz = rate_of_first(np.array([cloud.stamp_ns for cloud in firsts]))
             model = replace(UNKNOWN_SENSOR, rate_hz=rate_hz)
-            read = [self._scan_of(cloud, model) for cloud in firsts]
+            read: list[Scan] = []
+            for cloud in firsts:
+                self._unusable_firsts.add(cloud.stamp_ns)
+                with self._some_unusable(CLOUD):
+                    read.append(self._scan_of(cloud, model))
+                    self._unusable_firsts.discard(cloud.stamp_ns)
+            if len(read) < len(firsts):
+                return False
             estimate = estimate_sensor(read, rate_hz)
             self.sensor = estimate.sensor
             self.sensor_told = estimate.told

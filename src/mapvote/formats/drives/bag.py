@@ -139,6 +139,8 @@ class NextMessages:
         """Receipt of the last message that was read."""
         self._until_ns = 0
         self._kept: dict[tuple[str, int, int], tuple[Any, bytes]] = {}
+        self.frames: dict[str, str] = {}
+        """The frame of each topic, once a message of it was read."""
 
     def read(self, topic: str, received_ns: int, header_ns: int) -> tuple[Any, bytes] | None:
         """(connection, bytes) of the message that was received then with this stamp in its header; None without one.

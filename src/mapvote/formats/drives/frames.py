@@ -21,6 +21,14 @@ def is_map_frame(name: str) -> bool:
     return last in ("", "map", "world", "earth", "global", "utm", "enu")
 
 
+def two_frames(topic: str, first: str, other: str) -> str:
+    """Why clouds of one topic in two frames are not read."""
+    return (
+        f"{topic} sends clouds in frame {first} and in frame {other}: two LiDARs on one topic. Give each a topic of "
+        "its own (remap its driver)"
+    )
+
+
 def T_from(edges: Edges, source: str) -> dict[str, F64]:
     """T_source_frame (4, 4) of every frame that can be reached."""
     reached = {source: np.eye(4)}

@@ -20,7 +20,7 @@ from mapvote.formats.drives.bag import CLOUD, CLOUDS, Bag, NextMessages, frame_i
 from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
-from mapvote.formats.drives.frames import T_from
+from mapvote.formats.drives.frames import T_from, two_frames
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
 from mapvote.formats.drives.packets import PACKET_RULE, SWEEP_RULE, Packets, direction_of, scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
@@ -152,6 +152,10 @@ def _points_of(bag: Bag, clouds: NextMessages, topic: str, message: _Message, so
     serialised = clouds.read(topic, message.received_ns, message.header_ns)
     if serialised is None:
         raise MapvoteError(f"{source}: gone; the bag changed while it was read")
+    frame = bag.frame_id(serialised[1]).strip("/")
+    first = clouds.frames.setdefault(topic, frame)
+    if frame != first:
+        raise MapvoteError(f"{source}: {two_frames(topic, first, frame)}")
     return bag.points(source, *serialised)
 
 
