@@ -29,7 +29,7 @@ from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.road_map import OneMap
 from mapvote.live.service import Plan, run
-from mapvote.live.subscriptions import Clocks, Subscriptions
+from mapvote.live.subscriptions import Clocks, Headers, Subscriptions
 from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 from streets import drive_along, path, street
 
@@ -146,6 +146,19 @@ def test_a_pose_that_is_none_is_refused(damage: dict[str, float]) -> None:
     assert np.array_equal(matrix_of(zero, SimpleNamespace(**identity)), np.eye(4))
     with pytest.raises(MapvoteError, match="quaternion of zeros"):
         matrix_of(zero, SimpleNamespace(**identity | damage))
+
+
+def test_a_topic_without_stamps_has_its_times_of_sending_and_one_lidar(caplog: pytest.LogCaptureFixture) -> None:
+    headers = Headers("/points")
+    assert [headers.stamp_ns(0, sent) for sent in (7, 8)] == [7, 8]
+    assert caplog.text.count("/points has no stamps in its headers") == 1
+    assert headers.stamp_ns(START, 9) == START
+    with pytest.raises(MapvoteError, match="its stamp is 0"):
+        headers.stamp_ns(0, 10)
+    headers.check_frame("front")
+    headers.check_frame("front")
+    with pytest.raises(MapvoteError, match="/points sends clouds in frame front and in frame rear: two LiDARs"):
+        headers.check_frame("rear")
 
 
 LATE_POSES = [("pose", 100.0 + k, 100.0 + k, 30.0) for k in range(9)]
@@ -283,6 +296,32 @@ def test_a_lidar_that_hangs_on_the_vehicle_by_tf_static_is_read_in_axes_with_z_u
     assert T[2, 2] > 0.99
     assert T[0, 0] > 0.99
     assert np.abs(transform(T, scan.points) - world).max() < 1e-4
+
+
+def test_empty_clouds_and_stamps_of_zero_at_the_start_do_not_end_a_drive_whose_sensor_is_measured(domain: int) -> None:
+    drive = drive_along(path(11), 1)
+    vehicle = Vehicle(domain, (POINTS, CLOUD), ("/tf_static", TF))
+    topics, scans = subscriptions(domain, [POINTS], waits=Waits(odometry_s=0.0)), list[list[Cloud]]()
+    topics.sensor = None
+    vehicle.until_subscribed()
+    for i in range(11):
+        points = drive.read_scan(i).points
+        covered = np.full((5, 3), np.nan, dtype=np.float32)
+        vehicle.send(POINTS, cloud_message(Scan(0 if i < 3 else START + i * STEP, points[:0] if i < 2 else points)))
+        if i == 2:
+            columns = dict(zip("xyz", covered.T, strict=True))
+            vehicle.send(POINTS, to_cdr(CLOUD, cloud_of(columns, START + STEP, "lidar")))
+    vehicle.send(POINTS, cloud_message(Scan(START + 11 * STEP, drive.read_scan(0).points)))
+    vehicle.send(POINTS, cloud_message(Scan(START + 12 * STEP, drive.read_scan(0).points)))
+
+    def is_measured() -> bool:
+        scans.extend(topics.take_scans())
+        return topics.measure(scans)
+
+    until(is_measured)
+    assert topics.unusable == 3, "two are empty, one has no return"
+    sent = max(scans, key=lambda sweep: sweep[0].stamp_ns)  # by the clock of today
+    assert topics.waiting(sent).read().stamp_ns == sent[0].stamp_ns > START + 100 * STEP
 
 
 def test_a_drive_to_which_no_cloud_comes_ends_after_the_idle_time(tmp_path: Path, domain: int) -> None:

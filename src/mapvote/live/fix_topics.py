@@ -13,7 +13,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.bag_poses import heading_of_message, stated_covariance
 from mapvote.formats.drives.fixes import Fixes, antenna_lever, fixes_of
 from mapvote.formats.drives.frames import BASE_FRAME, Frames
-from mapvote.formats.geo.frame import MapFrame, sound_fixes
+from mapvote.formats.geo.frame import MapFrame, have_place
 from mapvote.live.messages import stamp_ns
 
 
@@ -54,10 +54,11 @@ class FixTopics:
         lonlat = np.array([[message.longitude, message.latitude, height_m]])
         if message.status.status < 0:
             raise MapvoteError("a fix whose status is NO_FIX: the receiver finds no satellites")
-        _, place = sound_fixes("a fix", lonlat)
-        self._height_m = float(place[0, 2])
+        if not have_place(lonlat)[0]:
+            raise MapvoteError("a fix without a place (not a number, or latitude 0, longitude 0)")
+        self._height_m = float(height_m)
         times_ns = np.array([stamp_ns(message.header)], dtype=np.int64)
-        fix = fixes_of(times_ns, place, stated_covariance(message)[None], self._map_frame)
+        fix = fixes_of(times_ns, lonlat, stated_covariance(message)[None], self._map_frame)
         self._fixes = self._fixes.with_fixes(fix, self._memory.fixes)
 
     def add_imu(self, message: Any) -> None:

@@ -298,7 +298,7 @@ class Subscriptions:
                 with self._some_unusable(CLOUD):
                     message = from_cdr(one.kind, data)
                     if message.width * message.height == 0:
-                        raise MapvoteError("it holds no points")
+                        raise MapvoteError(f"a cloud of {one.topic} holds no points")
                     headers = self._headers[lidar]
                     headers.check_frame(message.header.frame_id.strip("/"))
                     self.lidar_frames[lidar] = headers.frame

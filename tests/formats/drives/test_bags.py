@@ -189,6 +189,16 @@ def test_messages_come_in_any_order_and_those_of_several_lidars_in_one_pass(tmp_
     assert clouds.read(*rows[1]) is not None
 
 
+def test_two_lidars_on_one_topic_are_refused(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "bag")
+    for i in range(4):
+        bag.cloud("/points", "front" if i % 2 else "rear", START + i * 10**8, HALL)
+    bag.bag.close()
+    drive = open_drive(tmp_path / "bag", sensor="hdl32e", prior="none")
+    with pytest.raises(MapvoteError, match=r"/points sends clouds in frame rear and in frame front: two LiDARs"):
+        list(drive)
+
+
 def test_which_lidars_are_meant_and_where_they_sit_must_be_known(tmp_path: Path) -> None:
     with pytest.raises(MapvoteError, match="several LiDARs of one vehicle with commas"):
         open_drive(two_lidars(tmp_path / "bag"))

@@ -220,6 +220,13 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
     return poses_at(frame.from_lonlat(lonlat), frame.axes_at(lonlat) @ R_enu_base), frame
 
 
+def have_place(lonlat: F64) -> Bool:
+    """Which of the fixes (n, 3), longitude and latitude in degrees, state a place: numbers, and not (0, 0) in the Gulf
+    of Guinea, which receivers send before their first fix."""
+    degrees = lonlat[:, :2]
+    return np.asarray(np.isfinite(degrees).all(axis=1) & (np.abs(degrees) >= 1e-6).any(axis=1))
+
+
 def sound_fixes(source: str, lonlat: F64, status: F64 | None = None) -> tuple[Bool, F64]:
     """(which of the fixes (n, 3), longitude, latitude in degrees, height in metres, are ones (n,), these (m, 3)).
 
@@ -228,7 +235,7 @@ def sound_fixes(source: str, lonlat: F64, status: F64 | None = None) -> tuple[Bo
     counted. MapvoteError if none is left.
     """
     finite = np.isfinite(lonlat[:, :2]).all(axis=1)
-    at_zero = finite & (np.abs(lonlat[:, :2]) < 1e-6).all(axis=1)  # in the Gulf of Guinea: no vehicle is there
+    at_zero = finite & ~have_place(lonlat)
     no_fix = np.zeros(len(lonlat), dtype=np.bool_) if status is None else status < 0
     keep = finite & ~at_zero & ~no_fix
     if not keep.all():
