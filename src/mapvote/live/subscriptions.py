@@ -30,7 +30,7 @@ from mapvote.formats.drives.sensor_estimate import (
 )
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.choice import Chosen
-from mapvote.live.dds import Network
+from mapvote.live.dds import Network, PublishedTopic, Subscription
 from mapvote.live.drive import WaitingScan
 from mapvote.live.fix_topics import FixTopics
 from mapvote.live.log_lines import Repeated
@@ -177,18 +177,9 @@ class Subscriptions:
         self._pose_headers = Headers("odometry" if chosen.odometry is None else chosen.odometry.topic)
         self._sweeps = Sweeps(len(chosen.points))
         self._revolutions = [Revolutions() for _ in chosen.points]
-        self._points, self._odometry = (
-            [
-                network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=SUBSCRIPTION_RULE.depth)
-                for one in topics
-            ]
-            for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
-        )
-        self._imu = [
-            network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=SUBSCRIPTION_RULE.depth)
-            for one in [chosen.imu]
-            if one
-        ]
+        self._points = self._subscribed(chosen.points)
+        self._odometry = self._subscribed([chosen.odometry])
+        self._imu = self._subscribed([chosen.imu])
         self.tf = self._frames_topic("tf")
         self.tf_static = self._frames_topic("tf_static")
         self._tf_static = [
@@ -199,6 +190,13 @@ class Subscriptions:
         self._clock = network.subscribe(self.names.resolve("/clock"), CLOCK, reliable=False, depth=1)
         self.sim_time = sim_time
         self._clock_ns = 0
+
+    def _subscribed(self, topics: Sequence[PublishedTopic | None]) -> list[Subscription]:
+        return [
+            self.network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=SUBSCRIPTION_RULE.depth)
+            for one in topics
+            if one is not None
+        ]
 
     def _frames_topic(self, name: str) -> str:
         """/tf or /tf_static as remapped, else that of the namespace where somebody sends it, else the global one."""
