@@ -65,12 +65,12 @@ def test_what_was_read_before_changes_nothing_that_is_decided(
 
 @pytest.mark.slow
 def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> None:
-    assert disagreements(sqlite_stores, range(4, 4 + int(os.environ.get("HISTORIES", "15")))) == []
+    assert disagreements(sqlite_stores, range(4, 4 + int(os.environ.get("HISTORIES", "10")))) == []
 
 
 @pytest.mark.slow
 def test_no_replay_fails_in_histories_full_of_rollbacks_and_clearings(sqlite_stores: MakeStore) -> None:
-    seeds = range(1_000, 1_000 + int(os.environ.get("HISTORIES", "20")))
+    seeds = range(1_000, 1_000 + int(os.environ.get("HISTORIES", "12")))
     assert disagreements(sqlite_stores, seeds, troubled=True) == []
 
 
