@@ -125,6 +125,9 @@ def full_scale(values: NDArray[Any]) -> float:
     """The value of a column (n,) that means 1.0: that of :class:`Brightness`, without bins, which take longer."""
     if values.dtype.kind != "f":
         return Brightness.of(values).full
+    # Reals up to 1, as most sensors give them, need no more than their largest.
+    if values.max(initial=0.0) <= BRIGHTNESS_RULE.scales[0]:
+        return BRIGHTNESS_RULE.scales[0]
     counted = Brightness()
     finite = counted._note(values)
 

@@ -122,9 +122,11 @@ def _off_planes(points: F32, T: F64, point_map: PointMap, rules: OffSurfaces) ->
     on_map = transform(T, few)
     tiles = [point_map.tiles[index].points_map for index in tiles_within(point_map, T[:3, 3], rules.ranges_m[1])]
     mapped = np.concatenate([np.zeros((0, 3)), *tiles])
+    mapped = mapped[(np.abs(mapped[:, :2] - T[:2, 3]) < rules.ranges_m[1] + rules.reach_m).all(axis=1)]
     if len(mapped) < rules.neighbours or not len(on_map):
         return np.zeros(0), np.zeros(0)
-    away_m, beside = scipy.spatial.cKDTree(mapped).query(on_map, rules.neighbours, distance_upper_bound=rules.reach_m)
+    tree = scipy.spatial.cKDTree(mapped, balanced_tree=False)
+    away_m, beside = tree.query(on_map, rules.neighbours, distance_upper_bound=rules.reach_m)
     near = np.isfinite(away_m).all(axis=1)
     on_map = on_map[near]
     patches = mapped[beside[near]]
