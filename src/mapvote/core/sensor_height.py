@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
@@ -98,6 +98,6 @@ def two_levels(path: F64, numbers: PathLevels = PATH_LEVELS) -> tuple[float, flo
 
 def crossings(path: F64, numbers: PathLevels = PATH_LEVELS) -> I64:
     """(k, 2) indices of road positions (n, 3) of which one runs above the other."""
-    pairs = cKDTree(path[:, :2]).query_pairs(numbers.beside_m, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(path[:, :2]).query_pairs(numbers.beside_m, output_type="ndarray")
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > numbers.steps]
     return np.asarray(pairs[np.abs(path[pairs[:, 0], 2] - path[pairs[:, 1], 2]) > numbers.level_m], dtype=np.int64)
