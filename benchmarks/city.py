@@ -13,6 +13,10 @@ the server treats every tile by itself all the same.
 CPU is that of the server's process without the share of the readers, which is measured while nothing is published.
 ``memory_mb`` is its highest resident memory: before the publish, when it has ended, and after the readers have fetched
 what has changed. Readers ask for what has changed in the map, and for a plane of a tile.
+
+A second server, with a store of 100 tiles, has readers of the same kind and publishes nothing. It waits for the cores
+as the first does: ``beside`` are its waits during the publish, so ``meanwhile`` against ``beside`` is what the publish
+itself costs a reader, whatever else the machine does.
 """
 
 from __future__ import annotations
@@ -20,7 +24,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import random
+import subprocess
 import sys
 import tempfile
 import time
@@ -98,6 +104,12 @@ def memory_mb(at: Site) -> int:
     return int(status.split("VmHWM:")[1].split()[0]) // 1024
 
 
+def site_of(address: str, process: subprocess.Popen[str]) -> Site:
+    """A server that runs."""
+    host, port = address.removeprefix("http://").split(":")
+    return Site((host, int(port)), process, "", {})
+
+
 async def rest(at: Site) -> None:
     """Wait until the server has made the overview of its first version."""
     used_s = 1.0
@@ -143,16 +155,24 @@ class Readers:
         return [wait for asked, wait in self.waits if asked + wait > start and asked < end]
 
 
-async def measured(at: Site, tiles: int, readers: int, idle_s: float) -> Row:
-    """One publish of all tiles."""
+async def readers_of(at: Site, readers: int) -> tuple[Readers, list[asyncio.Task[None]]]:
+    """Readers of the newest version, who have begun."""
     _, (_, content) = await timed(at, "/v1/map")
     manifest = json.loads(content)
     planes = sorted({hashes["points"] for hashes in manifest["tiles"].values()})
+    reading = Readers(at, [f"/v1/map?since={manifest['version']}", f"/v1/tiles/{planes[0]}"], 1.0)
+    return reading, [asyncio.create_task(reading.read()) for _ in range(readers)]
+
+
+async def measured(at: Site, beside: Site, tiles: int, readers: int, idle_s: float) -> Row:
+    """One publish of all tiles."""
+    await timed(at, "/v1/map")
     coverage = [(await timed(at, "/v1/coverage"))[0] for _ in range(3)]
     await rest(at)
     before_mb = memory_mb(at)
-    reading = Readers(at, [f"/v1/map?since={manifest['version']}", f"/v1/tiles/{planes[0]}"], 1.0)
-    tasks = [asyncio.create_task(reading.read()) for _ in range(readers)]
+    await rest(beside)
+    reading, tasks = await readers_of(at, readers)
+    reading_beside, tasks_beside = await readers_of(beside, readers)
     await asyncio.sleep(2.0)
     start = time.perf_counter()
     cpu_s = at.cpu_s()
@@ -169,8 +189,9 @@ async def measured(at: Site, tiles: int, readers: int, idle_s: float) -> Row:
     if status != 200 or len(told["tiles"]) != tiles:
         raise SystemExit(f"publish: {status} {content[:500]!r}")
     await asyncio.sleep(3.0)
-    reading.done.set()
-    await asyncio.gather(*tasks)
+    for one in (reading, reading_beside):
+        one.done.set()
+    await asyncio.gather(*tasks, *tasks_beside)
     after = [(await timed(at, "/v1/coverage"))[0] for _ in range(2)]
     return {
         "tiles": tiles,
@@ -184,8 +205,10 @@ async def measured(at: Site, tiles: int, readers: int, idle_s: float) -> Row:
         "coverage_after_ms": [round(one, 1) for one in after],
         **percentiles("idle", idle),
         **percentiles("meanwhile", reading.between(start, end)),
+        **percentiles("beside", reading_beside.between(start, end)),
         **percentiles("after", reading.between(end, end + 3.0)),
         "reads": len(reading.waits),
+        "load": [round(one, 1) for one in os.getloadavg()],
     }
 
 
@@ -196,11 +219,14 @@ def city(options: argparse.Namespace, tiles: int) -> Row:
         start = time.perf_counter()
         build(url, tiles, options.vehicles)
         built_s = time.perf_counter() - start
-        log = Path(name) / "log"
-        with serving(url.removeprefix("sqlite:///"), log=log, settings=LIMITS) as (address, process):
-            host, port = address.removeprefix("http://").split(":")
-            at = Site((host, int(port)), process, url, {})
-            found = asyncio.run(measured(at, tiles, options.readers, options.idle))
+        small = Path(name) / "beside.db"
+        build(f"sqlite:///{small}", BLOCK**2, 2)
+        with (
+            serving(url.removeprefix("sqlite:///"), log=Path(name) / "log", settings=LIMITS) as served,
+            serving(small, log=Path(name) / "log_beside", settings=LIMITS) as served_beside,
+        ):
+            at = site_of(*served)
+            found = asyncio.run(measured(at, site_of(*served_beside), tiles, options.readers, options.idle))
         size = 0 if cluster else sum(file.stat().st_size for file in Path(name).glob("store.db*"))
     return found | {"built_s": round(built_s, 1), "store_mb": size // 2**20}
 
@@ -252,9 +278,8 @@ async def viewed_at(at: Site, newest: int, last: int) -> Row:
 
 async def viewed(file: Path, log: Path, newest: int, last: int) -> Row:
     """The same of a server that has just begun."""
-    with serving(file, log=log, settings=LIMITS) as (address, process):
-        host, port = address.removeprefix("http://").split(":")
-        at = Site((host, int(port)), process, "", {})
+    with serving(file, log=log, settings=LIMITS) as served:
+        at = site_of(*served)
         await timed(at, "/v1/info")
         return await viewed_at(at, newest, last)
 
