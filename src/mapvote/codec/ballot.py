@@ -248,6 +248,13 @@ class Planes:
         assert self.tally is not None
         return np.asarray(self.tally.any(axis=-1))
 
+    def speaks_of(self, cell: tuple[int, int]) -> bool:
+        """Whether it votes on a cell (row, column) of the tile."""
+        if self.states is not None:
+            return int(self.states[cell]) != NO_VOTE
+        assert self.tally is not None
+        return bool(self.tally[cell].any())
+
 
 def pack_planes(tile: TileIndex, planes: Planes) -> BallotTile:
     """The votes on one tile as a ballot holds them; planes without content are left out."""

@@ -37,7 +37,7 @@ from mapvote_server.store.fusion_jobs import standings_of
 from mapvote_server.store.integrity import DamagedBallots, ballot_name
 from mapvote_server.store.keys import pseudonyms
 from mapvote_server.store.policy import Policy, policy_in
-from mapvote_server.store.queries import records_of, tile_as_of, version_of
+from mapvote_server.store.queries import records_in, states_of, tile_as_of, version_of
 from mapvote_server.store.store import PerStore, Store
 from mapvote_server.store.votes import (
     FOREVER,
@@ -197,8 +197,9 @@ def explain_cell(
         number = version_of(connection).number
         tile = tile_as_of(connection, store.lattice.tile(index), number)
         present = _as_of_now(store, connection, number, tile, cell, electorate_now(connection, store.clock()), sizes)
-        states = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
-        decisions = [(record, state) for record, state in states if state != state_name(NO_VOTE)]
+        states = {version: _state_in(packed, cell) for version, packed in states_of(connection, index)}
+        deciding = [version for version, state in states.items() if state != state_name(NO_VOTE)]
+        decisions = [(record, states[record.version]) for record in records_in(connection, index, deciding)]
         falls = [fell_with(store, connection, index, record, cell) for record, _ in decisions]
         votes = _votes(connection, present, [record for record, _ in decisions[-sizes.records :]], with_names)
     if not with_names:
@@ -335,7 +336,7 @@ def _votes(connection: sa.Connection, present: _Now, records: Sequence[Record], 
     left_out = defaultdict[int, list[LeftOut]](list)
     for made in records:
         for standing in _standings(made):
-            if standing.ballot in said and said[standing.ballot].spoken()[present.cell]:
+            if standing.ballot in said and said[standing.ballot].speaks_of(present.cell):
                 reason_code = standing.why_not(flat)
                 if reason_code:
                     left_out[standing.ballot].append(LeftOut(made.version, REASONS[reason_code]))
@@ -377,7 +378,7 @@ def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str
 
 def _why_not(standing: Vote, present: _Now) -> str:
     """Why the next version would not count a standing ballot on the cell; "" if it would."""
-    if not standing.why and not present.said[standing.ballot].spoken()[present.cell]:
+    if not standing.why and not present.said[standing.ballot].speaks_of(present.cell):
         return "says nothing here"
     reason_code: Why = standing.why_not(present.cell[0] * TILE_CELLS + present.cell[1])
     fuse = present.electorate.settings
@@ -397,9 +398,9 @@ def _standings(record: Record) -> Sequence[Vote]:
         return ()
 
 
-def _state_in(record: Record, cell: tuple[int, int]) -> str:
+def _state_in(packed_states: bytes, cell: tuple[int, int]) -> str:
     try:
-        return state_name(int(_states_of(record.packed_states)[cell]))
+        return state_name(int(_states_of(packed_states)[cell]))
     except MapvoteError:
         return UNREADABLE
 

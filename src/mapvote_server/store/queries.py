@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -254,12 +254,34 @@ _PLANES = Question(
 )
 
 
+def states_of(connection: sa.Connection, index: TileIndex) -> list[tuple[int, bytes]]:
+    """(version, packed states) of every decision on a tile, oldest version first: its small part."""
+    d = schema.decisions.c
+    query = sa.select(d.version, d.states).where(d.row == index[0], d.col == index[1]).order_by(d.version)
+    return [(version, states) for version, states in connection.execute(query).all()]
+
+
+def records_in(connection: sa.Connection, index: TileIndex, versions: Sequence[int]) -> list[Record]:
+    """The decision records of a tile in some versions, which ascend."""
+    d = schema.decisions
+    records: list[Record] = []
+    for start in range(0, len(versions), DATABASE_SIZES.variables):
+        part = versions[start : start + DATABASE_SIZES.variables]
+        query = _RECORDS.where(d.c.row == index[0], d.c.col == index[1], d.c.version.in_(part))
+        records += [Record(*row) for row in connection.execute(query.order_by(d.c.version)).all()]
+    return records
+
+
+_RECORDS = sa.select(
+    *(schema.decisions.c[name] for name in ("version", "states", "tally", "odds", "standings", "edits", "fell"))
+)
+
+
 def records_of(connection: sa.Connection, index: TileIndex, *, after: int = 0, upto: int | None = None) -> list[Record]:
     """The decision records of a tile, oldest version first: of all versions, or of those ``after`` one ``upto``
     another, the latter included."""
     d = schema.decisions
-    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds, d.c.standings, d.c.edits, d.c.fell)
-    query = query.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
+    query = _RECORDS.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
     query = query.where(d.c.version > after)
     if upto is not None:
         query = query.where(d.c.version <= upto)
