@@ -267,21 +267,21 @@ def records_in(connection: sa.Connection, index: TileIndex, versions: Sequence[i
     records: list[Record] = []
     for start in range(0, len(versions), DATABASE_SIZES.variables):
         part = versions[start : start + DATABASE_SIZES.variables]
-        query = _RECORDS.where(d.c.row == index[0], d.c.col == index[1], d.c.version.in_(part))
+        query = _records().where(d.c.row == index[0], d.c.col == index[1], d.c.version.in_(part))
         records += [Record(*row) for row in connection.execute(query.order_by(d.c.version)).all()]
     return records
 
 
-_RECORDS = sa.select(
-    *(schema.decisions.c[name] for name in ("version", "states", "tally", "odds", "standings", "edits", "fell"))
-)
+def _records() -> sa.Select[Any]:
+    names = ("version", "states", "tally", "odds", "standings", "edits", "fell")
+    return sa.select(*(schema.decisions.c[name] for name in names))
 
 
 def records_of(connection: sa.Connection, index: TileIndex, *, after: int = 0, upto: int | None = None) -> list[Record]:
     """The decision records of a tile, oldest version first: of all versions, or of those ``after`` one ``upto``
     another, the latter included."""
     d = schema.decisions
-    query = _RECORDS.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
+    query = _records().where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
     query = query.where(d.c.version > after)
     if upto is not None:
         query = query.where(d.c.version <= upto)

@@ -25,7 +25,6 @@ _EXTENSIONS = [
     "https://stac-extensions.github.io/pointcloud/v2.0.0/schema.json",
     "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
 ]
-_ABOUT = "Versions of a point-cloud map that vehicles keep true"
 COLLECTION = "collection.json"
 """Name of the file of the collection."""
 CLOUD_ASSET = "cloud.copc.laz"
@@ -158,7 +157,7 @@ def stac_catalog(map_id: str, numbers: Sequence[int], extent: Extent | None) -> 
     """The catalogue: of the one collection if its ``extent`` is known, else of the items of these versions."""
     links = [_link("root", "./catalog.json")]
     links += [_link("child", f"./{COLLECTION}")] if extent else _item_links(numbers)
-    about = {"id": f"{map_id}-catalog" if extent else map_id, "title": "mapvote", "description": _ABOUT}
+    about = {"id": f"{map_id}-catalog" if extent else map_id, "title": "mapvote", "description": "Versions of a map"}
     return {"type": "Catalog", "stac_version": _STAC} | about | {"links": links}
 
 
@@ -172,7 +171,7 @@ def stac_collection(map_id: str, numbers: Sequence[int], extent: Extent) -> dict
         "stac_extensions": [],
         "id": map_id,
         "title": "Versions of a map",
-        "description": _ABOUT,
+        "description": "Versions of a point-cloud map that vehicles keep true",
         "license": "other",
         "keywords": ["point cloud", "lidar", "change detection"],
         "extent": {"spatial": {"bbox": [list(extent.bbox)]}, "temporal": {"interval": [[times[0], times[-1]]]}},
