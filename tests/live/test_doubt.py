@@ -17,8 +17,8 @@ from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, NO_VOTE, CellState, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.bag import Bag
-from mapvote.live import doubt as doubt_module
 from mapvote.live.doubt import DoubtKeeper, DoubtRule, doubtful_place
+from mapvote.live.doubt_file import FileWriter, Job, PlacedCloud, write_file
 
 pytest.importorskip("rosbags")
 START = 1_700_000_000 * 10**9
@@ -39,6 +39,25 @@ def ballot_of(*tiles: BallotTile) -> Ballot:
         map_id="m", base=names, version=1, vehicle="car", drive="d-001", start_ns=START, end_ns=START + 1,
         method="surfaces", settings_hash="", scans=1, scans_localised=1, median_sigma_m=0.01, tiles=list(tiles),
     )  # fmt: skip
+
+
+class InThread(FileWriter):
+    """Writes without a process, which takes a second to begin."""
+
+    def __init__(self, most_bytes: int, free: threading.Event | None = None) -> None:
+        super().__init__(most_bytes)
+        self._bound = most_bytes
+        self._free = free
+
+    def write(self, job: Job) -> str:
+        if self._free is not None:
+            self._free.wait(30.0)
+            return ""
+        try:
+            write_file(job, self._bound)
+        except MapvoteError as error:
+            return str(error)
+        return ""
 
 
 def driven(keeper: DoubtKeeper, scans: int = 40, first: int = 0) -> None:
@@ -64,7 +83,7 @@ def test_a_change_of_some_cells_that_is_neither_sure_nor_improbable_is_doubtful(
 
 
 def test_the_last_ten_seconds_near_the_change_are_a_recording_that_can_be_read_again(tmp_path: Path) -> None:
-    keeper = DoubtKeeper(tmp_path / "kept", 10**8)
+    keeper = DoubtKeeper(tmp_path / "kept", 0, writer=InThread(10**8))
     driven(keeper, 60)
     marked = keeper.marked("d-001", ballot_of(voted(0.5), voted(0.99, tile=(0, 1))), Lattice())
     assert [tile.clouds for tile in marked.tiles] == [True, False]
@@ -81,11 +100,24 @@ def test_the_last_ten_seconds_near_the_change_are_a_recording_that_can_be_read_a
     assert {(t.header.frame_id, t.child_frame_id) for t in ways} == {("map", "lidar")}
 
 
+@pytest.mark.slow
+def test_a_process_that_cannot_write_says_why_and_writes_the_next_file_after_it_was_killed(tmp_path: Path) -> None:
+    writer = FileWriter(10**6)
+    cloud = PlacedCloud(START, POINTS, np.eye(4))
+    assert "more than --keep-doubt-mb" in writer.write(Job(tmp_path / "a.mcap", np.zeros(2), [cloud] * 90))
+    assert writer._process is not None
+    writer._process.kill()
+    writer._process.wait()
+    assert writer.write(Job(tmp_path / "b.mcap", np.zeros(2), [cloud])) == ""
+    writer.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["b.mcap"]
+
+
 def test_the_oldest_files_go_first_and_the_bound_holds(tmp_path: Path) -> None:
     size = 0
     for most_bytes in (10**8, 0):
         folder = tmp_path / str(most_bytes)
-        keeper = DoubtKeeper(folder, most_bytes or round(2.5 * size), DoubtRule(jobs=9))
+        keeper = DoubtKeeper(folder, 0, DoubtRule(jobs=9), InThread(most_bytes or round(2.5 * size)))
         driven(keeper)
         for row in range(5):
             keeper.marked("d-001", ballot_of(voted(0.5, tile=(row, 0))), Lattice(0.0, -76.8 * row))
@@ -98,11 +130,10 @@ def test_the_oldest_files_go_first_and_the_bound_holds(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_slow_or_full_costs_clouds_and_never_the_vehicle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     stuck = threading.Event()
-    keeper = DoubtKeeper(tmp_path / "slow", 10**8, DoubtRule(jobs=1))
-    monkeypatch.setattr(doubt_module, "write_mcap", lambda *_: stuck.wait(30.0))
+    keeper = DoubtKeeper(tmp_path / "slow", 10**8, DoubtRule(jobs=1), InThread(10**8, stuck))
     driven(keeper)
     marks = [
         keeper.marked("d", ballot_of(voted(0.5, tile=(row, 0))), Lattice(0.0, -76.8 * row)).tiles[0].clouds
@@ -112,7 +143,7 @@ def test_a_disk_that_is_slow_or_full_costs_clouds_and_never_the_vehicle(
     assert "the disk is slow" in caplog.text
     stuck.set()
     keeper.close()
-    small = DoubtKeeper(tmp_path / "small", 1000)
+    small = DoubtKeeper(tmp_path / "small", 1000, writer=InThread(1000))
     driven(small)
     small.marked("d", ballot_of(voted(0.5)), Lattice())
     small.close()
@@ -124,6 +155,7 @@ def test_a_disk_that_is_slow_or_full_costs_clouds_and_never_the_vehicle(
 def test_files_that_a_crash_left_half_written_are_deleted_and_a_jump_of_the_clock_keeps_nothing(tmp_path: Path) -> None:
     (tmp_path / ".mcap-left").mkdir()
     (tmp_path / ".mcap-left" / "bag").write_bytes(bytes(100))
+    (tmp_path / ".mcap-raw").write_bytes(bytes(100))
     keeper = DoubtKeeper(tmp_path, 10**8)
     driven(keeper)
     keeper.forget()
@@ -132,15 +164,7 @@ def test_files_that_a_crash_left_half_written_are_deleted_and_a_jump_of_the_cloc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_write_is_told_before_the_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def full(*_: object) -> None:
-        raise MapvoteError("no space left")
-
-    monkeypatch.setattr(doubt_module, "write_mcap", full)
-    DoubtKeeper(tmp_path, 10**8).close()
-    assert "no clouds are kept of a doubtful change: no space left" in caplog.text
+def test_the_package_that_writes_is_asked_for_before_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(MapvoteError, match=r"--keep-doubt: .*mapvote\[ros\]"):
         DoubtKeeper(tmp_path, 10**8)
