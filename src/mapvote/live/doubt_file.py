@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -83,10 +84,7 @@ class FileWriter:
             self.close()
         if self._process is None:
             command = [sys.executable, "-m", "mapvote.live.doubt_file"]
-            # A session of its own: Ctrl-C ends the drive, which then waits for the last file.
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-            )
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(f"{line}\n")
@@ -153,6 +151,8 @@ def _messages(job: Job, near_m: float) -> Iterator[FileMessage]:
 
 def main() -> None:
     """Write files until the input ends."""
+    for ends in (signal.SIGINT, signal.SIGTERM):  # they end the drive too, which waits for its last file
+        signal.signal(ends, signal.SIG_IGN)
     os.nice(KEPT_FILE.niceness)
     for line in sys.stdin:
         raw, path, most_bytes = json.loads(line)
