@@ -190,7 +190,9 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
     n = len(xyz)
     share = 1.0 / max(n, 1)
     level = xyz if R is None else xyz @ R.T
-    distance = np.sqrt((xyz**2).sum(axis=1))
+    axes = np.ascontiguousarray(xyz.T)
+    squared = axes**2
+    distance = np.sqrt(squared[0] + squared[1] + squared[2])
     azimuth = np.arctan2(level[:, 1], level[:, 0])
     seen = np.cumsum(
         np.bincount(
@@ -203,19 +205,20 @@ def _look(index: int, points: F32, R: F32 | None = None) -> np.void:
     steps -= 2.0 * np.pi * np.round(steps / (2.0 * np.pi))
     rounded = []
     for quantum in SCAN_CHECK.quanta_m:
-        whole = np.abs(xyz[:, 0] / quantum - np.round(xyz[:, 0] / quantum)) < 1e-3  # of x, which is mostly no multiple
+        steps_of_x = axes[0] / quantum
+        whole = np.abs(steps_of_x - np.round(steps_of_x)) < 1e-3  # of x, which is mostly no multiple
         off = xyz[whole] / quantum
         rounded.append((np.abs(off - np.round(off)) < 1e-3).all(axis=1).sum() / max(n, 1))
     row = np.zeros(1, dtype=_LOOK)[0]
     row["index"] = index
     row["count"] = len(points)
-    row["low"] = xyz.min(axis=0, initial=np.inf)
-    row["high"] = xyz.max(axis=0, initial=-np.inf)
+    row["low"] = axes.min(axis=1, initial=np.inf)
+    row["high"] = axes.max(axis=1, initial=-np.inf)
     row["mean"] = xyz.sum(axis=0) * share
     row["range_m"] = [(np.searchsorted(seen, part * n) + 0.5) * SCAN_CHECK.bin_m for part in (0.1, 0.5, 0.99)]
     row["sectors"] = np.bincount(sectors, minlength=SCAN_CHECK.sectors) * share
-    row["near"] = (distance < 2.0).sum() * share
-    row["unit"] = ((xyz >= 0.0) & (xyz <= 1.0)).sum(axis=0) * share
+    row["near"] = np.count_nonzero(distance < 2.0) * share
+    row["unit"] = np.count_nonzero((axes >= 0.0) & (axes <= 1.0), axis=1) * share
     row["rounded"] = rounded
     row["turns"] = steps[np.abs(steps) < 1.0].sum() / (2.0 * np.pi)
     row["digest"] = ((np.arange(n) % 97 + 1.0) * distance).sum()
