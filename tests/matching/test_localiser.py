@@ -61,10 +61,67 @@ def off(fixes: list[Fix]) -> F64:
     )
 
 
-def test_scans_wait_until_several_agree_and_leave_with_the_look_that_confirms_them(point_map: PointMap) -> None:
+def test_scans_wait_until_several_agree_and_leave_at_once_when_the_track_holds(point_map: PointMap) -> None:
     one = localiser(point_map)
-    assert [len(one.push(scan(i), told(POSES[i]))) for i in range(9)] == [0, 0, 3, 0, 0, 0, 4, 0, 0]
-    assert all(fix.trusted for fix in one.flush())
+    assert [len(one.push(scan(i), told(POSES[i]))) for i in range(9)] == [0, 0, 3, 0, 0, 1, 1, 1, 1]
+    assert all(fix.trusted and fix.standing.holds for fix in one.flush())
+
+
+def test_scans_of_a_track_that_a_look_refutes_are_taken_back_and_those_before_the_last_good_look_are_not(
+    point_map: PointMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = localiser(point_map)
+    given = [fix for i in range(9) for fix in one.push(scan(i), told(POSES[i]))]
+    misfit = one.misfit
+    monkeypatch.setattr(one.judge, "holds", lambda verdict: False)
+    assert not any(fix.trusted for fix in one.flush())
+    assert [fix.standing.holds for fix in given] == [True] * 3 + [False] * 4
+    np.testing.assert_array_equal(one.misfit, misfit, "what was taken back teaches nothing")
+
+
+def test_scans_before_a_doubt_stand_if_a_look_at_the_last_of_them_holds(
+    point_map: PointMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = localiser(point_map)
+    given = [fix for i in range(9) for fix in one.push(scan(i), told(POSES[i]))]
+    answers = iter([False, False, True, True])  # quickly, of the newest scan, then of that verdict; the same before it
+    monkeypatch.setattr(one.judge, "holds", lambda verdict: next(answers))
+    one.flush()
+    assert all(fix.standing.holds for fix in given)
+
+
+def test_a_track_that_leaps_is_doubted(point_map: PointMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = localiser(point_map)
+    given = [fix for i in range(8) for fix in one.push(scan(i), told(POSES[i]))]
+    localise = one.tracker.localise
+
+    def leap(newest: Scan, prior: PosePrior | None) -> Fix:
+        fix = localise(newest, prior)
+        T_map_lidar = fix.registration.T_map_lidar @ from_xyz_rpy(3.0, 0.0, 0.0)
+        return replace(fix, registration=replace(fix.registration, T_map_lidar=T_map_lidar))
+
+    monkeypatch.setattr(one.tracker, "localise", leap)
+    monkeypatch.setattr(one.judge, "holds", lambda verdict: False)
+    one.push(scan(8), told(POSES[8]))
+    assert [fix.standing.holds for fix in given] == [True] * 3 + [False] * 3
+
+
+def test_a_look_comes_before_the_filter_of_moving_objects_lets_a_scan_go(
+    point_map: PointMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moving = SETTINGS.moving.model_copy(update={"lookahead_s": 0.25})
+    one, looks = Localiser(point_map, SETTINGS.model_copy(update={"moving": moving}), SENSORS["hdl32e"]), list[int]()
+    judge = one.judge.judge
+
+    def counting(ndt_map: NdtMap, few: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
+        looks[-1] += 1
+        return judge(ndt_map, few, T_map_lidar, quick)
+
+    monkeypatch.setattr(one.judge, "judge", counting)
+    for i in range(9):
+        looks.append(0)
+        one.push(scan(i), told(POSES[i]))
+    assert looks == [1, 1, 1, 0, 0, 1, 0, 0, 1]
 
 
 @pytest.mark.parametrize(

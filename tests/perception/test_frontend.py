@@ -92,6 +92,33 @@ def test_the_scans_of_a_burst_are_worked_on_one_with_each_call_and_none_is_lost(
     assert indices == list(range(3 * burst))
 
 
+class TakesBack:
+    """A localiser that gives scans out at once, and with scan 6 takes back those from 3 on."""
+
+    def __init__(self) -> None:
+        self._given: list[Fix] = []
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        if len(self._given) == 6:
+            for fix in self._given[3:]:
+                fix.standing.holds = False
+        self._given += localise().push(scan, prior)
+        return self._given[-1:]
+
+    def flush(self) -> list[Fix]:
+        return []
+
+
+def test_scans_that_are_taken_back_are_lost_and_no_witnesses_of_what_moves() -> None:
+    movers = MovingFilter(SENSORS["hdl32e"], MovingSettings())
+    whole = Frontend(TakesBack(), movers, LocalMap(street(), 40.0))
+    seen = drive(whole, 7)
+    assert [scan.stamp_ns * 4 // SECOND for scan in movers._window] == [0, 1, 2, 6]
+    assert [one.scan.index for one in seen + whole.finish()] == [0, 1, 2, 6]
+    assert whole.report.lost == [3, 4, 5]
+    assert len(whole.report.T_map_lidar) == 7
+
+
 def test_an_observation_tells_obstacles_from_the_road_and_how_sure_the_pose_was() -> None:
     one = frontend()
     drive(one, 1)
@@ -124,6 +151,9 @@ class AllMove:
 
     def flush(self) -> list[Bool]:
         return []
+
+    def forget(self, count: int) -> None:
+        assert count == 0
 
 
 def test_moving_points_do_not_count_as_hits_and_given_poses_need_no_prior() -> None:

@@ -1,8 +1,10 @@
 """Poses that a vehicle may vote with: a track is followed, doubted, confirmed, moved or taken back.
 
-A scan waits until the place of its track has been confirmed by a look taken at it or after it. So nothing has to be
-recalled once a track proves wrong: its scans since the last good look have not voted yet. Where another place fits
-better the track moves there, and the scans that wait move along. Memory is bounded by the scans that may wait.
+A scan votes once the place of its track has been confirmed by a look taken at it or after it. Until a track is
+confirmed its scans wait here; where another place fits better the track moves there, and they move along. The scans of
+a confirmed track are given out at once: the filter of moving objects holds each for a second, and a look comes within
+that second. If the look refutes the track, the scans since the last good look are taken back (:class:`Standing`), so
+that they never vote. Memory is bounded by the scans that may wait.
 """
 
 from __future__ import annotations
@@ -39,8 +41,10 @@ class Localisation:
     """Scans that wait at most until their track is confirmed: the number that a vehicle can hold, 4 s at 10 Hz."""
     every_m: float = 10.0
     """Distance after which a track that holds is checked again, well within the 15 m of a check."""
-    every_s: float = 0.35
-    """Time after which it is checked again: four scans at 10 Hz, however their stamps jitter. A vote waits so long."""
+    every_s: float = 1.0
+    """Time after which it is checked again, or that for which the filter of moving objects holds a scan, if less."""
+    kept: int = 2
+    """Newest scans of a confirmed track that wait: with two a track that is moved knows its motion."""
     jumps: int = 4
     """Moves of a track on one scan before it counts as lost there."""
     memory: float = 0.1
@@ -49,6 +53,10 @@ class Localisation:
     """Distance from the motion of the scans after it at which a scan that is followed back is lost."""
     back_rad: float = float(np.radians(5.0))
     """Turn from that motion at which it is lost."""
+    leap_m: float = 1.0
+    """Distance of a pose from the motion before it at which the track has leapt ..."""
+    leap_mps2: float = 10.0
+    """... and the acceleration, which no car exceeds, by which it may be farther."""
     first_search: int = 6
     """Scans without a confirmed place before the whole map is searched; every further search waits twice as long."""
 
@@ -129,6 +137,9 @@ class Localiser:
         self.misfit = np.zeros(3)
         """(3,) shift of trusted fixes from their priors lately, map metres."""
         self._waiting: deque[_Waiting] = deque()
+        self._given: list[_Waiting] = []
+        """Scans of the confirmed track that were given out since the last look."""
+        self._every_s = min(numbers.every_s, settings.moving.lookahead_s)
         self._held = 0
         """Looks in turn that held."""
         self._confirmed = False
@@ -147,15 +158,21 @@ class Localiser:
             self._catch_leap(scan, prior)
             prior = self._at_height(prior)
             believed = self._corrected(prior) if self._is_pose(prior) and not self._reverses(prior) else None
+        predicted = self._predicted(scan)
         fix = self.tracker.localise(scan, believed)
         self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
         self._waiting.append(_Waiting(fix, misfit, prior))
         self._place_prior(self._waiting[-1])
+        if self._leapt(fix, predicted) and not self._doubt():
+            for waiting in list(self._waiting)[:-1]:
+                waiting.fix = replace(waiting.fix, trusted=False)
         if self._is_due(fix):
             self._look()
             if self._confirmed and self._held:
                 return self._decide(len(self._waiting), True)
+        elif self._confirmed:
+            return self._give_out(max(0, len(self._waiting) - self.numbers.kept))
         return self._decide(max(0, len(self._waiting) - self.numbers.wait_scans), False)
 
     def flush(self) -> list[Fix]:
@@ -262,14 +279,28 @@ class Localiser:
         T_map_lidar[:3, 3] += self.misfit
         return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.linalg.norm(self.misfit))))
 
+    def _predicted(self, scan: Scan) -> tuple[F64, float] | None:
+        """Where the motion of the track leads by now (4, 4), and the seconds since; None where that says little."""
+        age_s = 1e-9 * (scan.stamp_ns - self.tracker.last_stamp_ns)
+        last = self.tracker.last_pose
+        if last is None or not self.tracker.has_motion or age_s > self.tracker.numbers.twist_age_s:
+            return None
+        return last @ exp(age_s * self.tracker.twist), age_s
+
+    def _leapt(self, fix: Fix, predicted: tuple[F64, float] | None) -> bool:
+        """Whether a confirmed track found the scan where no motion leads: here or before it the place was wrong."""
+        if not self._confirmed or predicted is None or not fix.trusted:
+            return False
+        T_map_lidar, age_s = predicted
+        off_m = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]))
+        return off_m > self.numbers.leap_m + 0.5 * self.numbers.leap_mps2 * age_s**2
+
     def _is_due(self, fix: Fix) -> bool:
         last = self._looked_at
         if last is None or not self._confirmed or not fix.trusted:
             return True
         way = np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - last.registration.T_map_lidar[:3, 3])
-        return bool(
-            way >= self.numbers.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self.numbers.every_s
-        )
+        return bool(way >= self.numbers.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self._every_s)
 
     def _look(self) -> None:
         """Judge the newest fix; move the track while another place fits better."""
@@ -282,12 +313,31 @@ class Localiser:
         self._looked_at = self._waiting[-1].fix
         if self._looked_at.trusted and self.judge.holds(verdict):
             self._held += 1
+            self._learn_of_given()
             if not self._confirmed and self._held >= self.numbers.checks:
                 self._confirmed = True
                 self._follow_back()
         else:
-            self._held = 0
-            self._confirmed = False
+            self._doubt()
+
+    def _doubt(self) -> bool:
+        """The track does not hold at the newest scan. What was given out of it stands if it holds at the scan before,
+        and is taken back if not. Returns which."""
+        stands = self._confirmed and len(self._waiting) > 1 and self.judge.holds(self._verdict(-2))
+        if stands:
+            self._learn_of_given()
+        for given in self._given:
+            given.fix.standing.holds = False
+        self._given.clear()
+        self._held = 0
+        self._confirmed = False
+        return stands
+
+    def _learn_of_given(self) -> None:
+        """The track held: so did the scans that were given out since the last look."""
+        for given in self._given:
+            self._learn(given)
+        self._given.clear()
 
     def _follow_back(self) -> None:
         """The track holds: the scans before it that have no place are registered from it backwards in time, with the
@@ -309,8 +359,8 @@ class Localiser:
                 waiting[i].fix = replace(waiting[i].fix, trusted=False)
                 return
 
-    def _verdict(self) -> Verdict:
-        fix = self._waiting[-1].fix
+    def _verdict(self, of: int = -1) -> Verdict:
+        fix = self._waiting[of].fix
         T_map_lidar = fix.registration.T_map_lidar
         around = self.map_around(T_map_lidar[:3, 3])
         few = solid_of(fix.scan, fix.twist, LEVELS[-1].points_m)
@@ -322,6 +372,7 @@ class Localiser:
 
     def _move(self, T_map_lidar: F64) -> None:
         """The newest scan was taken here: it and all that wait are registered anew, the track goes on from here."""
+        self._doubt()
         newest = self._waiting[-1]
         shift = T_map_lidar @ inverse(newest.fix.registration.T_map_lidar)
         twist = self.tracker.twist
@@ -334,8 +385,6 @@ class Localiser:
             if waiting.nowhere:
                 continue
             self._register_anew(waiting, shift @ waiting.fix.registration.T_map_lidar, twist)
-        self._held = 0
-        self._confirmed = False
         self._go_on()
 
     def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
@@ -359,23 +408,41 @@ class Localiser:
         registration = newest.fix.registration
         self.tracker.move_to(registration.T_map_lidar, newest.fix.scan.stamp_ns, twist, registration.score)
 
+    def _give_out(self, count: int) -> list[Fix]:
+        """The fixes of the oldest ``count`` scans of a confirmed track, until a look says otherwise."""
+        given = [self._waiting.popleft() for _ in range(count)]
+        for one in given:
+            self._settle(one, one.fix.trusted)
+        self._given += given
+        return [one.fix for one in given]
+
     def _decide(self, count: int, confirmed: bool) -> list[Fix]:
-        """The fixes of the oldest ``count`` scans, which nothing changes any more; trusted ones correct the remembered
-        error of the prior."""
+        """The fixes of the oldest ``count`` scans, which nothing changes any more."""
         decided = []
         for _ in range(count):
             waiting = self._waiting.popleft()
-            fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
-            if fix.trusted and waiting.misfit is not None:
-                self.misfit = self.misfit + self.numbers.memory * (waiting.misfit - self.misfit)
-            if waiting.prior is not None and waiting.begun == self.prior_frame.begun:
-                self._place_prior(waiting)  # by all that was learnt before this scan
-                if fix.trusted and not waiting.prior.is_planar and self._is_pose(waiting.prior):
-                    self.prior_frame.learn(waiting.prior, fix.registration.T_map_lidar)
-            if waiting.in_map is not None:
-                fix = replace(fix, prior=waiting.in_map)
-            decided.append(fix)
+            self._settle(waiting, waiting.fix.trusted and confirmed)
+            self._learn(waiting)
+            decided.append(waiting.fix)
         return decided
+
+    def _settle(self, waiting: _Waiting, trusted: bool) -> None:
+        """The fix as it is given out, its prior placed by all that was learnt before it."""
+        if waiting.prior is not None and waiting.begun == self.prior_frame.begun:
+            self._place_prior(waiting)
+        prior = waiting.fix.prior if waiting.in_map is None else waiting.in_map
+        waiting.fix = replace(waiting.fix, trusted=trusted, prior=prior)
+
+    def _learn(self, waiting: _Waiting) -> None:
+        """A trusted fix corrects the remembered error of the prior."""
+        fix = waiting.fix
+        if not fix.trusted or waiting.prior is None:
+            return
+        if waiting.misfit is not None:
+            self.misfit = self.misfit + self.numbers.memory * (waiting.misfit - self.misfit)
+        in_frame = waiting.begun == self.prior_frame.begun and not waiting.prior.is_planar
+        if in_frame and self._is_pose(waiting.prior):
+            self.prior_frame.learn(waiting.prior, fix.registration.T_map_lidar)
 
 
 class GivenPoses:

@@ -6,7 +6,7 @@ A vehicle that does not trust its pose abstains: a lost vehicle must never demol
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -53,6 +53,14 @@ class Tracking:
 TRACKING = Tracking()
 
 
+@dataclass(slots=True)
+class Standing:
+    """Whether a pose that was given out still stands."""
+
+    holds: bool = True
+    """False once a check has refuted the track that the pose is of."""
+
+
 @dataclass(frozen=True, slots=True)
 class Fix:
     """One scan, localised."""
@@ -65,6 +73,8 @@ class Fix:
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
     prior: PosePrior | None = None
     """The prior in the map's frame, where its own frame had to be learnt."""
+    standing: Standing = field(default_factory=Standing)
+    """Changes until a second after the scan at most."""
 
     @property
     def points(self) -> F32:
@@ -141,8 +151,13 @@ class Tracker:
             return 0
         return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
 
+    @property
+    def has_motion(self) -> bool:
+        """Whether the motion that led to the last pose is known."""
+        return self._measured or bool(self.twist.any())
+
     def _knows_motion(self, scan: Scan) -> bool:
-        return scan.time_s is None or bool(self.twist.any()) or self._measured
+        return scan.time_s is None or self.has_motion
 
     def guess_motion(
         self, around: LocalMatcher, stamp_ns: int, sample: Sample, seed: F64, prior: PosePrior | None = None
@@ -166,8 +181,8 @@ class Tracker:
         """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
-            has_motion = self._measured or bool(self.twist.any())
-            drift = 0.5 * self.numbers.acceleration_mps2 * age**2 if has_motion else age * float(self._speeds_mps[-1])
+            fastest_mps = float(self._speeds_mps[-1])
+            drift = 0.5 * self.numbers.acceleration_mps2 * age**2 if self.has_motion else age * fastest_mps
             if prior is None or drift < prior.sigma_m:
                 return self.last_pose @ exp(age * self.twist), drift
         if prior is None:

@@ -9,6 +9,7 @@ order, each once its place is confirmed and the moving-object filter has decided
 from __future__ import annotations
 
 import time
+from bisect import insort
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, Bool, MapvoteError, PosePrior, Reference, Scan
 from mapvote.matching.localiser import Localise
-from mapvote.matching.odometry import Fix
+from mapvote.matching.odometry import Fix, Standing
 from mapvote.perception.placement import ONE_LIDAR, LidarPart, cells_and_obstacles, lidar_parts, place_points
 from mapvote.perception.raycast import ScanView, Sky, cast_rays
 
@@ -37,21 +38,23 @@ class Spread:
     """How the work of confirmed scans is spread."""
 
     calls: int = 6
-    """Calls within which a confirmed scan is worked on. A check of the pose confirms four scans at once: one of them is
-    taken with each call, and none waits longer for its turn than the first of them waited for the check."""
+    """Calls within which a confirmed scan is worked on. The check that first confirms a track gives out several scans,
+    each later one three: one of them is taken with each call."""
 
 
 SPREAD = Spread()
 
 
 class MoversFilter(Protocol):
-    """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
+    """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its methods."""
 
     def push(
         self, rows: F32, origin_map: F64, obstacle: Bool, stamp_ns: int, lidars: tuple[LidarPart, ...] = ONE_LIDAR
     ) -> list[Bool]: ...
 
     def flush(self) -> list[Bool]: ...
+
+    def forget(self, count: int) -> None: ...
 
 
 @dataclass(slots=True)
@@ -159,6 +162,8 @@ class PlacedScan:
     """Attributes (n,) of the points that the sensor measures."""
     forward_map: F64 = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     """(3,) the sensor's own x axis, in the map's frame."""
+    standing: Standing = field(default_factory=Standing)
+    """Whether its pose still stands."""
 
     @property
     def points_map(self) -> F64:
@@ -228,6 +233,7 @@ class Frontend:
         report.priors.append(prior)
         with report.timed("localise"):
             self._confirmed.extend(self._localise.push(scan, prior))
+        self._take_back()
         turns = ceil(len(self._confirmed) / self._spread.calls)
         return [seen for _ in range(turns) for seen in self._take(self._confirmed.popleft())]
 
@@ -236,6 +242,7 @@ class Frontend:
         self._ended = True
         with self.report.timed("localise"):
             self._confirmed.extend(self._localise.flush())
+        self._take_back()
         decided = [seen for fix in self._confirmed for seen in self._take(fix)]
         self._confirmed.clear()
         return decided + self._see(self._movers.flush())
@@ -271,7 +278,7 @@ class Frontend:
         report.covariances.append(fix.registration.covariance.astype(np.float32))
         if fix.prior is not None:
             report.priors[index] = fix.prior
-        if not fix.trusted:
+        if not (fix.trusted and fix.standing.holds):
             report.lost.append(index)
             return []
         with report.timed("ground"):
@@ -304,7 +311,16 @@ class Frontend:
             lidars,
             scan.fields,
             forward_map,
+            fix.standing,
         )
+
+    def _take_back(self) -> None:
+        """The newest scans whose poses stand no longer are lost."""
+        count = 0
+        while self._waiting and not self._waiting[-1].standing.holds:
+            insort(self.report.lost, self._waiting.pop().index)
+            count += 1
+        self._movers.forget(count)
 
     def _see(self, decided: list[Bool]) -> list[Observation]:
         """The oldest scans that wait, one for each mask of moving points (n,)."""

@@ -368,6 +368,12 @@ class MovingFilter:
         self._window.clear()
         return decided
 
+    def forget(self, count: int) -> None:
+        """The ``count`` youngest scans, none of them decided, were taken elsewhere than told."""
+        for _ in range(count):
+            self._window.pop()
+        self._waiting -= count
+
     def _decide(self, up_to_ns: int) -> list[Bool]:
         """Masks of all waiting scans not younger than ``up_to_ns``; forgets what no later scan will ask for."""
         out = []
