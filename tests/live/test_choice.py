@@ -88,6 +88,7 @@ LIVOX = "diagnostic_msgs/msg/DiagnosticArray"
             ["below /car1", "type --points /car2/points"],
         ),
         ([("/points", CLOUD)], Wish(), ["no nav_msgs/msg/Odometry or other pose", "begins without it"]),
+        ([("/points", CLOUD), ("/tf", TF)], Wish(), ["begins with the frames that move on /tf", "--odometry /tf"]),
     ],
 )
 def test_a_missing_topic_is_named_soon_and_again_with_the_option_to_type(
@@ -224,6 +225,20 @@ def test_frames_that_come_late_or_as_moving_ones_are_waited_for(domain: int) -> 
     assert found is not None
     assert np.allclose(found, mount)
     del scans, poses
+
+
+def test_fixed_frames_whose_sender_keeps_nothing_are_named_and_read_when_they_are_sent_again(domain: int) -> None:
+    sender = Sender(domain, ("/points", CLOUD), ("/odom", ODOMETRY))
+    frames = Network(domain).publish("/tf_static", TF)
+    topics = topics_of(domain, "/odom")
+    until(lambda: topics._points[0].writers and topics._odometry[0].writers and topics._tf_static[1].writers)
+    sender.send("/points", cloud(0))
+    sender.send("/odom", odometry_message(START, np.eye(4)))
+    ended = Said()
+    prepare(topics, PLAN, ended, ended.voice)
+    assert "/tf_static is not sent as transient local" in ended.lines[0]
+    frames.send(frames_message(0, {"lidar": from_xyz_rpy(1.0, 0.0, 1.8)}))
+    until(lambda: topics.take_scans() or topics.T_base_lidar() is not None)
 
 
 def heard_lidar(topics: Subscriptions, sender: Sender) -> None:
