@@ -22,9 +22,9 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.slow
-def test_a_client_and_a_server_start_without_the_parts_of_scipy_that_few_requests_need() -> None:
+def test_a_client_a_vehicle_and_a_server_start_without_the_parts_of_scipy_that_few_requests_need() -> None:
     """They would be a fifth of their start. ``import scipy`` loads a part when it is first asked for."""
-    for room in ("mapvote.client", "mapvote_server.api.serve"):
+    for room in ("mapvote.client", "mapvote.vehicle", "mapvote_server.api.serve"):
         code = (
             f"import sys, {room}; print([n for n in ('spatial', 'sparse', 'special') if f'scipy.{{n}}' in sys.modules])"
         )

@@ -18,8 +18,7 @@ from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial import KDTree
+import scipy
 
 from mapvote.compare.register import PATCHES, Registered
 from mapvote.core.columns import rebased
@@ -232,7 +231,7 @@ def _hangs(planes: CloudPlanes) -> Bool:
 
 
 def _around(cells: Bool, reach: int) -> Bool:
-    return np.asarray(ndimage.maximum_filter(cells, 2 * reach + 1, mode="constant"))
+    return np.asarray(scipy.ndimage.maximum_filter(cells, 2 * reach + 1, mode="constant"))
 
 
 def _explained(
@@ -260,7 +259,7 @@ def _explained(
             if not len(others) or not len(here):
                 continue
             at, others = (points[here], transform(T, others)) if k == 0 else (transform(T, points[here]), others)
-            fits[here] = KDTree(others).query(at, distance_upper_bound=explained_m)[0] < explained_m
+            fits[here] = scipy.spatial.KDTree(others).query(at, distance_upper_bound=explained_m)[0] < explained_m
         # The share of them in each cell.
         rows, cols, _ = window.indices_of(points)
         total = np.zeros(window.shape)
@@ -418,4 +417,4 @@ def _both(before: Tile, after: Tile) -> Tile:
 
 
 def _has_near(points: F64, others: F64) -> Bool:
-    return np.asarray(KDTree(others).query(points, distance_upper_bound=CELL_SIZE)[0] < CELL_SIZE)
+    return np.asarray(scipy.spatial.KDTree(others).query(points, distance_upper_bound=CELL_SIZE)[0] < CELL_SIZE)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from mapvote.core.geometry import exp, log, transform
 from mapvote.core.record import record
@@ -54,11 +54,11 @@ class Surface:
 
     points: F64
     """(n, 3)."""
-    tree: KDTree
+    tree: scipy.spatial.KDTree
 
     @classmethod
     def of(cls, points: F64) -> Surface:
-        return cls(points, KDTree(points))
+        return cls(points, scipy.spatial.KDTree(points))
 
     def normals(self, places: F64, numbers: PlaneMatch = PLANE_MATCH) -> tuple[F64, F64]:
         """((m, 3) unit normals at places (m, 3), (m,) how flat the surface is there, in [0, 1]: 1 for a plane).

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+import scipy
 
 from mapvote.compare.free_space import with_free_space_of
 from mapvote.compare.point_to_plane import PLANE_MATCH, Surface, refine_on_planes
@@ -145,9 +144,9 @@ def register_patches(
     ``paths``: (n, 3) each, from where a or b was measured, in a's frame by T_a_b."""
     thin_a = _thinned(points_a, numbers.thin_m)
     thin_b = _thinned(points_b, numbers.thin_m)
-    tree_a = KDTree(thin_a[:, :2])
-    tree_b = KDTree(thin_b[:, :2])
-    path_trees = [KDTree(path) for path in paths]
+    tree_a = scipy.spatial.KDTree(thin_a[:, :2])
+    tree_b = scipy.spatial.KDTree(thin_b[:, :2])
+    path_trees = [scipy.spatial.KDTree(path) for path in paths]
     centres = []
     poses = []
     covariances = []
@@ -293,7 +292,7 @@ def unbent(points_b: F64, patches: Patches, T_a_b: F64) -> F64:
     # The weights of the nearest patches, for squares of 2 m.
     coarse, cell = np.unique(np.floor(points_b[:, :2] / 2.0).astype(np.int64), axis=0, return_inverse=True)
     nearest = min(8, len(centres))
-    far, index = KDTree(centres[:, :2]).query(2.0 * coarse + 1.0, k=[*range(1, nearest + 1)])
+    far, index = scipy.spatial.KDTree(centres[:, :2]).query(2.0 * coarse + 1.0, k=[*range(1, nearest + 1)])
     weight = np.exp(-0.5 * (far / (0.5 * patches.numbers.side_m)) ** 2) + 1e-12
     weight /= weight.sum(axis=1, keepdims=True)
     # Each point moved by the average.
@@ -332,8 +331,10 @@ def _side_by_side(centre_xy: F64, off: Bool, numbers: PatchNumbers) -> list[Bool
     members = np.flatnonzero(off)
     if not len(members):
         return []
-    tree = KDTree(centre_xy[members])
-    _, label = connected_components(tree.sparse_distance_matrix(tree, 1.5 * numbers.step_m).tocsr(), directed=False)
+    tree = scipy.spatial.KDTree(centre_xy[members])
+    _, label = scipy.sparse.csgraph.connected_components(
+        tree.sparse_distance_matrix(tree, 1.5 * numbers.step_m).tocsr(), directed=False
+    )
     return [
         np.isin(np.arange(len(off)), members[label == number])
         for number in np.argsort(-np.bincount(label), kind="stable")
@@ -483,7 +484,7 @@ def _on_surfaces(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) 
     T[:3, 3] = fit.middle
     middle_b = transform(inverse(fit.T_a_b), fit.middle[None])[0]
     # Only points of b that a rigid motion lays on a, and the points of a around them.
-    agree = KDTree(patches.T_a_patch[fit.agree, :2, 3])
+    agree = scipy.spatial.KDTree(patches.T_a_patch[fit.agree, :2, 3])
     surfaces = []
     for points, T_a_points in ((points_a, np.eye(4)), (points_b, fit.T_a_b)):
         thin = _thinned(points, numbers.surface_m)

@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial import KDTree
+import scipy
 
 from mapvote.codec.ballot import Ballot, Planes
 from mapvote.codec.planes import Words
@@ -222,7 +221,7 @@ def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float,
     nearest = image.copy()
     for wide in (1, 2, 4, 8):
         near = np.where(image * numbers.bin_rad * wide < 1.5 * spacing_m, image, np.inf)
-        nearest = np.minimum(nearest, ndimage.minimum_filter(near, 2 * wide + 1, mode=("nearest", "wrap")))
+        nearest = np.minimum(nearest, scipy.ndimage.minimum_filter(near, 2 * wide + 1, mode=("nearest", "wrap")))
     # The rays to the first surface.
     first = (reach <= image[row, col]) & (reach <= nearest[row, col] + CLEARANCE_M)
     words = np.zeros(window.shape, dtype=np.uint64)
@@ -234,4 +233,4 @@ def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float,
 def _spacing(points: F64) -> float:
     """Median distance to the nearest neighbour of a sample of (n, 3) points, metres."""
     sample = points[np.random.default_rng(0).permutation(len(points))[:2000]]
-    return float(np.median(KDTree(points).query(sample, k=2)[0][:, 1]))
+    return float(np.median(scipy.spatial.KDTree(points).query(sample, k=2)[0][:, 1]))

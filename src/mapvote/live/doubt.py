@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from mapvote.codec.ballot import Ballot, BallotTile, Odds, in_nats, unpack_planes
 from mapvote.core.extras import require
@@ -166,9 +166,9 @@ def doubtful_place(tile: BallotTile, lattice: Lattice, rule: DoubtRule = DOUBT_R
     flat = np.full(TILE_CELLS * TILE_CELLS, np.nan)
     flat[odds.cells] = in_nats(odds.steps)
     plane = flat.reshape(TILE_CELLS, TILE_CELLS)
-    group, count = ndimage.label(np.isfinite(plane), np.ones((3, 3)))
+    group, count = scipy.ndimage.label(np.isfinite(plane), np.ones((3, 3)))
     each = np.arange(1, count + 1)
-    middle = np.abs(ndimage.median(plane, group, each))
+    middle = np.abs(scipy.ndimage.median(plane, group, each))
     size = np.bincount(group.ravel(), minlength=count + 1)[1:]
     doubtful = (middle < math.log(rule.sure / (1.0 - rule.sure))) & (size >= rule.cells)
     if not doubtful.any():

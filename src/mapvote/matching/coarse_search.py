@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
-from scipy.spatial import KDTree
+import scipy
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.record import record
@@ -135,9 +134,9 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
     drawn = np.zeros((rows, cols))
     drawn[cells[:, 1] - low[1], cells[:, 0] - low[0]] = weight
     reach = int(np.ceil(np.hypot(tall[:, 0], tall[:, 1]).max() / cell_m)) + 1
-    shape = [fft.next_fast_len(side + 2 * reach, real=True) for side in drawn.shape]
-    spectrum = fft.rfft2(drawn, shape)
-    energy = fft.rfft2(drawn**2, shape)
+    shape = [scipy.fft.next_fast_len(side + 2 * reach, real=True) for side in drawn.shape]
+    spectrum = scipy.fft.rfft2(drawn, shape)
+    energy = scipy.fft.rfft2(drawn**2, shape)
     # The best places of each heading.
     ranked: list[tuple[float, float, float, float]] = []
     for yaw in np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws):
@@ -149,8 +148,8 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
         mask = np.zeros(shape)
         np.maximum.at(image, (row, col), tall[:, 2])
         mask[row, col] = 1.0
-        met = fft.irfft2(spectrum * np.conj(fft.rfft2(image, shape)), shape)
-        under = fft.irfft2(energy * np.conj(fft.rfft2(mask, shape)), shape)
+        met = scipy.fft.irfft2(spectrum * np.conj(scipy.fft.rfft2(image, shape)), shape)
+        under = scipy.fft.irfft2(energy * np.conj(scipy.fft.rfft2(mask, shape)), shape)
         score = met / np.sqrt(np.maximum(under, 0.05 * (image**2).sum()) * (image**2).sum())
         for k in np.argpartition(score.ravel(), -5)[-5:]:
             r, q = np.unravel_index(k, shape)
@@ -227,7 +226,7 @@ class _Standing:
     """Points of two clouds above their ground. Their distances tell a place from one like it better than distributions
     of a metre do, which also hold the ground at the feet of walls."""
 
-    a: KDTree
+    a: scipy.spatial.KDTree
     b: F64
     """(m, 3)."""
     near_m: float
@@ -237,7 +236,7 @@ class _Standing:
         a, b = (points[voxel_downsample(points, numbers.near_m)] for points in (points_a, points_b))
         b = b[stands(b, numbers)]
         sample = b[np.random.default_rng(0).permutation(len(b))[: numbers.sample]]
-        return cls(KDTree(a[stands(a, numbers)]), sample, numbers.near_m)
+        return cls(scipy.spatial.KDTree(a[stands(a, numbers)]), sample, numbers.near_m)
 
     def nearness(self, T_a_b: F64) -> float:
         """Mean over b's points of 1 - (distance / near_m)^2 to the nearest one of a, 0 beyond ``near_m``."""

@@ -38,10 +38,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, column_bits, rebased
@@ -264,7 +261,7 @@ def mirrored(points: F64, point_map: PointMap, road: F64 | None, numbers: Cleani
         above_each_other = road[np.unique(crossings(road))]
         if len(above_each_other):
             below = np.flatnonzero(out)
-            tree = cKDTree(above_each_other[:, :2])
+            tree = scipy.spatial.cKDTree(above_each_other[:, :2])
             out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=numbers.bridge_m)[0])
     return out
 
@@ -273,8 +270,8 @@ def _unbroken(ground_z: F32, numbers: Cleaning = CLEANING) -> Bool:
     """(rows, cols) cells around which the ground is known and has no step."""
     side = 2 * numbers.level_cells + 1
     measured = np.isfinite(ground_z)
-    highest = ndimage.maximum_filter(np.where(measured, ground_z, np.inf), side, mode="nearest")
-    lowest = ndimage.minimum_filter(np.where(measured, ground_z, -np.inf), side, mode="nearest")
+    highest = scipy.ndimage.maximum_filter(np.where(measured, ground_z, np.inf), side, mode="nearest")
+    lowest = scipy.ndimage.minimum_filter(np.where(measured, ground_z, -np.inf), side, mode="nearest")
     with np.errstate(invalid="ignore"):
         return np.asarray(highest - lowest <= numbers.below_m)
 
@@ -293,7 +290,7 @@ def _hardly_hit(points: F64, scans: I32, places: F64, numbers: Cleaning) -> Bool
     out = np.zeros(len(points), dtype=np.bool_)
     if not len(places):
         return out
-    tree = cKDTree(places[:, :2])
+    tree = scipy.spatial.cKDTree(places[:, :2])
     # Places near one point are near each other: voxels hit oftener than the largest number required are skipped.
     most = tree.query_ball_point(places[:, :2], 2.001 * numbers.near_m, return_length=True).max()
     tested = np.flatnonzero(scans < min(numbers.most_hits, numbers.hit_share * most))
@@ -420,8 +417,9 @@ def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice, numbers: 
     flat, at = np.unique((rows - rows.min()) * width + cols - cols.min(), return_inverse=True)
     top = np.full(len(flat), -np.inf)
     np.maximum.at(top, at, np.nan_to_num(height_m, nan=np.inf))
-    beside = cKDTree(np.column_stack([flat // width, flat % width])).query_pairs(1.5, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(flat), len(flat)))
-    group = connected_components(graph, directed=False)[1]
+    tree = scipy.spatial.cKDTree(np.column_stack([flat // width, flat % width]))
+    beside = tree.query_pairs(1.5, output_type="ndarray")
+    graph = scipy.sparse.coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(flat), len(flat)))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     passed = np.bincount(group, weights=np.bincount(at, weights=balance))[group] < 0
     return np.asarray((passed & (top < numbers.tall_m))[at])

@@ -18,9 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu, spsolve
-from scipy.spatial import cKDTree
+import scipy
 
 from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
 from mapvote.core.record import record
@@ -118,7 +116,7 @@ def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations:
     poses = T_map.copy()
     for _ in range(iterations):
         H, gradient = _normal_equations(poses, links, anchors)
-        step = -np.asarray(spsolve(H, gradient.ravel())).reshape(len(poses), 6)
+        step = -np.asarray(scipy.sparse.linalg.spsolve(H, gradient.ravel())).reshape(len(poses), 6)
         poses = poses @ exps(step)
         if np.abs(step).max(initial=0.0) < 1e-6:
             break
@@ -128,7 +126,7 @@ def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations:
 def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], chosen: I64) -> F64:
     """(k,) standard deviation of the positions of the poses ``chosen`` (k,), the largest over all directions."""
     H, _ = _normal_equations(T_map, links, anchors)
-    solve = splu(H).solve
+    solve = scipy.sparse.linalg.splu(H).solve
     out = []
     for i in chosen.tolist():
         unit = np.zeros((6 * len(T_map), 3))
@@ -137,7 +135,7 @@ def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], chos
     return np.array(out)
 
 
-def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[sparse.csc_matrix, F64]:
+def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[scipy.sparse.csc_matrix, F64]:
     """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step holds free poses."""
     n = len(poses)
     gradient = np.zeros((n, 6))
@@ -167,7 +165,7 @@ def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) ->
     row = np.broadcast_to(6 * first[:, None, None] + np.arange(6)[:, None], values.shape)
     col = np.broadcast_to(6 * second[:, None, None] + np.arange(6), values.shape)
     # Blocks that stand in the same place add up.
-    H = sparse.csc_matrix((values.ravel(), (row.ravel(), col.ravel())), shape=(6 * n, 6 * n))
+    H = scipy.sparse.csc_matrix((values.ravel(), (row.ravel(), col.ravel())), shape=(6 * n, 6 * n))
     return H, gradient
 
 
@@ -242,7 +240,7 @@ def carried_along(
     if np.array_equal(before, after):
         return points
     moved = after @ inverses(before)
-    tree = cKDTree(before[:, :3, 3])
+    tree = scipy.spatial.cKDTree(before[:, :3, 3])
     out = np.empty_like(points)
     for first in range(0, len(points), numbers.points_at_once):
         part = slice(first, first + numbers.points_at_once)
@@ -316,7 +314,7 @@ def _links(drives: Sequence[Drive], T: F64, placed: I64, piece_of: I64, numbers:
     order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
     consecutive = piece_of[placed[:-1]] == piece_of[placed[1:]]
     pairs = [(placed[:-1][consecutive], placed[1:][consecutive])]
-    tree = cKDTree(T[placed, :3, 3])
+    tree = scipy.spatial.cKDTree(T[placed, :3, 3])
     first = []
     second = []
     for j, near in zip(placed, tree.query_ball_point(T[placed, :3, 3], numbers.revisit_m), strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mapvote.core.types import F64
 from mapvote.formats.atomic import write_whole
@@ -33,5 +33,5 @@ def write_trajectory(file: Path, stamps_ns: Sequence[int], T_map_lidar: Sequence
 
 
 def _tum_line(stamp_ns: int, T: F64) -> str:
-    numbers = [*T[:3, 3], *Rotation.from_matrix(np.asarray(T[:3, :3])).as_quat()]
+    numbers = [*T[:3, 3], *scipy.spatial.transform.Rotation.from_matrix(np.asarray(T[:3, :3])).as_quat()]
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} " + " ".join(f"{number:.9f}" for number in numbers)
