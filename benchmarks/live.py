@@ -35,10 +35,10 @@ from mapvote.core.types import F64, I64, Bool, Drive, PosePrior, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.fixes import Fixes, fixes_of, prior_at
 from mapvote.formats.drives.frames import BASE_FRAME
+from mapvote.formats.drives.ros_types import CLOUD, ODOMETRY
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.dds import Network
-from mapvote.live.messages import CLOUD, ODOMETRY
 from mapvote.live.play import cloud_message, odometry_message, opened
 from mapvote.vehicle import Vehicle, vote_drive
 

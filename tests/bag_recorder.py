@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from mapvote.core.types import F64
-from mapvote.live.messages import CLOUD as CLOUD
-from mapvote.live.messages import TF
+from mapvote.formats.drives.ros_types import CLOUD as CLOUD
+from mapvote.formats.drives.ros_types import TF
 from mapvote.live.play import frames_message
 
 START = 1_700_000_000 * 10**9

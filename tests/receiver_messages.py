@@ -6,7 +6,8 @@ import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64
-from mapvote.live.messages import GNSS, IMU, TF, blank_message, header_of, pose_of, to_cdr
+from mapvote.formats.drives.ros_types import GNSS, IMU, TF
+from mapvote.live.messages import blank_message, header_of, pose_of, to_cdr
 
 
 def fix_message(ns: int, lonlat: F64, sigma_m: float | None = None, *, status: int = 0) -> bytes:

@@ -15,10 +15,11 @@ from live.test_ballot_messages import STREET, ballot
 from mapvote.codec.ballot import Ballot
 from mapvote.core.types import F64
 from mapvote.formats.drives.point_fields import point_cloud_table
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.live.ballot_messages import BallotTopic
 from mapvote.live.changes_topics import ChangesTopics
 from mapvote.live.dds import Network
-from mapvote.live.messages import CLOUD, from_cdr
+from mapvote.live.messages import from_cdr
 from mapvote.live.names import RosNames
 
 pytest.importorskip("cyclonedds")

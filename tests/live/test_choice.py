@@ -14,23 +14,11 @@ from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
+from mapvote.formats.drives.ros_types import CLOCK, CLOUD, GNSS, IMU, ODOMETRY, POSE, POSE_WITH_COVARIANCE, TF
 from mapvote.live import choice
 from mapvote.live.choice import Chosen, Voice, Waits, Wish, choose_topics
 from mapvote.live.dds import Network, PublishedTopic
-from mapvote.live.messages import (
-    CLOCK,
-    CLOUD,
-    GNSS,
-    IMU,
-    ODOMETRY,
-    POSE,
-    POSE_WITH_COVARIANCE,
-    TF,
-    blank_message,
-    header_of,
-    pose_of,
-    to_cdr,
-)
+from mapvote.live.messages import blank_message, header_of, pose_of, to_cdr
 from mapvote.live.names import RosNames, ros_names, sim_time_of
 from mapvote.live.play import cloud_message, frames_message, odometry_message
 from mapvote.live.service import Plan, prepare

@@ -12,9 +12,10 @@ import pytest
 from live.loopback_dds import LOOPBACK, own_domain, until
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.formats.drives.point_fields import LIVOX, scan_from_point_cloud2
+from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.ros_types import CLOUD, LIVOX, TF
 from mapvote.live.dds import Network, ros_type
-from mapvote.live.messages import CLOUD, READ, TF, blank_message, from_cdr, to_cdr
+from mapvote.live.messages import READ, blank_message, from_cdr, to_cdr
 from mapvote.live.play import cloud_message
 
 pytest.importorskip("cyclonedds")

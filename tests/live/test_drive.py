@@ -24,8 +24,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.formats.drives.frames import BASE_FRAME
+from mapvote.formats.drives.ros_types import CLOUD, GNSS, IMU, ODOMETRY, TF
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, TF
 from mapvote.live.play import cloud_message, frames_message, odometry_message
 from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
 from receiver_messages import fix_message, imu_message

@@ -12,8 +12,9 @@ from live.loopback_dds import until
 from live.test_dds import cloud
 from mapvote.core.sensors import SENSORS
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.live.dds import Network
-from mapvote.live.messages import CLOUD, from_cdr
+from mapvote.live.messages import from_cdr
 
 SOURCE = Path(__file__).with_name("fast_dds_talker.cpp")
 SENT = 20

@@ -14,9 +14,10 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.fixes import prior_at
 from mapvote.formats.drives.frames import Frames
+from mapvote.formats.drives.ros_types import GNSS, IMU, TF
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.fix_topics import FixMemory, FixTopics
-from mapvote.live.messages import GNSS, IMU, TF, from_cdr
+from mapvote.live.messages import from_cdr
 from mapvote.live.play import frames_message
 from receiver_messages import fix_message, imu_message
 

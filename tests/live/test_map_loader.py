@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from live.loopback_dds import until
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.point_fields import point_cloud_table
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.maps.autoware import check_followed, laid_version, lay_version
 from mapvote.formats.maps.cloud import Cloud
@@ -34,7 +35,7 @@ from mapvote.live.map_loader import (
     Cell,
     MapLoader,
 )
-from mapvote.live.messages import CLOUD, blank_message, from_cdr, to_cdr
+from mapvote.live.messages import blank_message, from_cdr, to_cdr
 from mapvote.live.parameters import NodeParameters
 
 

@@ -19,10 +19,11 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, MapvoteError, Scan
+from mapvote.formats.drives.ros_types import CLOUD, GNSS, IMU, ODOMETRY, TF
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.choice import Voice, Wish, choose_topics
 from mapvote.live.dds import Network
-from mapvote.live.messages import CLOUD, GNSS, IMU, ODOMETRY, TF, blank_message, header_of, to_cdr
+from mapvote.live.messages import blank_message, header_of, to_cdr
 from mapvote.live.names import ros_names
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import cloud_message, frames_message, odometry_message

@@ -9,7 +9,7 @@ import pytest
 
 from live.loopback_dds import LOOPBACK, until
 from mapvote.core.types import MapvoteError
-from mapvote.live.messages import CLOUD
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.live.ros_environment import ros_environment
 
 

@@ -19,8 +19,8 @@ from live.loopback_dds import until
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import Scan
+from mapvote.formats.drives.ros_types import CLOUD, ODOMETRY, TF
 from mapvote.live.choice import Voice, Wish, choose_topics
-from mapvote.live.messages import CLOUD, ODOMETRY, TF
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.subscriptions import Subscriptions
 

@@ -17,14 +17,14 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.formats.drives.compressed_cloud import COMPRESSED
 from mapvote.formats.drives.frames import matrix_of
 from mapvote.formats.drives.packets import direction_of
-from mapvote.formats.drives.point_fields import LIVOX, point_cloud_table
+from mapvote.formats.drives.point_fields import point_cloud_table
 from mapvote.formats.drives.point_times import TimeRules
+from mapvote.formats.drives.ros_types import CLOUD, COMPRESSED, LIVOX, ODOMETRY, TF
 from mapvote.live.choice import WAITS, Chosen, Voice, Waits, Wish, choose_topics, missing_for_drive
 from mapvote.live.dds import Network, PublishedTopic, TopicRate
-from mapvote.live.messages import CLOUD, ODOMETRY, TF, blank_message, cloud_of, from_cdr, to_cdr
+from mapvote.live.messages import blank_message, cloud_of, from_cdr, to_cdr
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, frames_message, odometry_message
 from mapvote.live.road_map import OneMap

@@ -12,10 +12,10 @@ import scipy
 from mapvote.core.types import F64, I64, Drive, MapvoteError
 from mapvote.doctor import Finding, Severity
 from mapvote.doctor.lidars import check_lidars
-from mapvote.formats.drives.bag import CLOUDS, Bag, frame_id, stamps_of, static_frames
-from mapvote.formats.drives.bag_poses import GNSS, POSES
+from mapvote.formats.drives.bag import Bag, frame_id, stamps_of, static_frames
 from mapvote.formats.drives.frames import T_from
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive, drive_options
+from mapvote.formats.drives.ros_types import CLOUDS, GNSS, POSES
 from mapvote.formats.drives.rosbag import T_base_lidars
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 

@@ -19,8 +19,9 @@ from mapvote.core.record import record
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, I8, U8, CellState
 from mapvote.core.voting import plurality
+from mapvote.formats.drives.ros_types import CLOUD, POSE
 from mapvote.live.mcap import FileMessage
-from mapvote.live.messages import CLOUD, MAP_FRAME, POSE, blank_message, cloud_of, header_of, to_cdr
+from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, header_of, to_cdr
 
 
 class BallotTopic(StrEnum):

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, one_of_each_cloud, republished, unread_format
+from mapvote.formats.drives.compressed_cloud import one_of_each_cloud, republished, unread_format
+from mapvote.formats.drives.ros_types import CLOUD, CLOUDS, COMPRESSED, GNSS, IMU, ODOMETRY, POSES, TF
 from mapvote.live.dds import Network, PublishedTopic, Subscription, TopicRate
-from mapvote.live.messages import CLOUD, CLOUDS, GNSS, IMU, ODOMETRY, POSE_TOPIC, POSES, TF
+from mapvote.live.messages import POSE_TOPIC
 from mapvote.live.names import RosNames
 
 

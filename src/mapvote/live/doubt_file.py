@@ -21,8 +21,9 @@ import numpy as np
 from mapvote.core.geometry import transform
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, MapvoteError
+from mapvote.formats.drives.ros_types import CLOUD, TF
 from mapvote.live.mcap import HIDDEN, FileMessage, write_mcap
-from mapvote.live.messages import CLOUD, LIDAR_FRAME, MAP_FRAME, TF, cloud_of, to_cdr
+from mapvote.live.messages import LIDAR_FRAME, MAP_FRAME, cloud_of, to_cdr
 from mapvote.live.play import frames_message
 
 

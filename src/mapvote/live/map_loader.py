@@ -30,13 +30,14 @@ import numpy as np
 
 from mapvote.core.record import record
 from mapvote.core.types import F32, MapvoteError
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.formats.listing import plain_name
 from mapvote.formats.maps.autoware import METADATA, TILES, check_followed
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.pcd import stream_pcd
 from mapvote.formats.reading import first_line, read_yaml
 from mapvote.live.dds import Network, Publication, Subscription
-from mapvote.live.messages import CLOUD, MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
+from mapvote.live.messages import MAP_FRAME, blank_message, cloud_of, from_cdr, header_of, to_cdr
 from mapvote.live.parameters import NodeParameters, Value
 
 log = logging.getLogger("mapvote.live")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
-from mapvote.formats.drives.point_fields import LIVOX
+from mapvote.formats.drives.compressed_cloud import definition_of_compressed
+from mapvote.formats.drives.ros_types import COMPRESSED, LIVOX
 
 
 def lacking_types() -> dict[str, str]:

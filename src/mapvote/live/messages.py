@@ -16,22 +16,13 @@ from numpy.typing import NDArray
 
 from mapvote.core.extras import require
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.drives.compressed_cloud import COMPRESSED
-from mapvote.formats.drives.point_fields import LIVOX, livox_table, serialised_frame, serialised_stamp_ns
+from mapvote.formats.drives.point_fields import livox_table, serialised_frame, serialised_stamp_ns
+from mapvote.formats.drives.ros_types import CLOCK, CLOUD, CLOUDS, GNSS, IMU, LIVOX, ODOMETRY, TF
 from mapvote.formats.reading import first_line
 from mapvote.live.message_types import lacking_types
 
-CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
-POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSES = (ODOMETRY, POSE_WITH_COVARIANCE, POSE)
-"""Types of topics that say where a vehicle is."""
 POSE_TOPIC = "mapvote/pose"
 """Where a vehicle publishes its own pose, below its namespace."""
-CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
-"""Types of topics that hold the points of a LiDAR."""
-CLOCK = "rosgraph_msgs/msg/Clock"
-GNSS = "sensor_msgs/msg/NavSatFix"
-IMU = "sensor_msgs/msg/Imu"
 READ = {*CLOUDS, ODOMETRY, TF, IMU, GNSS, "std_msgs/msg/Header", CLOCK}
 READ |= {f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")}
 READ |= {

@@ -22,20 +22,9 @@ from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.bag import Bag, is_rosbag
 from mapvote.formats.drives.frames import BASE_FRAME
+from mapvote.formats.drives.ros_types import CLOUD, ODOMETRY, TF
 from mapvote.live.dds import Network, Publication
-from mapvote.live.messages import (
-    CLOUD,
-    LIDAR_FRAME,
-    MAP_FRAME,
-    ODOMETRY,
-    READ,
-    TF,
-    blank_message,
-    cloud_of,
-    header_of,
-    pose_of,
-    to_cdr,
-)
+from mapvote.live.messages import LIDAR_FRAME, MAP_FRAME, READ, blank_message, cloud_of, header_of, pose_of, to_cdr
 
 
 @record()

@@ -10,8 +10,9 @@ import numpy as np
 from mapvote.core.extras import require
 from mapvote.core.types import MapvoteError
 from mapvote.formats.drives.point_fields import point_cloud_table
+from mapvote.formats.drives.ros_types import CLOUD
 from mapvote.live.ballot_messages import BallotTopic, Stamped
-from mapvote.live.messages import CLOUD, from_cdr
+from mapvote.live.messages import from_cdr
 
 
 def write_rrd(path: Path, messages: Sequence[Stamped]) -> None:

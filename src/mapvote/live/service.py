@@ -15,10 +15,10 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.drives.frames import is_map_frame
+from mapvote.formats.drives.ros_types import TF
 from mapvote.live.choice import Voice
 from mapvote.live.doubt import DoubtKeeper
 from mapvote.live.drive import Counts, FirstSeconds, LiveDrive
-from mapvote.live.messages import TF
 from mapvote.live.outbox import Outbox
 from mapvote.live.road_map import Maps
 from mapvote.live.subscriptions import Subscriptions

@@ -21,9 +21,10 @@ from mapvote.core.geometry import inverse
 from mapvote.core.kernel import call_while_compiling
 from mapvote.core.record import record
 from mapvote.core.types import MapvoteError
+from mapvote.formats.drives.ros_types import POSE_WITH_COVARIANCE
 from mapvote.live.dds import Network, Publication
 from mapvote.live.drive import Counts, LiveDrive
-from mapvote.live.messages import POSE_TOPIC, POSE_WITH_COVARIANCE, blank_message, header_of, pose_of, to_cdr
+from mapvote.live.messages import POSE_TOPIC, blank_message, header_of, pose_of, to_cdr
 from mapvote.live.outbox import Outbox, OutboxReport
 from mapvote.live.road_map import Maps, RoadMap
 from mapvote.live.subscriptions import Subscriptions

@@ -21,6 +21,7 @@ from mapvote.formats.drives.frames import BASE_FRAME, Frames, is_map_frame, matr
 from mapvote.formats.drives.packets import scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, scan_from_point_cloud2
 from mapvote.formats.drives.point_times import TimeRules
+from mapvote.formats.drives.ros_types import CLOCK, CLOUD, GNSS, IMU, POSES, TF
 from mapvote.formats.drives.sensor_estimate import (
     RING_RULE,
     UNKNOWN_SENSOR,
@@ -34,7 +35,7 @@ from mapvote.live.dds import Network, PublishedTopic, Subscription
 from mapvote.live.drive import WaitingScan
 from mapvote.live.fix_topics import FixTopics
 from mapvote.live.log_lines import Repeated
-from mapvote.live.messages import CLOCK, CLOUD, GNSS, IMU, MAP_FRAME, POSES, TF, from_cdr, header_of, stamp_ns, time_ns
+from mapvote.live.messages import MAP_FRAME, from_cdr, header_of, stamp_ns, time_ns
 from mapvote.live.names import RosNames
 from mapvote.live.sweeps import Cloud, Revolutions, Sweeps
 

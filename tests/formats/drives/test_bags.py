@@ -19,8 +19,9 @@ from mapvote.core.types import F32, MapvoteError, PosePrior, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.drives.bag import Bag, NextMessages, stamps_of
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.ros_types import GNSS, IMU, ODOMETRY, TF
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.messages import GNSS, IMU, ODOMETRY, TF, blank_message, from_cdr, header_of, to_cdr
+from mapvote.live.messages import blank_message, from_cdr, header_of, to_cdr
 from mapvote.live.play import cloud_message, odometry_message
 from mapvote.live.sweeps import Cloud, Revolutions
 from receiver_messages import fix_message, imu_message, moving_frame

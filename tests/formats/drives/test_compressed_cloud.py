@@ -15,8 +15,9 @@ from bag_recorder import CLOUD, START, Recorder
 from mapvote.codec.planes import zstd
 from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed, one_of_each_cloud
+from mapvote.formats.drives.compressed_cloud import definition_of_compressed, one_of_each_cloud
 from mapvote.formats.drives.point_fields import point_cloud_table
+from mapvote.formats.drives.ros_types import COMPRESSED
 from mapvote.live.choice import Wish, lack_of_clouds
 from mapvote.live.dds import PublishedTopic
 from mapvote.live.messages import blank_message, cloud_of, from_cdr, to_cdr

@@ -16,20 +16,11 @@ from mapvote.core.extras import require
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.drives.bag_files import bag_files, is_bag, is_bag_without_metadata, mend_of
-from mapvote.formats.drives.compressed_cloud import COMPRESSED, definition_of_compressed
+from mapvote.formats.drives.compressed_cloud import definition_of_compressed
 from mapvote.formats.drives.frames import Edges, pose_of_message
-from mapvote.formats.drives.point_fields import (
-    LIVOX,
-    livox_table,
-    point_cloud_table,
-    serialised_frame,
-    serialised_stamp_ns,
-)
+from mapvote.formats.drives.point_fields import livox_table, point_cloud_table, serialised_frame, serialised_stamp_ns
+from mapvote.formats.drives.ros_types import COMPRESSED, LIVOX, TF
 from mapvote.formats.reading import first_line
-
-CLOUD = "sensor_msgs/msg/PointCloud2"
-CLOUDS = (CLOUD, *LIVOX, COMPRESSED)
-TF = "tf2_msgs/msg/TFMessage"
 
 
 def is_rosbag(path: Path) -> bool:

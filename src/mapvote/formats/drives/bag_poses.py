@@ -12,18 +12,15 @@ import msgspec
 import numpy as np
 
 from mapvote.core.types import F64, I64, MapvoteError
-from mapvote.formats.drives.bag import TF, Bag, frame_id, matrix_in, static_frames
+from mapvote.formats.drives.bag import Bag, frame_id, matrix_in, static_frames
 from mapvote.formats.drives.fixes import Fixes, antenna_lever, fixes_of, heading_of_imu
 from mapvote.formats.drives.frames import BASE_FRAME, BodyPose, Frames, T_from, is_map_frame
 from mapvote.formats.drives.options import DriveOptions, beside, map_frame
 from mapvote.formats.drives.point_fields import log, stamp_of
+from mapvote.formats.drives.ros_types import GNSS, IMU, POSES, TF
 from mapvote.formats.drives.stamp_order import StampOrder, in_order_of_stamps
 from mapvote.formats.drives.trajectory import Prior, Trajectory, prior_of
 from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, sound_fixes, yaw_from_track
-
-POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-GNSS = ("sensor_msgs/msg/NavSatFix",)
-IMU = "sensor_msgs/msg/Imu"
 
 
 class Poses(NamedTuple):
@@ -45,7 +42,7 @@ def choose_poses(bag: Bag, options: DriveOptions, cloud: str, mount: F64 | None)
     topic = options.prior
     if topic is None and options.as_live and not (beside(bag.path) / "prior.txt").is_file():
         topic = _only_topic_of_poses(bag)
-    if topic in bag.topics(*GNSS):
+    if topic in bag.topics(GNSS):
         return _poses_of_fixes(bag, topic, frame_id(bag, cloud), mount)
     if topic in bag.topics(TF):
         return _poses_of_frames(bag, options, topic, frame_id(bag, cloud), mount)
@@ -96,11 +93,11 @@ def _poses_of_frames(bag: Bag, options: DriveOptions, topic: str, lidar: str, mo
 def prior_of_bag(bag: Bag, options: DriveOptions, stamps_ns: I64, poses: Poses) -> Prior:
     """The prior of every scan from a topic or a file."""
     topic = poses.topic
-    pose_topics = bag.topics(*POSES, *GNSS, TF)
+    pose_topics = bag.topics(*POSES, GNSS, TF)
     if topic is not None and topic.startswith("/") and topic not in pose_topics and not Path(topic).is_file():
         raise MapvoteError(f"{bag.path}: no pose topic {topic}; topics with poses: {', '.join(pose_topics) or 'none'}")
     frame = map_frame(options)
-    if topic in bag.topics(*GNSS) and options.prior is None and frame is None:
+    if topic in bag.topics(GNSS) and options.prior is None and frame is None:
         log.warning("%s: %s is not used: the place of the map on Earth is unknown (import --crs)", bag.path, topic)
         return Prior()
 
@@ -124,7 +121,7 @@ def _only_topic_of_poses(bag: Bag) -> str | None:
     """The only Odometry that holds messages, else the only other topic of poses, else the only one of fixes, else the
     frames that move; None, and a word, if there are several."""
     own = "/mapvote/pose"  # the pose that a live drive published is no prior
-    for kinds in (POSES[:1], POSES[1:], GNSS):
+    for kinds in (POSES[:1], POSES[1:], (GNSS,)):
         named = [topic for topic, n in bag.topics(*kinds).items() if n and topic != own]
         if len(named) > 1:
             log.warning("%s: several topics of poses, none is used; --prior chooses: %s", bag.path, ", ".join(named))
@@ -136,7 +133,7 @@ def _only_topic_of_poses(bag: Bag) -> str | None:
 def _trajectory(bag: Bag, topic: str, frame: MapFrame | None, lidar: str) -> Trajectory:
     """T_map_base of a topic of poses, of moving frames, or of GNSS fixes in the frame of the map; fixes head where the
     vehicle drives."""
-    if topic in bag.topics(*GNSS):
+    if topic in bag.topics(GNSS):
         return _fixes(bag, topic, frame)
     stamps: list[int] = []
     received: list[int] = []

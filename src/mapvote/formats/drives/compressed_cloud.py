@@ -12,8 +12,7 @@ from typing import Any
 
 from mapvote.codec.planes import zstd
 from mapvote.core.types import MapvoteError
-
-COMPRESSED = "point_cloud_interfaces/msg/CompressedPointCloud2"
+from mapvote.formats.drives.ros_types import COMPRESSED
 
 
 def definition_of_compressed() -> str:

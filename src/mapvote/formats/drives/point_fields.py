@@ -54,12 +54,6 @@ class PointRule:
 
 POINT_RULE = PointRule()
 _AZIMUTHS_AT_ONCE = 512
-LIVOX = (
-    "livox_ros_driver2/msg/CustomMsg",
-    "livox_ros_driver/msg/CustomMsg",
-    "livox_interfaces/msg/CustomMsg",
-)
-"""Clouds of Livox's three drivers, all of one definition: decoded points, each with its time."""
 _POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's types of numbers."""
 

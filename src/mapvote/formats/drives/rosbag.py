@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.drives.bag import CLOUD, CLOUDS, Bag, NextMessages, frame_id, stamps_of, static_frames
+from mapvote.formats.drives.bag import Bag, NextMessages, frame_id, stamps_of, static_frames
 from mapvote.formats.drives.bag_files import mend_of
 from mapvote.formats.drives.bag_poses import choose_poses, prior_of_bag
 from mapvote.formats.drives.compressed_cloud import one_of_each_cloud
@@ -24,6 +24,7 @@ from mapvote.formats.drives.frames import T_from, two_frames
 from mapvote.formats.drives.options import DriveOptions, make_drive, read_mount, step_of
 from mapvote.formats.drives.packets import PACKET_RULE, SWEEP_RULE, Packets, direction_of, scan_of_packets
 from mapvote.formats.drives.point_fields import PointReader, log, tell_without_points
+from mapvote.formats.drives.ros_types import CLOUD, CLOUDS
 from mapvote.formats.drives.stamp_order import in_order_of_stamps
 
 
