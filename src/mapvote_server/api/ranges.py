@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import BinaryIO
 
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from mapvote_server.api.etags import has_already
 from mapvote_server.api.problems import refuse
@@ -54,16 +55,27 @@ def answer_part(request: Request, file: BinaryIO, size: int, tag: str, media_typ
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     status = 200 if part is None else 206
-    return StreamingResponse(_pieces(file, sent), status, headers, media_type)
+    return _PartOfFile(file, _pieces(file, sent), status, headers, media_type)
+
+
+class _PartOfFile(StreamingResponse):
+    """Closes its file however the answer ends: also where the client goes, or asked for the headers alone."""
+
+    def __init__(
+        self, file: BinaryIO, pieces: Iterator[bytes], status: int, headers: Mapping[str, str], media_type: str
+    ) -> None:
+        super().__init__(pieces, status, headers, media_type)
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self._file:
+            await super().__call__(scope, receive, send)
 
 
 def _pieces(file: BinaryIO, sent: range) -> Iterator[bytes]:
-    with file:
-        file.seek(sent.start)
-        left = len(sent)
-        while left:
-            piece = file.read(min(left, 1 << 18))
-            left -= len(piece)
-            if not left:  # nobody asks for more once the last byte is sent
-                file.close()
-            yield piece
+    file.seek(sent.start)
+    left = len(sent)
+    while left:
+        piece = file.read(min(left, 1 << 18))
+        left -= len(piece)
+        yield piece
