@@ -15,7 +15,15 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, MapvoteError
-from mapvote.rules.packed_tiles import COUNT_PLANES, PackedTiles, Shelf, TilePacking, add_one, count_of
+from mapvote.rules.packed_tiles import (
+    COUNT_PLANES,
+    TILE_PACKING,
+    PackedTiles,
+    Shelf,
+    TilePacking,
+    add_one,
+    count_of,
+)
 from mapvote.rules.surfaces import SurfaceVoter
 from mapvote.rules.voxel_counts import CROSSED, HIT, PASSED, PASSES
 
@@ -48,7 +56,7 @@ def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
     for seed, (tile, share) in enumerate(shares.items()):
         tiles.near(tile)[:] = some_planes(seed, share)
     far = Grid(LATTICE, 5000, 5000, 100, 100)
-    for _ in shares:
+    for _ in range(TILE_PACKING.bands):
         tiles.leave(far)
     assert not tiles._open
     assert set(tiles) == set(shares)
@@ -65,8 +73,22 @@ def test_a_tile_is_left_only_when_the_view_is_far_from_it() -> None:
     for col in (100, 256, 256 + 63):
         tiles.leave(Grid(LATTICE, 0, col, 100, 100))
         assert list(tiles._open) == [(0, 0)]
-    tiles.leave(Grid(LATTICE, 0, 256 + 64, 100, 100))
+    for _ in range(TILE_PACKING.bands):
+        tiles.leave(Grid(LATTICE, 0, 256 + 64, 100, 100))
     assert not tiles._open
+
+
+def test_what_is_counted_while_a_tile_is_being_packed_is_kept() -> None:
+    tiles = PackedTiles(LATTICE, 16)
+    far = Grid(LATTICE, 5000, 5000, 100, 100)
+    tiles.near((0, 0))[:] = some_planes(1, 0.01)
+    for _ in range(TILE_PACKING.bands - 1):
+        tiles.leave(far)
+    tiles.near((0, 0))[:] = some_planes(2, 0.01)
+    for _ in range(TILE_PACKING.bands):
+        tiles.leave(far)
+    assert not tiles._open
+    np.testing.assert_array_equal(tiles[0, 0], some_planes(2, 0.01))
 
 
 def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:

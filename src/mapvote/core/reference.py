@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
-from itertools import repeat
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
 
-from mapvote.core.columns import base_layers, fill_columns
+from mapvote.core.columns import fill_base, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, U64, Reference
@@ -28,24 +28,35 @@ def _finished(layout: Layout) -> Reference:
 
 
 def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
+    # Ground and free space, tile by tile: reading a tile may unpack it.
     ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
     free = np.zeros(grid.shape, dtype=np.uint64)
-    tiles = [point_map.tiles[index] for index in grid.tiles() if index in point_map.tiles]
-    for tile in tiles:
+    tiles = []
+    for index in grid.tiles():
+        if index not in point_map.tiles:
+            continue
+        yield None
+        tile = point_map.tiles[index]
+        tiles.append(tile)
         common = tile.window.intersection(grid)
         ground_z[common.slices_in(grid)] = tile.ground_z[common.slices_in(tile.window)]
         if tile.free is not None:
             free[common.slices_in(grid)] = tile.free[common.slices_in(tile.window)]
-    yield None
-    base = base_layers(ground_z)
-    yield None
+    # The start of each column: by the tile alone where it has ground, so that every editor of the tile reads the words
+    # as they were written.
+    base = np.zeros(grid.shape, dtype=np.int32)
+    for _ in fill_base(ground_z, base):
+        yield None
     for tile in tiles:
-        if tile.has_ground:  # by the tile alone, so that every editor of the tile reads the words as they were written
+        if tile.has_ground:
             common = tile.window.intersection(grid)
             base[common.slices_in(grid)] = tile.base[common.slices_in(tile.window)]
+            yield None
+    # The obstacles in each column. Each plane is a step of its own: the system gives its pages in milliseconds.
     occupied = np.zeros(grid.shape, dtype=np.uint64)
     counts = np.zeros(grid.shape, dtype=np.int32)
     bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
+    yield None
     top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
     for tile in tiles:
         yield None
@@ -77,9 +88,12 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
 class LocalMap:
     """The reference around a moving vehicle: arrays over the tiles around it, made anew only when it has left them.
 
-    The next one is made step by step, one step per call, while the vehicle drives through the tile
-    that will be its middle.
+    The next one is made step by step while the vehicle drives through the tile that will be its middle: so many steps
+    per call as the cells that it drove, so that it is there when the vehicle is half a tile farther, at any speed.
     """
+
+    CELLS_PER_STEP = 2
+    """A layout has 30 to 100 steps, more where more tiles lie around."""
 
     def __init__(self, point_map: PointMap, window_m: float) -> None:
         self.point_map = point_map
@@ -89,6 +103,8 @@ class LocalMap:
         self._middle: TileIndex | None = None
         self._next: tuple[TileIndex, Layout] | None = None
         """Another middle, and its planes on their way."""
+        self._place = 0, 0
+        """Row and column of the last call."""
 
     def at(self, origin_map: F64) -> tuple[Reference, Reference]:
         """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
@@ -103,8 +119,10 @@ class LocalMap:
             self._next = None
         elif middle != self._middle:
             ahead = self._ahead(middle, window)
-            done = next(ahead)
+            driven = max(abs(row - self._place[0]), abs(col - self._place[1]))
+            done = next(filter(None, islice(ahead, 1 + driven // self.CELLS_PER_STEP)), None)
             self._next = middle, ahead if done is None else repeat(done)
+        self._place = row, col
         return _cut(self.outer, window), self.outer
 
     def _ahead(self, middle: TileIndex, window: Grid) -> Layout:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import mmap
 import tempfile
 import weakref
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -40,6 +41,9 @@ class TilePacking:
     """Level of compression: tiles are packed while driving, and read once or twice."""
     far_cells: int = 64
     """Cells between a tile and the view at which the tile is packed: a vehicle that turns round comes back to it."""
+    bands: int = 16
+    """Bands of rows of a tile, one of which is packed for each scan: a tile at once would take as long as several
+    scans."""
 
 
 TILE_PACKING = TilePacking()
@@ -100,7 +104,9 @@ class PackedTiles(Mapping[TileIndex, U64]):
         self.packing = packing
         self._open: dict[TileIndex, U64] = {}
         self._shelf = Shelf(packing)
-        self._packed = dict[TileIndex, Slot]()
+        self._leaving = defaultdict[TileIndex, list[Slot]](list)
+        """Open tiles that lie far away, and those of their bands that are packed already."""
+        self._packed = dict[TileIndex, list[Slot]]()
 
     def __getitem__(self, tile: TileIndex) -> U64:
         return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile], self._new())
@@ -117,6 +123,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
     def near(self, tile: TileIndex) -> U64:
         """The planes of a tile, to be changed in place; zeros if there were none."""
+        self._leaving.pop(tile, None)
         if tile not in self._open:
             packed = self._packed.pop(tile, None)
             planes = self._new()
@@ -130,15 +137,18 @@ class PackedTiles(Mapping[TileIndex, U64]):
         return Overlap(rows.start, rows.stop, cols.start, cols.stop, view.row0 - window.row0, view.col0 - window.col0)
 
     def leave(self, view: Grid) -> None:
-        """Pack one tile that lies far from ``view``, if there is any: for every scan, so that none has it all."""
+        """Pack a band of each tile that lies far from ``view``: for every scan, so that none has it all."""
         around = view.padded(self.packing.far_cells)
-        for tile, planes in self._open.items():
+        for tile, planes in list(self._open.items()):
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
-                self._packed[tile] = self._shelf.put(_packed(planes, self.packing.zstd_level))
-                del self._open[tile]
-                give_back_free_pages()
-                return
+                bands = self._leaving[tile]
+                band = planes.reshape(self.packing.bands, -1, self.words)[len(bands)]
+                bands.append(self._shelf.put(_packed(band, self.packing.zstd_level)))
+                if len(bands) == self.packing.bands:
+                    self._packed[tile] = self._leaving.pop(tile)
+                    del self._open[tile]
+                    give_back_free_pages()
 
     def _new(self) -> U64:
         """Zeros in pages of their own. The system gives each page at its first count, and takes all back once the tile
@@ -146,22 +156,24 @@ class PackedTiles(Mapping[TileIndex, U64]):
         pages = mmap.mmap(-1, 8 * CELLS * self.words)
         return np.frombuffer(pages, np.uint64).reshape(TILE_CELLS, TILE_CELLS, self.words)
 
-    def _unpacked(self, place: Slot, planes: U64) -> U64:
+    def _unpacked(self, bands: list[Slot], planes: U64) -> U64:
         """``planes``, which come empty, with the packed words."""
-        data = self._shelf.read(place)
-        raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
-        cells, *words = raw.reshape(self.words + 1, -1)
-        planes.reshape(CELLS, self.words)[cells.astype(np.int64)] = np.stack(words, axis=1)
+        cells_of_band = CELLS // self.packing.bands
+        for place, band in zip(bands, planes.reshape(self.packing.bands, cells_of_band, self.words), strict=True):
+            data = self._shelf.read(place)
+            raw = np.frombuffer(unpack_bytes(data, cells_of_band * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
+            cells, *words = raw.reshape(self.words + 1, -1)
+            band[cells.astype(np.int64)] = np.stack(words, axis=1)
         return planes
 
 
-def _packed(planes: U64, zstd_level: int) -> bytes:
-    """The cells in which anything was counted, and their words plane by plane: most of the higher ones are empty."""
-    flat = planes.reshape(CELLS, -1)
-    cells = np.flatnonzero(flat.any(axis=1))
-    out = np.empty((flat.shape[1] + 1, len(cells)), np.uint64)
+def _packed(band: U64, zstd_level: int) -> bytes:
+    """Of a band (cells, words) the cells in which anything was counted, and their words plane by plane: most of the
+    higher ones are empty."""
+    cells = np.flatnonzero(band.any(axis=1))
+    out = np.empty((band.shape[1] + 1, len(cells)), np.uint64)
     out[0] = cells
-    out[1:] = flat[cells].T
+    out[1:] = band.take(cells, axis=0).T
     return compress(out.data, zstd_level)
 
 
