@@ -150,28 +150,22 @@ def _enter_cells(
         flat[i] = min(max(row, 0), rows - 1) * cols + min(max(col, 0), cols - 1)
 
 
-GENTLE_SLOPE = 0.02
-"""Grade by which unknown ground is at most expected to fall away from known ground."""
-BAND_ROWS = 64
-"""Rows that :func:`fill_base` works out in one step: some tenths of a millisecond for a window of three tiles."""
-
-
 def base_layers(ground_z: F32) -> I32:
     """(rows, cols) lattice layer of bit 0: floor(ground_z / 0.3), unknown cells filled from the nearest known one."""
     base = np.zeros(ground_z.shape, dtype=np.int32)
-    for _ in fill_base(ground_z, base):
+    for _ in fill_base(ground_z, base, len(base)):
         pass
     return base
 
 
-def fill_base(ground_z: F32, base: I32) -> Iterator[None]:
-    """Enter :func:`base_layers` into ``base`` (rows, cols), which come as zeros, in steps of BAND_ROWS rows."""
+def fill_base(ground_z: F32, base: I32, band_rows: int) -> Iterator[None]:
+    """Enter :func:`base_layers` into ``base`` (rows, cols), which come as zeros, in steps of ``band_rows`` rows."""
     if not np.isfinite(ground_z).any():
         return
     rows = len(ground_z)
     low = np.empty(ground_z.shape, dtype=np.float64)
-    slope = GENTLE_SLOPE * CELL_SIZE
-    bands = [(first, min(first + BAND_ROWS, rows)) for first in range(0, rows, BAND_ROWS)]
+    slope = 0.02 * CELL_SIZE
+    bands = [(first, min(first + band_rows, rows)) for first in range(0, rows, band_rows)]
     for first, end in bands:
         own = ground_z[first:end]
         low[first:end] = np.where(np.isfinite(own), own, np.inf)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from itertools import islice, repeat
 from typing import Any
 
@@ -12,22 +12,38 @@ import numpy as np
 from mapvote.core.columns import fill_base, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.point_map import PointMap
+from mapvote.core.record import record
 from mapvote.core.types import F64, U64, Reference
 
 Layout = Iterator[Reference | None]
 """The planes of a window on their way: each step takes a few milliseconds at most, the last one gives them."""
 
 
+@record()
+@dataclass(frozen=True, slots=True)
+class LayoutSteps:
+    """Numbers of the laying-out of planes, which is spread over scans."""
+
+    band_rows: int = 64
+    """Rows of the start of columns in a step: some tenths of a millisecond for a window of three tiles."""
+    cells: int = 2
+    """Cells that the vehicle drives for each step after the first of a scan. A layout has 30 to 100 steps, more where
+    more tiles lie around."""
+
+
+LAYOUT_STEPS = LayoutSteps()
+
+
 def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
-    return _finished(_laid_out(point_map, grid))
+    return _finished(_laid_out(point_map, grid, grid.rows))
 
 
 def _finished(layout: Layout) -> Reference:
     return next(filter(None, layout))
 
 
-def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
+def _laid_out(point_map: PointMap, grid: Grid, band_rows: int) -> Layout:
     # Ground and free space, tile by tile: reading a tile may unpack it.
     ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
     free = np.zeros(grid.shape, dtype=np.uint64)
@@ -45,7 +61,7 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
     # The start of each column: by the tile alone where it has ground, so that every editor of the tile reads the words
     # as they were written.
     base = np.zeros(grid.shape, dtype=np.int32)
-    for _ in fill_base(ground_z, base):
+    for _ in fill_base(ground_z, base, band_rows):
         yield None
     for tile in tiles:
         if tile.has_ground:
@@ -92,12 +108,10 @@ class LocalMap:
     per call as the cells that it drove, so that it is there when the vehicle is half a tile farther, at any speed.
     """
 
-    CELLS_PER_STEP = 2
-    """A layout has 30 to 100 steps, more where more tiles lie around."""
-
-    def __init__(self, point_map: PointMap, window_m: float) -> None:
+    def __init__(self, point_map: PointMap, window_m: float, steps: LayoutSteps = LAYOUT_STEPS) -> None:
         self.point_map = point_map
         self.window_m = window_m
+        self.steps = steps
         self.outer: Reference | None = None
         """The planes made last; windows are views into them."""
         self._middle: TileIndex | None = None
@@ -120,7 +134,7 @@ class LocalMap:
         elif middle != self._middle:
             ahead = self._ahead(middle, window)
             driven = max(abs(row - self._place[0]), abs(col - self._place[1]))
-            done = next(filter(None, islice(ahead, 1 + driven // self.CELLS_PER_STEP)), None)
+            done = next(filter(None, islice(ahead, 1 + driven // self.steps.cells)), None)
             self._next = middle, ahead if done is None else repeat(done)
         self._place = row, col
         return _cut(self.outer, window), self.outer
@@ -128,7 +142,8 @@ class LocalMap:
     def _ahead(self, middle: TileIndex, window: Grid) -> Layout:
         if self._next is not None and self._next[0] == middle:
             return self._next[1]
-        return _laid_out(self.point_map, self.point_map.lattice.tile(middle).padded(max(TILE_CELLS, window.rows)))
+        around = self.point_map.lattice.tile(middle).padded(max(TILE_CELLS, window.rows))
+        return _laid_out(self.point_map, around, self.steps.band_rows)
 
 
 def _cut(outer: Reference, window: Grid) -> Reference:
