@@ -168,7 +168,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
 
 def _packed(band: U64, zstd_level: int) -> bytes:
-    """Of a band (cells, words) the cells in which anything was counted, and their words plane by plane: most of the
+    """The cells of a band (cells, words) in which anything was counted, and their words plane by plane: most of the
     higher ones are empty."""
     cells = np.flatnonzero(band.any(axis=1))
     out = np.empty((band.shape[1] + 1, len(cells)), np.uint64)
