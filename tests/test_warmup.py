@@ -69,6 +69,32 @@ def test_once_warmed_up_no_verb_compiles_anything(tmp_path: Path) -> None:
     assert not run("update", "map", "v1.ballot", "v2.ballot", "--out", "map_2")
 
 
+MARKED = """
+from mapvote.warmup import compiled_mark, leave_mark
+print(compiled_mark().exists())
+leave_mark()
+assert compiled_mark().exists()
+"""
+
+
+def test_kernels_are_known_to_be_compiled_until_a_source_changes(tmp_path: Path) -> None:
+    """The demo asks, instead of running through everything that may have to be compiled."""
+    installed = shutil.copytree(SOURCES, tmp_path / "mapvote", ignore=shutil.ignore_patterns("__pycache__"))
+    kernels = tmp_path / "kernels"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(kernels)}
+
+    def marked_before() -> str:
+        done = subprocess.run([sys.executable, "-c", MARKED], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert [marked_before(), marked_before()] == ["False", "True"]
+    with (installed / "matching" / "ndt.py").open("a") as source:
+        source.write("# another line\n")
+    assert marked_before() == "False"
+    assert len(list(kernels.rglob("compiled-*"))) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cache", ["the user's", "the temporary folder's, where there is no home"])
 def test_a_read_only_install_keeps_its_kernels_in_a_cache(tmp_path: Path, cache: str) -> None:

@@ -88,6 +88,7 @@ class PictureSizes:
 
 
 PICTURE_SIZES = PictureSizes()
+_DPI = 140
 _FONT = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
@@ -124,7 +125,20 @@ def save(figure: Figure, path: Path, format: Format = "png") -> None:
     undated = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
     fixed = {"svg.hashsalt": "mapvote", "svg.fonttype": "none", "pdf.fonttype": 42}
     with matplotlib.rc_context(_FONT | fixed), whole_file(path) as partial:
-        figure.savefig(partial, format=format, dpi=140, metadata=undated[format])
+        options: dict[str, Any] = {"dpi": _DPI, "metadata": undated[format]}
+        if format == "png":
+            _lay_out(figure)
+            options["pil_kwargs"] = {"compress_level": 3}  # a twentieth larger than by 6, in two thirds of the time
+        figure.savefig(partial, format=format, **options)
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place the axes by the layout engine alone: ``savefig`` would draw all images and points once more for that."""
+    figure.set_dpi(_DPI)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
 
 
 def draw_survey(drives: Sequence[Drive], report: BuildReport, path: Path, sizes: PictureSizes = PICTURE_SIZES) -> None:

@@ -6,8 +6,10 @@ there is none in a temporary folder (or in ``NUMBA_CACHE_DIR``), so that later r
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +17,12 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+import mapvote
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Lattice
+from mapvote.core.kernel import cached_for
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.process_memory import give_back_free_pages, seldom_collecting
 from mapvote.core.record import record
@@ -33,6 +37,7 @@ from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
 from mapvote.fusion.gravity import Remains, fall_within
 from mapvote.matching.localiser import GivenPoses
+from mapvote.matching.ndt import align
 from mapvote.survey.build import build_map
 from mapvote.vehicle import vote_drive
 
@@ -85,6 +90,31 @@ def warm_up() -> Iterator[tuple[str, float]]:
             start = time.process_time()
             work()
             yield step, time.process_time() - start
+
+
+def compiled_mark() -> Path:
+    """The file that stands beside the kernels once the two functions below have compiled all that they do.
+
+    Its name holds what numba asks before it takes a kernel from its cache: the times and sizes of the program's files,
+    numba, Python and the processor. If some of the kernels are taken away, but not the mark, a later run waits for
+    them where it needs them.
+    """
+    folder, compiled_for = cached_for(align)
+    sources = Path(mapvote.__file__).parent
+    digest = hashlib.sha256(compiled_for.encode())
+    for file in sorted(sources.rglob("*.py")):
+        written = file.stat()
+        digest.update(f"{file.relative_to(sources)} {written.st_mtime_ns} {written.st_size}\n".encode())
+    return folder / f"compiled-{digest.hexdigest()[:16]}"
+
+
+def leave_mark() -> None:
+    """Say that all kernels are compiled, for the next run. Where nothing can be written, that run looks itself."""
+    mark = compiled_mark()
+    with suppress(OSError):
+        for outdated in mark.parent.glob("compiled-*"):
+            outdated.unlink()
+        mark.touch()
 
 
 def compile_for_maps() -> None:

@@ -236,7 +236,6 @@ def demo(
     def show(picture: Path) -> None:
         console.print(f"first picture: {escape(str(picture))}")
 
-    console.print("The first run compiles its kernels, which takes up to a minute.", style="dim")
     if drive is not None:
         if full or keep:
             raise typer.BadParameter("a recorded drive is not simulated: leave out --full and --keep")

@@ -18,6 +18,7 @@ from __future__ import annotations
 import inspect
 import os
 import stat
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ import numba
 import numpy as np
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.registry import cpu_target
 
 _VARIABLE = "NUMBA_CACHE_DIR"
 
@@ -140,6 +142,12 @@ def _kept(**options: bool) -> Callable[[Any], Any]:
         return dispatcher
 
     return declare
+
+
+def cached_for(kernel: Any) -> tuple[Path, str]:
+    """The folder that holds a compiled kernel, and the numba, the Python and the processor that it was compiled for."""
+    target = cpu_target.target_context.codegen().magic_tuple()
+    return Path(kernel._cache.cache_path), repr((numba.__version__, sys.version, target))
 
 
 kernel = _kept(_nrt=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from mapvote.matching.localiser import GivenPoses
 from mapvote.plots import Colour, save
 from mapvote.shapes.cutout import Cutout, fragment
 from mapvote.survey.build import build_map
-from mapvote.warmup import compile_for_maps, compile_for_votes
+from mapvote.warmup import compile_for_maps, compile_for_votes, compiled_mark, leave_mark
 from mapvote_lab.evaluation import figures, real_bench
 from mapvote_lab.evaluation.cases import Progress, choose_cases, untold
 from mapvote_lab.evaluation.evaluate import Evaluation, PublishedRound, evaluate, vote_by_http
@@ -296,16 +296,13 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     """
     settings = Settings()
     cases, _ = choose_cases(settings, CASE)
-    with processes(2) as compilers:
-        compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
+    with processes(2) as helpers:
+        compiling = _compile_in(helpers)
         length = len(open_drive(folder))
         recording = open_drive(folder, scans=f"0:{min(DEMO_PLAN.scans, length)}")
         scan = draw_scan(recording, out / "pictures" / "scan.png")
         show(scan)
-        for done, compiled in enumerate(compiling):
-            progress("compiling", done, len(compiling))
-            compiled.result()
-    progress("compiling", 2, 2)
+        _wait_for(compiling, progress)
     progress("mapping", 0, 2)
     reference = build_map([recording], settings)[1].tracks[0].T_map_lidar
     progress("mapping", 1, 2)
@@ -347,6 +344,25 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     write_whole(out / "report.html", text)
     lines = [f"{meaning}: {figure}" for figure, meaning in facts]
     return [*lines, f"{out / 'report.html'}: the story with pictures", f"{out / 'map'}: the map"]
+
+
+def _compile_in(helpers: Executor) -> list[Future[None]]:
+    """Let two processes compile the kernels; nothing where an earlier run has left all of them."""
+    if compiled_mark().exists():
+        return []
+    return [helpers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
+
+
+def _wait_for(compiling: Sequence[Future[None]], progress: Progress) -> None:
+    """Wait for the kernels, and leave word that they are there."""
+    if not compiling:
+        return
+    progress("compiling kernels, once", 0, len(compiling))
+    for done, _ in enumerate(as_completed(compiling), start=1):
+        progress("compiling kernels, once", done, len(compiling))
+    for compiled in compiling:
+        compiled.result()
+    leave_mark()
 
 
 def draw_scan(recording: Drive, path: Path) -> Path:
@@ -418,21 +434,20 @@ def demo(
 
     ``show(path)`` is called with the first picture, as soon as the drives are simulated. ``keep``: the drives, the
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
-    was interrupted is continued by the next one. Two processes compile the kernels while this one simulates; the memory
-    that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
+    was interrupted is continued by the next one. Two processes simulate, then compile the kernels that no run before
+    left; the memory that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
     """
     settings = Settings()
     work = out / "work"
     scene = Scene("street" if full else "corner", DEMO_PLAN.seed, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
-    with processes(2) as compilers:
-        compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
-        scene.simulate(progress)
+    with processes(2) as helpers:
+        scene.simulate(progress, helpers.map)
+        compiling = _compile_in(helpers)
         first = draw_scans(scene, out / "pictures" / "scans.png")
         if show:
             show(first[0])
-        for compiled in compiling:
-            compiled.result()
+        _wait_for(compiling, progress)
     evaluation = evaluate(scene, cases, progress=progress)
     give_back_free_pages()
     progress("server and pictures", 0, 1)

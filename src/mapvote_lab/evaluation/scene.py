@@ -47,7 +47,7 @@ from mapvote.vehicle import write_ballot
 from mapvote_lab.evaluation.cases import Case, CountedBy, KeptDrive, Progress, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.simulation.processes import Run, processes
 from mapvote_lab.simulation.scenario import load_scenario
 
 _MAP_FROM = ("core", "codec", "formats", "matching", "perception", "rules", "survey")
@@ -106,12 +106,12 @@ class Scene:
         key = key_of(sources_digest(_MAP_FROM), *settings, self.poses)
         return self.folder.with_name(f"{self.folder.name}-made") / key
 
-    def simulate(self, progress: Progress = untold) -> None:
-        """Simulate the drives, unless the cache holds them."""
+    def simulate(self, progress: Progress = untold, run: Run | None = None) -> None:
+        """Simulate the drives, unless the cache holds them. ``run``: by these processes."""
         if not self.folder.exists():
             made = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
             report = partial(progress, "simulating")
-            simulate(self.scenario, made, self.seed, progress=report, overrides=self.overrides)
+            simulate(self.scenario, made, self.seed, progress=report, overrides=self.overrides, run=run)
             os.replace(made, self.folder) if not self.folder.exists() else shutil.rmtree(made)
 
     def prepare(self, progress: Progress = untold) -> None:

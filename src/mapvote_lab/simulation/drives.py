@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -48,12 +49,14 @@ def simulate(
     progress: Progress | None = None,
     overrides: Mapping[str, Any] | None = None,
     workers: int | None = None,
+    run: Run | None = None,
 ) -> None:
     """Write the drive folders ``out``/survey_1.., ``out``/v1.. and ``out``/truth; ``out`` appears whole.
 
     ``scenario`` is a name (:func:`mapvote_lab.simulation.scenario.scenario_names`) or a TOML file, ``overrides``
     replace its fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per
-    core for long drives). MapvoteError if ``out`` exists or the scenario is not valid.
+    core for long drives) nor on ``run``, a map over tasks by processes that are there already. MapvoteError if ``out``
+    exists or the scenario is not valid.
     """
     out = Path(out)
     if out.exists():
@@ -67,9 +70,9 @@ def simulate(
         writers = [_writer(partial, route, stage).open() for route in stage.routes]
         for route in stage.routes:
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
-        with mapping(workers or _processes(stage)) as run:
-            dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
-            recorded = _drive_all(stage, partial, run, progress)
+        with nullcontext(run) if run else mapping(workers or _processes(stage)) as by_task:
+            dense = by_task(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
+            recorded = _drive_all(stage, partial, by_task, progress)
             T = T_map_street(spec)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
                 writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
