@@ -477,6 +477,7 @@ def _drop_touching(
     Into ``needed``, which has one tile more on every side, the tiles that would decide a group.
     """
     rows, cols = rest.shape
+    zero = np.int64(0)  # for a literal 0 numba would compile _follow once more
     for r in range(row0, row0 + TILE_CELLS):
         for c in range(col0, col0 + TILE_CELLS):
             if deleted[r, c] == 0:
@@ -504,8 +505,8 @@ def _drop_touching(
                         start = near & ~seen[a, b]
                         start &= ~start + np.uint64(1)
                         n = _follow(
-                            rest, holds, base, at_hand, a, b, start, _ANYWHERE, 0, 0, _NO_CELLS, _NO_CELLS, _NO_TOPS,
-                            touch, longest, 0, seen, stays, cells, words, needed,
+                            rest, holds, base, at_hand, a, b, start, _ANYWHERE, zero, zero, _NO_CELLS, _NO_CELLS,
+                            _NO_TOPS, touch, longest, zero, seen, stays, cells, words, needed,
                         )  # fmt: skip
                         for k in range(n):
                             x = cells[k] // cols
