@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -70,6 +71,35 @@ def started_anew(record: str = "Counts") -> tuple[int, int, Path]:
 def test_without_a_change_the_kept_kernel_is_loaded(package: Path) -> None:
     assert started_anew()[:2] == (32, 1)
     assert started_anew()[:2] == (32, 0)
+
+
+LOADED = """
+import sys
+import numpy as np
+from cached_sample import loops
+print(getattr(loops, sys.argv[1])(np.array([20, 12])), "numba.np.arraymath" in sys.modules)
+"""
+OF_ARRAYS = """
+import numpy as np
+from mapvote.core.kernel import allocating, kernel
+@kernel
+def summed(a):
+    return a[0] + a[1]
+@allocating
+def of_copy(a):
+    b = a.copy()
+    return summed(b)
+"""
+
+
+@pytest.mark.parametrize(("name", "makes_ready"), [("summed", False), ("of_copy", True)])
+def test_a_kept_kernel_is_loaded_without_making_the_compiler_ready(package: Path, name: str, makes_ready: bool) -> None:
+    """Unless it allocates: then it calls numba's run time, which is compiled at each start."""
+    (package / "loops.py").write_text(OF_ARRAYS)
+    program = [sys.executable, "-c", LOADED, name]
+    paths = {"PYTHONPATH": os.pathsep.join([str(package.parent), *sys.path])}
+    said = [subprocess.run(program, env=os.environ | paths, capture_output=True, text=True).stdout for _ in range(2)]
+    assert said == ["32 True\n", f"32 {makes_ready}\n"]
 
 
 @pytest.mark.parametrize(

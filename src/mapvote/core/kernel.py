@@ -107,10 +107,19 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    def __init__(self, function: FunctionType) -> None:
+    def __init__(self, function: FunctionType, allocates: bool) -> None:
         super().__init__(function)
+        self._allocates = allocates
         stamp = self._impl.locator.get_source_stamp()
         self._cache_file = _Index(function, self.cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        # numba makes its compiler ready even for a kernel that is kept: it compiles its run time, which only code that
+        # allocates calls, and imports all that a kernel may call, scipy's BLAS too. That takes .5 s and 48 MB.
+        if self._allocates:
+            return super().load_overload(sig, target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[object, ...]:
         # numba compares named tuples by class and types. Fields that changed places would go unnoticed.
@@ -138,7 +147,7 @@ def _kept(**options: bool) -> Callable[[Any], Any]:
 
     def declare(function: FunctionType) -> Any:
         dispatcher = compiled(function)
-        dispatcher._cache = _Cache(function)  # as enable_caching() does with numba's own
+        dispatcher._cache = _Cache(function, options.get("_nrt", True))  # as enable_caching() does with numba's own
         return dispatcher
 
     return declare
