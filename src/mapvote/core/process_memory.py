@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import mmap
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,18 @@ def give_back_free_pages() -> None:
     """
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
         trim(0)
+
+
+def zero_pages(n_bytes: int) -> mmap.mmap:
+    """Zeros in pages of their own. The system gives a page when it is first written to, and takes all back at the end.
+
+    Shared pages, which Python maps by default, it would give when they are read too; huge ones 2 MB at a time.
+    """
+    if not hasattr(mmap, "MADV_NOHUGEPAGE"):  # of Linux
+        return mmap.mmap(-1, n_bytes)
+    pages = mmap.mmap(-1, n_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return pages
 
 
 @contextmanager

@@ -9,7 +9,6 @@ in an unnamed file.
 
 from __future__ import annotations
 
-import mmap
 import tempfile
 import weakref
 from collections import defaultdict
@@ -22,7 +21,7 @@ import numpy as np
 from mapvote.codec.planes import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.process_memory import give_back_free_pages
+from mapvote.core.process_memory import give_back_free_pages, zero_pages
 from mapvote.core.record import record
 from mapvote.core.types import U64, MapvoteError
 
@@ -151,10 +150,8 @@ class PackedTiles(Mapping[TileIndex, U64]):
                     give_back_free_pages()
 
     def _new(self) -> U64:
-        """Zeros in pages of their own. The system gives each page at its first count, and takes all back once the tile
-        is left: no holes in the heap."""
-        pages = mmap.mmap(-1, 8 * CELLS * self.words)
-        return np.frombuffer(pages, np.uint64).reshape(TILE_CELLS, TILE_CELLS, self.words)
+        """Zeros in pages of their own: all go back once the tile is left, no holes stay in the heap."""
+        return np.frombuffer(zero_pages(8 * CELLS * self.words), np.uint64).reshape(TILE_CELLS, TILE_CELLS, self.words)
 
     def _unpacked(self, bands: list[Slot], planes: U64) -> U64:
         """``planes``, which come empty, with the packed words."""
