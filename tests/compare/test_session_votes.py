@@ -9,7 +9,8 @@ import pytest
 
 from made_courts import CARS, court_clouds, made_court
 from mapvote.codec.ballot import Ballot
-from mapvote.compare.session_votes import vote_of_session, with_free_space
+from mapvote.compare.session_votes import vote_of_session
+from mapvote.compare.trajectory_rays import with_free_space
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, all_points, map_from_points

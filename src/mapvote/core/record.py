@@ -33,12 +33,22 @@ _declared: dict[str, tuple[type, bool]] = {}
 class RecordField:
     """One field of a record."""
 
-    name: str
-    """``Record.field``."""
+    record: type
+    """The record."""
+    field: str
+    """The field's own name."""
     value: Any
     """Its default."""
-    meaning: str
-    """Its sentence."""
+
+    @property
+    def name(self) -> str:
+        """``Record.field``."""
+        return f"{self.record.__name__}.{self.field}"
+
+    @property
+    def meaning(self) -> str:
+        """Its sentence, for which the source of the record is parsed: a digest of all records does without."""
+        return _sentences(self.record).get(self.field, "")
 
 
 def record(*, votes: bool = False) -> Callable[[Record], Record]:
@@ -80,13 +90,13 @@ def numbers(
 @cache
 def modules_with_records(packages: tuple[str, ...], *, votes: bool = False) -> list[str]:
     """The modules whose source declares a record: no other is imported to find them."""
-    mark = "\n@record(votes=True)" if votes else "\n@record("
+    mark = b"\n@record(votes=True)" if votes else b"\n@record("
     names = []
     for package in packages:
         spec = find_spec(package)
         for folder in [] if spec is None else spec.submodule_search_locations or []:
             sources = sorted(Path(folder).rglob("*.py"))
-            names += [_module_name(package, Path(folder), source) for source in sources if mark in source.read_text()]
+            names += [_module_name(package, Path(folder), source) for source in sources if mark in source.read_bytes()]
     return names
 
 
@@ -115,12 +125,12 @@ def numbers_table(names: Iterable[str]) -> str:
 
 
 def _fields_of(cls: type) -> Iterator[RecordField]:
-    meanings = _sentences(cls)
     default = cls()
     for field in fields(cls):
-        yield RecordField(f"{cls.__name__}.{field.name}", getattr(default, field.name), meanings.get(field.name, ""))
+        yield RecordField(cls, field.name, getattr(default, field.name))
 
 
+@cache
 def _sentences(cls: type) -> dict[str, str]:
     """The text below each field of a class."""
     (body,) = ast.parse(inspect.getsource(cls)).body
