@@ -167,11 +167,28 @@ class PackedTiles(Mapping[TileIndex, U64]):
 def _packed(band: U64, zstd_level: int) -> bytes:
     """The cells of a band (cells, words) in which anything was counted, and their words plane by plane: most of the
     higher ones are empty."""
-    cells = np.flatnonzero(band.any(axis=1))
-    out = np.empty((band.shape[1] + 1, len(cells)), np.uint64)
-    out[0] = cells
-    out[1:] = band.take(cells, axis=0).T
-    return compress(out.data, zstd_level)
+    out = np.empty(band.size + len(band), np.uint64)
+    n = _gather_counted(band, out)
+    return compress(out[: n * (1 + band.shape[1])].data, zstd_level)
+
+
+@kernel
+def _gather_counted(band: U64, out: U64) -> int:
+    """Into ``out`` the numbers of the cells of a band (cells, words) in which anything was counted, then their words
+    plane by plane. Returns how many cells there are."""
+    cells, words = band.shape
+    n = 0
+    for cell in range(cells):
+        counted = np.uint64(0)
+        for k in range(words):
+            counted |= band[cell, k]
+        out[n] = cell
+        n += 1 if counted else 0
+    for i in range(n):
+        cell = np.int64(out[i])
+        for k in range(words):
+            out[(k + 1) * n + i] = band[cell, k]
+    return n
 
 
 @kernel
