@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from mapvote.codec.ballot import Ballot
-from mapvote.core.geometry import velocity_changes
+from mapvote.core.geometry import inverses, rotation_angles, velocity_changes
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.sensor_height import check_heights
@@ -229,8 +228,8 @@ def _ways(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iter
 
 def _attitude(drive: LocalisedDrive, sure_scans: I64, rules: LocalisedRules) -> Iterator[Finding]:
     assert drive.T_prior is not None
-    apart = np.einsum("nji,njk->nik", drive.T_prior[sure_scans, :3, :3], drive.T_map_lidar[sure_scans, :3, :3])
-    apart_deg = np.degrees(scipy.spatial.transform.Rotation.from_matrix(apart).magnitude())
+    apart = inverses(drive.T_prior[sure_scans]) @ drive.T_map_lidar[sure_scans]
+    apart_deg = np.degrees(rotation_angles(apart))
     median_deg = float(np.median(apart_deg))
     if median_deg > rules.turn_deg + 4.0 * drive.sigma_deg:
         problem = f"the prior's attitude differs by {median_deg:.0f} deg (median) from the localised one"

@@ -28,6 +28,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
+from mapvote.core.groups import groups_of
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
@@ -346,10 +347,7 @@ def _bodies(window: _Window, own: tuple[slice, slice], gravity: Gravity) -> Iter
     if not len(rows):
         return
     # Objects among the deleted cells, each by row, then column.
-    labels = np.zeros(window.deleted.shape, dtype=np.int32)
-    stack = np.empty(len(rows), dtype=np.int64)
-    _label_near(rows, cols, read_only(window.deleted), 2 * gravity.reach_cells + 1, labels, stack)
-    number = labels[rows, cols]
+    number = groups_of(window.deleted, 2 * gravity.reach_cells + 1, rows, cols)[rows, cols]
     order = np.argsort(number, kind="stable")
     starts = np.flatnonzero(np.diff(number[order], prepend=0))
     rows = rows[order]
@@ -409,31 +407,6 @@ def _seen_from(word: np.uint64, layers: int) -> np.uint64:
     if layers >= 64 or layers <= -64:
         return np.uint64(0)
     return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
-
-
-@kernel
-def _label_near(rows: I64, cols: I64, deleted: U64, reach: int, labels: I32, stack: I64) -> None:
-    """Into ``labels``, zeros, a number from 1 on for each object of the cells (n,) in which ``deleted`` has a bit: they
-    are of one object if they are at most ``reach`` rows and columns apart. ``stack`` (n,): memory."""
-    height, width = deleted.shape
-    count = 0
-    for k in range(len(rows)):
-        if labels[rows[k], cols[k]]:
-            continue
-        count += 1
-        labels[rows[k], cols[k]] = count
-        stack[0] = rows[k] * width + cols[k]
-        n = 1
-        while n > 0:
-            n -= 1
-            r = stack[n] // width
-            c = stack[n] % width
-            for a in range(max(r - reach, 0), min(r + reach + 1, height)):
-                for b in range(max(c - reach, 0), min(c + reach + 1, width)):
-                    if deleted[a, b] and not labels[a, b]:
-                        labels[a, b] = count
-                        stack[n] = a * width + b
-                        n += 1
 
 
 @kernel

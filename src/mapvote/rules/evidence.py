@@ -36,10 +36,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from mapvote.core.columns import TOP_BIT, layer_bit
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.groups import groups_of, within
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
@@ -278,7 +278,7 @@ def judge_window(
     gone = np.where(went, occupied, gone)
 
     # New voxels, also those that a deleted surface may have hidden.
-    near = scipy.ndimage.maximum_filter(went, 2 * rule.reach_cells + 1, mode="constant")
+    near = within(went, rule.reach_cells)
     new: U64 = np.bitwise_or(np.where(mapped, NO_VOXELS, drive.new), np.where(near, beyond, NO_VOXELS))
     states[new != 0] = CellState.UNDETERMINED
     states[enough(new, rule.new_a_cell, occupied & ~gone != 0, drive.balance, rule)] = CellState.CHANGED_OCCUPIED
@@ -293,7 +293,7 @@ def enough(voxels: U64, a_cell: int, others: Bool, balance: I32, rule: SurfaceRu
     here = voxels[cells]
     near_ground = np.uint64(0b1111)
     tall = here & (here >> np.uint64(1)) != 0
-    tied = scipy.ndimage.binary_dilation(others, np.ones((3, 3)))[cells] | (here & near_ground == 0)
+    tied = within(others, 1)[cells] | (here & near_ground == 0)
     one = np.ones(len(here), np.bool_)
     amounts = np.bitwise_count(here), one, tall, tied, balance[cells]
     size, count, talls, ties, left = over_groups(cells, *amounts)
@@ -315,6 +315,5 @@ def grown(strong: Bool, weak: Bool) -> Bool:
 def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
     """For each of ``amounts`` (m,), of the m ``cells`` (rows, cols) row by row, its sums (m,) over the 8-connected
     group that a cell is in."""
-    group, count = scipy.ndimage.label(cells, structure=np.ones((3, 3)))
-    of_cell = group[cells]
-    return [np.bincount(of_cell, amount, count + 1)[of_cell] for amount in amounts]
+    of_cell = groups_of(cells.astype(np.uint64), 1, *np.nonzero(cells))[cells]
+    return [np.bincount(of_cell, amount)[of_cell] for amount in amounts]

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from functools import partial, reduce
 
 import numpy as np
-import scipy
 
 from mapvote.codec.ballot import Planes, changed_cells_of
 from mapvote.codec.planes import Words
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.groups import groups_of
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.reference import above_ground_points, reference_window
@@ -199,7 +199,7 @@ def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice], odd
 def _features_of_objects(alike: Bool, amount: I32, rows: I64, cols: I64) -> tuple[I64, I64, F64]:
     """For the cells (n,): the size of their 8-connected group of ``alike``, the number of their eight neighbours in
     ``alike``, and ln(1 + their amount) - ln(1 + the largest amount of these)."""
-    group, _ = scipy.ndimage.label(alike, structure=np.ones((3, 3)))
+    group = groups_of(alike.astype(np.uint64), 1, rows, cols)
     sizes = np.bincount(group.ravel())[group[rows, cols]]
     amount_alike = np.where(alike, amount, 0)
     beside = np.stack([alike[rows + i, cols + j] for i, j in _NEIGHBOURS])
