@@ -44,7 +44,7 @@ def _label_near(rows: I64, cols: I64, words: U64, reach: int, labels: I32, stack
                         n += 1
 
 
-def within(cells: Bool, reach: int) -> Bool:
+def widened(cells: Bool, reach: int) -> Bool:
     """(rows, cols) the cells at most ``reach`` rows and columns away from one of ``cells`` (rows, cols)."""
     out = cells.copy()
     for _ in range(reach):

@@ -39,7 +39,7 @@ import numpy as np
 
 from mapvote.core.columns import TOP_BIT, layer_bit
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.groups import groups_of, within
+from mapvote.core.groups import groups_of, widened
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
@@ -278,7 +278,7 @@ def judge_window(
     gone = np.where(went, occupied, gone)
 
     # New voxels, also those that a deleted surface may have hidden.
-    near = within(went, rule.reach_cells)
+    near = widened(went, rule.reach_cells)
     new: U64 = np.bitwise_or(np.where(mapped, NO_VOXELS, drive.new), np.where(near, beyond, NO_VOXELS))
     states[new != 0] = CellState.UNDETERMINED
     states[enough(new, rule.new_a_cell, occupied & ~gone != 0, drive.balance, rule)] = CellState.CHANGED_OCCUPIED
@@ -293,7 +293,7 @@ def enough(voxels: U64, a_cell: int, others: Bool, balance: I32, rule: SurfaceRu
     here = voxels[cells]
     near_ground = np.uint64(0b1111)
     tall = here & (here >> np.uint64(1)) != 0
-    tied = within(others, 1)[cells] | (here & near_ground == 0)
+    tied = widened(others, 1)[cells] | (here & near_ground == 0)
     one = np.ones(len(here), np.bool_)
     amounts = np.bitwise_count(here), one, tall, tied, balance[cells]
     size, count, talls, ties, left = over_groups(cells, *amounts)
@@ -316,4 +316,4 @@ def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
     """For each of ``amounts`` (m,), of the m ``cells`` (rows, cols) row by row, its sums (m,) over the 8-connected
     group that a cell is in."""
     of_cell = groups_of(cells.astype(np.uint64), 1, *np.nonzero(cells))[cells]
-    return [np.bincount(of_cell, amount)[of_cell] for amount in amounts]
+    return [np.asarray(np.bincount(of_cell, amount), np.float64)[of_cell] for amount in amounts]

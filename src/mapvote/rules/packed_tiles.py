@@ -185,9 +185,9 @@ def _gather_counted(band: U64, out: U64) -> int:
         out[n] = cell
         n += 1 if counted else 0
     for i in range(n):
-        cell = np.int64(out[i])
+        counted_cell = np.int64(out[i])
         for k in range(words):
-            out[(k + 1) * n + i] = band[cell, k]
+            out[(k + 1) * n + i] = band[counted_cell, k]
     return n
 
 
