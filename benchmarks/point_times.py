@@ -31,7 +31,7 @@ from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.doctor import usable
-from mapvote.doctor.bent_scans import check_bent
+from mapvote.doctor.bent_scans import check_bent, window_for
 from mapvote.doctor.scans import looked_at
 from mapvote.formats import open_drive, read_map
 from mapvote.fusion.fuse import update_map
@@ -139,7 +139,7 @@ def voted(path: Path, point_map: PointMap) -> Ballot:
     looking = looked_at(open_drive(path))
     ballot, report = vote_drive(looking.drive, point_map, Settings())
     looking.warnings()
-    usable("", list(check_bent(looking.drive, report.T_map_lidar, point_map)))
+    usable("", list(check_bent(looking.drive, report.T_map_lidar, window_for(point_map, True))))
     return ballot
 
 

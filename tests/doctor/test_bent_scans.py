@@ -10,7 +10,7 @@ import pytest
 
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import Drive, Scan, TimesTold
-from mapvote.doctor.bent_scans import check_bent
+from mapvote.doctor.bent_scans import check_bent, window_for
 from mapvote.matching.prepare import deskew
 from streets import drive_along, path, street, twist_of
 
@@ -52,13 +52,13 @@ WRONG = {
 
 @pytest.mark.parametrize("kind", SOUND)
 def test_scans_that_are_straight_fit_best_as_they_are(kind: str) -> None:
-    assert list(check_bent(SOUND[kind], list(POSES), MAP)) == []
+    assert list(check_bent(SOUND[kind], list(POSES), window_for(MAP, True))) == []
 
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_scans_that_are_bent_fit_better_with_other_times(kind: str) -> None:
     drive, what, mend = WRONG[kind]
-    (finding,) = check_bent(drive, list(POSES), MAP)
+    (finding,) = check_bent(drive, list(POSES), window_for(MAP, True))
     assert f"{finding.severity}: {finding.what}".startswith(what)
     assert mend in finding.mend
     assert "scans fit the map better" in finding.what
@@ -71,18 +71,18 @@ def test_poses_of_a_prior_tell_the_same_unless_they_jump(kind: str) -> None:
     drive = SOUND[kind] if kind in SOUND else WRONG[kind][0]
     prior = POSES.copy()
     prior[:, :2, 3] += [0.4, 0.3]
-    found = list(check_bent(drive, list(prior), MAP, localised=False))
-    assert [f.what for f in found] == [f.what for f in check_bent(drive, list(POSES), MAP)] or (
+    found = list(check_bent(drive, list(prior), window_for(MAP, False)))
+    assert [f.what for f in found] == [f.what for f in check_bent(drive, list(POSES), window_for(MAP, True))] or (
         len(found) == 1 and kind in WRONG and found[0].severity == WRONG[kind][1].split(":")[0]
     )
     prior[:, :2, 3] += np.random.default_rng(1).normal(0.0, 0.4, (len(prior), 2))
-    assert kind in WRONG or list(check_bent(drive, list(prior), MAP, localised=False)) == []
+    assert kind in WRONG or list(check_bent(drive, list(prior), window_for(MAP, False))) == []
 
 
 def test_a_slow_drive_a_short_one_and_one_of_no_rings_tell_nothing() -> None:
     drive = WRONG["bent, without times"][0]
     standing = np.tile(POSES[:1], (len(POSES), 1, 1))
-    assert list(check_bent(drive, list(standing), MAP)) == []
-    assert list(check_bent(drive, list(POSES[:2]), MAP)) == []
+    assert list(check_bent(drive, list(standing), window_for(MAP, True))) == []
+    assert list(check_bent(drive, list(POSES[:2]), window_for(MAP, True))) == []
     ringless = replace(drive, sensor=replace(drive.sensor, rings=False))
-    assert list(check_bent(ringless, list(POSES), MAP)) == []
+    assert list(check_bent(ringless, list(POSES), window_for(MAP, True))) == []

@@ -11,6 +11,7 @@ import pytest
 
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F32, F64, Drive
+from mapvote.doctor.bent_scans import window_for
 from mapvote.doctor.off_surfaces import check_off_surfaces
 from streets import drive_along, path, street
 
@@ -50,7 +51,10 @@ def raised(deg: float) -> Callable[[F64], F64]:
 
 
 def found(drive: Drive, points_map: F64 = STREET) -> list[str]:
-    return [f"{f.severity}: {f.what}" for f in check_off_surfaces(drive, list(POSES), map_from_points(points_map))]
+    return [
+        f"{f.severity}: {f.what}"
+        for f in check_off_surfaces(drive, list(POSES), window_for(map_from_points(points_map), True))
+    ]
 
 
 @pytest.mark.parametrize(

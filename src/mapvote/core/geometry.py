@@ -55,6 +55,13 @@ def _rows_from(points: F64, origin: F64, rows: NDArray[np.float32]) -> None:
         z[i] = points[i, 2] - origin[2]
 
 
+def corners(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(2, k) the lowest and the highest coordinates of points (n, k), column by column: numpy takes ten times as long
+    to reduce rows of three."""
+    columns = points.T
+    return np.array([[column.min() for column in columns], [column.max() for column in columns]])
+
+
 def inverse(T_a_b: F64) -> F64:
     """T_b_a of T_a_b, by the transpose of the rotation (exact for rigid motions)."""
     T = np.eye(4)

@@ -48,17 +48,18 @@ BENT_SCANS = BentScans()
 _AS_READ, _NONE, _CLOCKWISE, _COUNTER = "as read", "none", "clockwise", "counter-clockwise"
 
 
-def check_bent(
-    drive: Drive, T_map_lidar: Sequence[F64], point_map: PointMap, *, localised: bool = True
-) -> Iterator[Finding]:
-    """Other times of points that fit the map clearly better than those of the drive. ``T_map_lidar``: the localised
-    poses of its scans, (4, 4) each; else those of a prior, which may be off by a metre."""
+def window_for(point_map: PointMap, localised: bool) -> MapWindow:
+    """The map as scans are registered in it once more: by the finest level alone if their poses are ``localised``."""
+    return MapWindow(point_map, LEVELS[-1:] if localised else LEVELS)
+
+
+def check_bent(drive: Drive, T_map_lidar: Sequence[F64], around: MapWindow) -> Iterator[Finding]:
+    """Other times of points that fit the map clearly better than those of the drive. ``T_map_lidar``: poses of its
+    scans, (4, 4) each, localised or of a prior, which may be off by a metre; ``around``: :func:`window_for` them."""
     poses = np.array(T_map_lidar)
     stamps_ns = drive.stamps_ns[: len(poses)]
     if len(poses) < 3:
         return
-    around = MapWindow(point_map)
-    first_level = len(LEVELS) - 1 if localised else 0
     scores: dict[str, list[float]] = {}
     times = None
     for i in evenly(1, len(poses) - 2, BENT_SCANS.scans).tolist():
@@ -75,7 +76,7 @@ def check_bent(
         ndt_map = around(poses[i, :3, 3])
         for name, time_s in _readings(scan, drive).items():
             clouds = Sample(replace(scan, time_s=time_s)).clouds(twist)
-            score = ndt_map.refine(clouds, poses[i], None, first_level).score
+            score = ndt_map.refine(clouds, poses[i]).score
             scores.setdefault(name, []).append(score)
     best = _best(scores)
     if best is not None:

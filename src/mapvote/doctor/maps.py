@@ -15,12 +15,12 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
-from mapvote.core.kernel import kernel
+from mapvote.core.neighbours import nearest
 from mapvote.core.point_map import LazyTiles, PointMap, all_points
 from mapvote.core.record import record
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.core.types import F64, MapvoteError
 from mapvote.doctor import Finding, any_error, in_order
 from mapvote.doctor.which_way_up import which_way_up
 from mapvote.formats import read_map, stream_cloud
@@ -199,32 +199,8 @@ def spacing(pieces: Pieces, sample: F64) -> F64:
             chosen = np.sort(np.argpartition(away, MAP_CHECK.neighbour_points - 1)[: MAP_CHECK.neighbour_points])
             near = near[chosen]
             away = away[chosen]
-    axis = int(np.argmax(np.ptp(near, axis=0)))
-    order = np.argsort(near[:, axis])
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    which = place[:: max(1, len(near) // 2000)]
-    apart = np.empty(len(which))
-    _to_nearest(near[order], axis, which, apart)
-    return apart
-
-
-@kernel
-def _to_nearest(points: F64, axis: int, which: I64, out: F64) -> None:
-    """Into ``out`` (m,) the distance from the points ``which`` (m,) to the nearest other one of the points (n, 3),
-    which ascend along ``axis``. A tree would import half of scipy, which takes longer than all of this check."""
-    for w in range(len(which)):
-        i = which[w]
-        best = np.inf
-        for way in (-1, 1):
-            j = i + way
-            while 0 <= j < len(points) and (points[j, axis] - points[i, axis]) ** 2 < best:
-                x = points[j, 0] - points[i, 0]
-                y = points[j, 1] - points[i, 1]
-                z = points[j, 2] - points[i, 2]
-                best = min(best, x * x + y * y + z * z)
-                j += way
-        out[w] = np.sqrt(best)
+    itself_and_next, _ = nearest(near, near[:: max(1, len(near) // 2000)], 2)
+    return itself_and_next[:, 1]
 
 
 def _units(wide: F64, apart: F64) -> Iterator[Finding]:

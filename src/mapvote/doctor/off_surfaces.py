@@ -12,17 +12,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from mapvote.core.geometry import transform
+from mapvote.core.neighbours import nearest
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.sampling import evenly
 from mapvote.core.types import F32, F64, Bool, Drive, MapvoteError
 from mapvote.doctor import Finding
-from mapvote.doctor.bent_scans import check_bent
+from mapvote.doctor.bent_scans import check_bent, window_for
 from mapvote.matching.ndt_map import MapWindow, tiles_within
-from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import Sample, deskew, motion_at
 
 
@@ -73,36 +72,30 @@ def check_points(
 ) -> list[Finding]:
     """Whether times or ranges of the points are wrong, by the map: bent scans, else points off its surfaces, on which
     those of bent scans do not lie either. ``T_map_lidar`` as :func:`check_off_surfaces`."""
-    bent = list(check_bent(drive, T_map_lidar, point_map, localised=localised))
-    return bent or list(check_off_surfaces(drive, T_map_lidar, point_map, localised=localised))
+    around = window_for(point_map, localised)
+    bent = list(check_bent(drive, T_map_lidar, around))
+    return bent or list(check_off_surfaces(drive, T_map_lidar, around))
 
 
 def check_off_surfaces(
-    drive: Drive,
-    T_map_lidar: Sequence[F64],
-    point_map: PointMap,
-    *,
-    localised: bool = True,
-    rules: OffSurfaces = OFF_SURFACES,
+    drive: Drive, T_map_lidar: Sequence[F64], around: MapWindow, rules: OffSurfaces = OFF_SURFACES
 ) -> Iterator[Finding]:
-    """Points that lie farther off the walls or the roads of the map than those of a sound sensor. ``T_map_lidar``: the
-    localised poses of the scans, (4, 4) each; else those of a prior, which may be off by a metre."""
+    """Points that lie farther off the walls or the roads of the map than those of a sound sensor. ``T_map_lidar`` and
+    ``around`` as :func:`check_bent`."""
     poses = np.array(T_map_lidar)
     if len(poses) < rules.least_scans:
         return
-    around = MapWindow(point_map)
-    first_level = len(LEVELS) - 1 if localised else 0
     of_walls: list[tuple[float, float]] = []
     of_roads: list[tuple[float, float]] = []
-    for i in evenly(0, len(poses) - 1, rules.scans).tolist():
+    for i in evenly(0, len(poses) - 1, rules.scans)[::-1].tolist():  # the window was used last at the end
         try:
             scan = drive.read_scan(i)
         except MapvoteError:  # its own finding
             continue
         # A scan lies where the map fits it best: what is left then is no error of the pose.
         twist = motion_at(drive.stamps_ns[: len(poses)], poses, i)
-        T = around(poses[i, :3, 3]).refine(Sample(scan).clouds(twist), poses[i], None, first_level).T_map_lidar
-        off_m, steep = _off_planes(deskew(scan, twist), T, point_map, rules)
+        T = around(poses[i, :3, 3]).refine(Sample(scan).clouds(twist), poses[i]).T_map_lidar
+        off_m, steep = _off_planes(deskew(scan, twist), T, around.point_map, rules)
         for kind, chosen, least in (
             (of_walls, steep <= rules.wall, rules.least_on_walls),
             (of_roads, steep >= rules.road, rules.least_on_road),
@@ -122,11 +115,11 @@ def _off_planes(points: F32, T: F64, point_map: PointMap, rules: OffSurfaces) ->
     on_map = transform(T, few)
     tiles = [point_map.tiles[index].points_map for index in tiles_within(point_map, T[:3, 3], rules.ranges_m[1])]
     mapped = np.concatenate([np.zeros((0, 3)), *tiles])
-    mapped = mapped[(np.abs(mapped[:, :2] - T[:2, 3]) < rules.ranges_m[1] + rules.reach_m).all(axis=1)]
+    x_m, y_m = mapped[:, :2].T - T[:2, 3, None]
+    mapped = mapped[x_m**2 + y_m**2 < (rules.ranges_m[1] + rules.reach_m) ** 2]
     if len(mapped) < rules.neighbours or not len(on_map):
         return np.zeros(0), np.zeros(0)
-    tree = scipy.spatial.cKDTree(mapped, balanced_tree=False)
-    away_m, beside = tree.query(on_map, rules.neighbours, distance_upper_bound=rules.reach_m)
+    away_m, beside = nearest(mapped, on_map, rules.neighbours, rules.reach_m)
     near = np.isfinite(away_m).all(axis=1)
     on_map = on_map[near]
     patches = mapped[beside[near]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import corners
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64
 from mapvote.doctor import Finding
@@ -106,7 +107,8 @@ def _sheet_shares(points: F64, axis: int) -> tuple[float, float]:
     """Share of the points that lie within 0.2 m of the lowest of their column of 2 m along ``axis``; and of the highest
     one, the lowest along its opposite."""
     others = [a for a in range(3) if a != axis]
-    cells = np.floor((points[:, others] - points[:, others].min(axis=0)) / RULE.column_m).astype(np.int64)
+    xy = points[:, others]
+    cells = np.floor((xy - corners(xy)[0]) / RULE.column_m).astype(np.int64)
     key = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
     order = np.argsort(points[:, axis])
     key = key[order]  # short numbers are sorted without comparing them

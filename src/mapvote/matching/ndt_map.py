@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import corners
 from mapvote.core.grid import TILE_CELLS, TileIndex, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
@@ -147,11 +148,12 @@ class MapWindow:
     """Built anew when the vehicle leaves its middle: in a millisecond or two where :meth:`prepare` has been called, and
     in the memory of the one before, which earlier callers must not use any longer.
 
-    Memory is bounded by the tiles around the vehicle.
+    Memory is bounded by the tiles around the vehicle. ``levels``: all, or the last ones.
     """
 
-    def __init__(self, point_map: PointMap) -> None:
+    def __init__(self, point_map: PointMap, levels: Sequence[Level] = LEVELS) -> None:
         self.point_map = point_map
+        self.levels = levels
         self.ndt_map: NdtMap | None = None
         self._ready: dict[TileIndex, list[list[Voxels]]] = {}
         """By tile, by level."""
@@ -174,7 +176,7 @@ class MapWindow:
         ahead = [
             tile
             for tile in tiles_within(self.point_map, position, NDT_WINDOW.ahead_m)
-            if len(self._ready.get(tile, [])) < len(LEVELS)
+            if len(self._ready.get(tile, [])) < len(self.levels)
         ]
         if ahead:
             rows, cols = self.point_map.lattice.cells_of(position[None, :2])
@@ -184,17 +186,17 @@ class MapWindow:
     def _step(self, tile: TileIndex) -> None:
         """One more level of a tile."""
         ready = self._ready.setdefault(tile, [])
-        ready.append(_voxels_of(self.point_map.tiles[tile], LEVELS[len(ready)]))
+        ready.append(_voxels_of(self.point_map.tiles[tile], self.levels[len(ready)]))
 
     def _laid_out(self, position: F64) -> NdtMap:
         kept = set(tiles_within(self.point_map, position, NDT_WINDOW.kept_m))
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in kept}
         here = tiles_within(self.point_map, position)
         for tile in here:
-            while len(self._ready.get(tile, [])) < len(LEVELS):
+            while len(self._ready.get(tile, [])) < len(self.levels):
                 self._step(tile)
         if self.ndt_map is None:
-            self.ndt_map = NdtMap(position)
+            self.ndt_map = NdtMap(position, self.levels)
         else:
             self.ndt_map.begin_anew(position)
         for i, grid in enumerate(self.ndt_map.levels):
@@ -215,7 +217,7 @@ def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
     slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
     for height in np.unique(slab):
         piece = points[slab == height]
-        low, high = np.floor(np.array([piece.min(axis=0), piece.max(axis=0)]) / level.voxel_m).astype(np.int64)
+        low, high = np.floor(corners(piece) / level.voxel_m).astype(np.int64)
         grid = NdtGrid(level, window_of(high - low + 1, low, level.voxel_m))
         grid.enter(piece)
         place, sums, cells = grid.voxels
