@@ -95,7 +95,8 @@ def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64,
     here = seen.reference
     scan = seen.scan
     grid = seen.view.grid
-    near, hit, apart = np.zeros((3, *grid.shape), dtype=np.uint64)
+    near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
+    hit = np.empty(grid.shape, dtype=np.uint64)
     cell = scan.cell if here is scan.reference else cells_and_obstacles(scan.rows, scan.origin_map, here)[0]
     from_corner = scan.origin_map - np.array([grid.x0, grid.y0, 0.0])
     chosen = np.empty(len(cell) + 1, np.int32)
@@ -112,8 +113,8 @@ def _mark_near(
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of ``occupied`` (rows,
     cols) and of the flat ``planes``: base, near, hit, apart. ``reach``: cells, below a half, so that a return reaches
-    two cells or one along each axis. Four are always entered, be they one: no branch to predict. ``chosen`` (n + 1,):
-    scratch."""
+    two cells or one along each axis. Four are always entered, be they one: no branch to predict. What is near a return
+    and the map's is hit. ``chosen`` (n + 1,): scratch."""
     base, near, hit, apart = planes
     rows, cols = occupied.shape
     east = points[0]
@@ -150,16 +151,14 @@ def _mark_near(
         of_b &= occupied[first, right]
         of_c &= occupied[last, left]
         of_d &= occupied[last, right]
-        hit[a] |= of_a
-        hit[b] |= of_b
-        hit[c] |= of_c
-        hit[d] |= of_d
         if not of_a | of_b | of_c | of_d:
             at = np.uint64(cell[p])
             layer = np.int64(np.floor(z))
-            of_a = _layers(layer, layer, np.int64(base[at]))
-            apart[at] |= of_a
-            hit[at] |= of_a
+            apart[at] |= _layers(layer, layer, np.int64(base[at]))
+    for r in range(rows):
+        start = np.uint64(r * cols)
+        for c in range(np.uint64(0), np.uint64(cols)):
+            hit[start + c] = near[start + c] & occupied[r, c] | apart[start + c]
 
 
 @inlined
