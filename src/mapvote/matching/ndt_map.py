@@ -216,7 +216,7 @@ def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
     pieces = []
     slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
     for height in np.unique(slab):
-        piece = points[slab == height]
+        piece = points.compress(slab == height, axis=0)
         low, high = np.floor(corners(piece) / level.voxel_m).astype(np.int64)
         grid = NdtGrid(level, window_of(high - low + 1, low, level.voxel_m))
         grid.enter(piece)
