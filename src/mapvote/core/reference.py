@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import islice, repeat
-from typing import Any
 
 import numpy as np
 
@@ -150,7 +149,13 @@ def _cut(outer: Reference, window: Grid) -> Reference:
     """The planes of ``outer`` over ``window``, which lies inside it: views, but for those whose cells points and rays
     find by one number."""
     cut = window.slices_in(outer.grid)
-    planes = {f.name: getattr(outer, f.name) for f in fields(Reference) if f.name != "grid"}
-    views: dict[str, Any] = {name: None if plane is None else plane[cut] for name, plane in planes.items()}
-    by_number = {name: np.ascontiguousarray(views[name]) for name in ("ground_z", "base")}
-    return Reference(window, **views | by_number)
+    return Reference(
+        window,
+        outer.ground_z[cut].copy(),
+        outer.base[cut].copy(),
+        outer.occupied[cut],
+        outer.counts[cut],
+        outer.bottom_z[cut],
+        outer.top_z[cut],
+        None if outer.free is None else outer.free[cut],
+    )
