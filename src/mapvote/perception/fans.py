@@ -122,21 +122,26 @@ def gather_rays(rays: Rays) -> Fans:
     stop = np.empty(room, np.float32)
     end = np.zeros(FANS, np.float32)
     fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
-    _gather(rays, fans)
+    _gather(rays, fans, np.empty(len(rays.reach) + 1, np.int32))
     return fans
 
 
 @kernel
-def _gather(rays: Rays, fans: Fans) -> None:
+def _gather(rays: Rays, fans: Fans, kept: I32) -> None:
+    """``kept`` (n + 1,): scratch, which rays mark anything: a third."""
     n = np.uint64(len(rays.reach))
     own = np.float32(CELL_SIZE)
     first, last, slope, stop, end, direction = fans
+    count = np.uint64(0)
     for i in range(n):
         fan = np.uint64(rays.fan[i])
         if rays.reach[i] >= own:
             direction[fan, 0] += rays.x[i]
             direction[fan, 1] += rays.y[i]
-            first[fan] += 1 if rays.stop[i] > _TOO_SHORT[fan] else 0
+            keep = rays.stop[i] > _TOO_SHORT[fan]
+            first[fan] += np.int32(keep)
+            kept[count] = i  # a ray that is not kept is overwritten: no branch to predict
+            count += np.uint64(keep)
     room = 0
     for f in range(FANS):
         room, first[f], last[f] = room + first[f] + 1, room, room
@@ -144,15 +149,14 @@ def _gather(rays: Rays, fans: Fans) -> None:
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    for i in range(n):  # rays that are not kept are overwritten: no branch to predict
+    for j in range(count):
+        i = np.uint64(kept[j])
         fan = np.uint64(rays.fan[i])
-        e = rays.stop[i]
-        keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
         k = np.uint64(last[fan])
         slope[k] = rays.slope[i]
-        stop[k] = e
-        last[fan] += 1 if keep else 0
-        end[fan] = max(end[fan], e if keep else np.float32(0.0))
+        stop[k] = rays.stop[i]
+        last[fan] += 1
+        end[fan] = max(end[fan], rays.stop[i])
 
 
 class Way(NamedTuple):

@@ -191,15 +191,28 @@ SKY_RULE = SkyRule()
 
 
 @kernel
-def _highest(rays: Rays, lean: F64, top: F32, count: I32) -> None:
+def _highest(rays: Rays, lean: F64, slopes: F32, top: F32, count: I32) -> None:
     """Enter into ``top`` (SKY_SECTORS,), which holds -inf, the steepest slope of a return in each sector, from the
-    sensor's own plane, and into ``count`` (SKY_SECTORS,), which holds 0, how many came."""
-    wide = FANS // SKY_SECTORS
-    for i in range(np.uint64(0), np.uint64(len(rays.reach))):
-        sector = np.uint64(rays.fan[i] // wide)
-        slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
-        top[sector] = max(top[sector], slope)
-        count[sector] += 1
+    sensor's own plane, and into ``count`` (SKY_SECTORS,), which holds 0, how many came. ``slopes`` (n,): scratch, of
+    all returns, in a loop that vectorises."""
+    wide = np.uint64(FANS // SKY_SECTORS)
+    for i in range(np.uint64(0), np.uint64(len(slopes))):
+        lifted = np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
+        slopes[i] = rays.slope[i] * np.float32(CELL_SIZE) + lifted
+    begun = np.uint64(0)
+    here = np.uint64(0)
+    highest = top[here]
+    for i in range(np.uint64(0), np.uint64(len(slopes))):
+        sector = np.uint64(rays.fan[i]) // wide
+        if sector != here:
+            top[here] = highest
+            count[here] += np.int32(i - begun)
+            begun = i
+            here = sector
+            highest = top[here]
+        highest = max(highest, slopes[i])
+    top[here] = highest
+    count[here] += np.int32(np.uint64(len(slopes)) - begun)
 
 
 @kernel
@@ -261,7 +274,7 @@ class Sky:
         lean = up_map[:2] / up_map[2]
         top = np.full(SKY_SECTORS, -np.inf, np.float32)
         count = np.zeros(SKY_SECTORS, np.int32)
-        _highest(rays, lean, top, count)
+        _highest(rays, lean, np.empty(len(rays.reach), np.float32), top, count)
         edge = self._edge_seen(top, forward_map)
         return self._above_returns(
             np.where(count < self._least, np.inf, top), edge, self._slopes[up_map[2] > 0.0], lean
