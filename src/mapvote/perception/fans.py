@@ -150,13 +150,13 @@ def _gather(rays: Rays, fans: Fans, kept: I32) -> None:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
     for j in range(count):
-        i = np.uint64(kept[j])
-        fan = np.uint64(rays.fan[i])
+        ray = np.uint64(kept[j])
+        fan = np.uint64(rays.fan[ray])
         k = np.uint64(last[fan])
-        slope[k] = rays.slope[i]
-        stop[k] = rays.stop[i]
+        slope[k] = rays.slope[ray]
+        stop[k] = rays.stop[ray]
         last[fan] += 1
-        end[fan] = max(end[fan], rays.stop[i])
+        end[fan] = max(end[fan], rays.stop[ray])
 
 
 class Way(NamedTuple):

@@ -156,9 +156,9 @@ def _mark_near(
             layer = np.int64(np.floor(z))
             apart[at] |= _layers(layer, layer, np.int64(base[at]))
     for r in range(rows):
-        start = np.uint64(r * cols)
-        for c in range(np.uint64(0), np.uint64(cols)):
-            hit[start + c] = near[start + c] & occupied[r, c] | apart[start + c]
+        for column in range(cols):
+            at = np.uint64(r * cols + column)
+            hit[at] = near[at] & occupied[r, column] | apart[at]
 
 
 @inlined
