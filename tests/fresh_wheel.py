@@ -5,9 +5,23 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import sysconfig
+import venv
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+
+
+def installed(folder: Path, wheel: Path) -> Path:
+    """The ``bin`` of a new environment with the wheel, and with what it needs from the environment of the tests."""
+    venv.create(folder, with_pip=False)
+    python = folder / "bin" / "python"
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps", str(wheel)]
+    subprocess.run(command, check=True, timeout=300)
+    # An environment added by a line of a .pth file brings its packages, but not the program that is being edited.
+    own = sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)})
+    (Path(own) / "beside.pth").write_text(sysconfig.get_path("purelib"))
+    return folder / "bin"
 
 
 def packed(folder: Path) -> Path:

@@ -10,13 +10,12 @@ import os
 import re
 import shlex
 import subprocess
-import venv
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fresh_wheel import packed
+from fresh_wheel import installed, packed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.core.types import CellState
 from mapvote.formats import write_map
@@ -35,10 +34,7 @@ def mapvote(tmp_path_factory: pytest.TempPathFactory) -> str:
     if "MAPVOTE_PROGRAM" in os.environ:
         return os.environ["MAPVOTE_PROGRAM"]
     home = tmp_path_factory.mktemp("fresh")
-    venv.create(home / "venv", with_pip=True)
-    wheel = f"{packed(home)}[server,postgres]"
-    subprocess.run([home / "venv/bin/pip", "install", "-q", wheel], check=True, timeout=900)
-    return str(home / "venv/bin/mapvote")
+    return str(installed(home / "venv", packed(home)) / "mapvote")
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

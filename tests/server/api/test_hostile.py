@@ -37,8 +37,9 @@ max_body_bytes = 300000
 work_s_per_minute = 1e9
 rows_per_minute = 1e12
 """
-EXAMPLES = os.environ.get("EXAMPLES", "15")
+EXAMPLES = os.environ.get("EXAMPLES", "10")
 """Generated requests of each kind and route."""
+MUTANTS = int(os.environ.get("MUTANTS", "3000"))
 
 
 class Site:
@@ -96,11 +97,11 @@ def changed(**fields: Any) -> bytes:
 
 
 @pytest.mark.slow
-def test_10_000_mutated_ballots(site: Site) -> None:
+def test_thousands_of_mutated_ballots(site: Site) -> None:
     """A refusal leaves no trace, and says something."""
     answers: Counter[int] = Counter()
     before = site.commits()
-    for data in mutants(honest(), 10_000, 2):
+    for data in mutants(honest(), MUTANTS, 2):
         answer = site.put(data)
         answers[answer.status_code] += 1
         assert answer.status_code in (200, 201, 403, 409, 413, 422), (answer.status_code, answer.text, data[:200])
@@ -109,7 +110,7 @@ def test_10_000_mutated_ballots(site: Site) -> None:
             assert len(answer.content) < 2000
             assert site.commits() == before, f"a refused ballot changed the store: {answer.text}"
         before = site.commits()
-    assert answers[422] > 5000, answers
+    assert answers[422] > MUTANTS // 2, answers
     assert site.put(honest()).status_code in (200, 201)
     assert site.commits() != before, "who writes is seen"
 
