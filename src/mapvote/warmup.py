@@ -30,7 +30,7 @@ from mapvote.core.rule import RULES
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan, read_only
 from mapvote.core.voxels import VoxelCloud
-from mapvote.doctor.maps import check_cloud, in_memory
+from mapvote.doctor.map_points import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
 from mapvote.formats.drives.point_fields import PointReader, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view

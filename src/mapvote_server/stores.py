@@ -21,7 +21,8 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.doctor import Finding, in_order
-from mapvote.doctor.maps import check_cloud, check_map, classified_ground, tile_by_tile
+from mapvote.doctor.map_points import check_cloud
+from mapvote.doctor.maps import check_map, classified_ground, tile_by_tile
 from mapvote_server.api.app import URL, in_process
 from mapvote_server.gate import gate_by
 from mapvote_server.questions.history import overview

@@ -16,7 +16,8 @@ from hand_made import save_pcd
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
 from mapvote.doctor.diagnosis import diagnose
-from mapvote.doctor.maps import check_cloud, check_map, examine_points, in_memory
+from mapvote.doctor.map_points import check_cloud, in_memory
+from mapvote.doctor.maps import check_map, examine_points
 from mapvote.formats import write_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las

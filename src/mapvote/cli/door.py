@@ -142,9 +142,9 @@ def map_at(
     touch it. ``or_kept``: if the server does not answer, the map that was fetched last, with a warning. ``origins``: a
     store's points have the version and the votes behind them as fields.
     """
-    from mapvote.client import Unreachable
-
     if is_url(name):
+        from mapvote.client import Unreachable
+
         with client_of(name, key_in(key_file)) as client:
             try:
                 point_map = client.fetch(version, region=region)
@@ -272,7 +272,7 @@ def look_at_points(path: str, *, unchecked: bool = False) -> Look:
     """The check of a map's points before the ground is computed: MapvoteError, with the way past, if they cannot be
     used; ``unchecked``: findings are only printed."""
     from mapvote.doctor import usable
-    from mapvote.doctor.maps import check_cloud
+    from mapvote.doctor.map_points import check_cloud
 
     def look(pieces: Pieces, ground: Pieces) -> None:
         findings = check_cloud(pieces, ground)

@@ -23,7 +23,8 @@ from mapvote.doctor.bags import check_bag, check_lidars_of_bag
 from mapvote.doctor.drive_evidence import DriveEvidence, check_ranges, check_road
 from mapvote.doctor.lean import RULES as ROAD_BELOW
 from mapvote.doctor.map_fit import MapEvidence, check_cloud_on_map, check_on_map, in_another_unit
-from mapvote.doctor.maps import check_cloud, check_map, classified_ground, examine_map, tile_by_tile
+from mapvote.doctor.map_points import check_cloud
+from mapvote.doctor.maps import check_map, classified_ground, examine_map, tile_by_tile
 from mapvote.doctor.off_surfaces import check_points
 from mapvote.doctor.prior_fit import agreement, check_attitude
 from mapvote.doctor.reading_on_map import decided_by_map

@@ -1,8 +1,4 @@
-"""A map by itself: units, axes, strays and rounding of its points; its ground, holes, frame; what leans and what is
-there twice.
-
-:func:`check_cloud` needs points only, in pieces, and uses no scipy: every verb that reads a map calls it first.
-"""
+"""A map by itself: its ground, holes, frame; what leans and what is there twice."""
 
 from __future__ import annotations
 
@@ -15,14 +11,13 @@ import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
-from mapvote.core.neighbours import nearest
 from mapvote.core.point_map import LazyTiles, PointMap, all_points
 from mapvote.core.record import record
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.doctor import Finding, any_error, in_order
-from mapvote.doctor.which_way_up import which_way_up
+from mapvote.doctor.map_points import MAP_POINT_CHECK, check_cloud, in_memory, spacing
 from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.drives.point_fields import POINT_RULE
 from mapvote.formats.geo.frame import frame_of
@@ -37,18 +32,8 @@ from mapvote.survey.clean_map import lone_points
 @record()
 @dataclass(frozen=True, slots=True)
 class MapCheck:
-    """Numbers of the checks of a map's points, ground and copies."""
+    """Numbers of the checks of a map's ground and copies."""
 
-    checked_points: int = 400_000
-    """Points of a map that are checked for its unit, its axes and lone points."""
-    neighbour_points: int = 100_000
-    """Points around the middle of a map whose neighbours are searched."""
-    few_points: int = 1000
-    """Points below which a map shows nothing."""
-    stray_m: float = 300.0
-    """Distance from the other points beyond which a point is a stray, metres; a nearer one is a reflection."""
-    highest_m: float = 3000.0
-    """Largest difference of heights of a map of streets, metres."""
     far_m: float = 50_000.0
     """Distance from the origin beyond which a map is far, metres."""
     slope_deg: float = 6.0
@@ -121,11 +106,6 @@ class LeanCheck:
 LEAN_CHECK = LeanCheck()
 
 
-def in_memory(points: NDArray[np.floating]) -> Pieces:
-    """One piece."""
-    return lambda: iter([points])
-
-
 def tile_by_tile(point_map: PointMap) -> Pieces:
     """The points of a map."""
     return lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles))
@@ -135,100 +115,6 @@ def classified_ground(point_map: PointMap) -> Pieces:
     """Those points of a map that its file classifies as ground."""
     tiles = point_map.tiles
     return lambda: (grounded(tiles[index].fields, tiles[index].points_map) for index in sorted(tiles))
-
-
-def check_cloud(pieces: Pieces, ground: Pieces | None = None) -> list[Finding]:
-    """Findings on points in map metres, as a file holds them. ``ground``: the points that it classifies as ground."""
-    n = sum(map(len, pieces()))
-    if n < MAP_CHECK.few_points:
-        return [Finding("warning", f"the map holds only {n} points", "is the file cut off, or the wrong one?")]
-    sample = _every(pieces, max(1, n // MAP_CHECK.checked_points))
-    low, high = np.quantile(sample, (0.001, 0.999), axis=0)
-    apart_m = spacing(pieces, sample)
-    units = list(_units(high - low, apart_m))
-    findings = [*_strays(pieces, n, low, high), *units]
-    if not units:
-        classified = np.empty((0, 3)) if ground is None else _every(ground, max(1, n // MAP_CHECK.checked_points))
-        findings += which_way_up(sample, high - low, classified)
-    twice = float((apart_m < 1e-6).mean())
-    if twice >= 0.05:
-        findings.append(Finding("warning", f"{twice:.0%} of the points occur twice", "was the map merged with itself?"))
-    return [*findings, *_rounded(sample)]
-
-
-def _every(pieces: Pieces, step: int) -> F64:
-    """(m, 3) every ``step``-th point."""
-    parts = []
-    skip = 0
-    for points in pieces():
-        parts.append(points[skip::step].astype(np.float64))
-        skip = (skip - len(points)) % step
-    return np.concatenate(parts)
-
-
-def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> Iterator[Finding]:
-    wide = high - low
-    strays = 0
-    far_m = 0.0
-    for points in pieces():
-        outside = np.zeros(len(points), np.bool_)
-        for axis in range(3):  # three columns are read faster than rows of three
-            along = points[:, axis]
-            outside |= (along < (low - wide - 20.0)[axis]) | (along > (high + wide + 20.0)[axis])
-        strays += int(outside.sum())
-        far_m = max(far_m, float(np.abs(points[outside] - 0.5 * (low + high)).max(initial=0.0)))
-    if strays:
-        problem = f"{strays} of {n} points lie far off all others, up to {far_m:.0f} m"
-        mend = "strays, or another place's points: cut them off"
-        yield Finding("warning" if far_m > MAP_CHECK.stray_m else "note", problem, mend)
-
-
-def spacing(pieces: Pieces, sample: F64) -> F64:
-    """(m,) distance of points to their nearest neighbour, of all points around one place, the middle of ``sample``."""
-    centre = np.median(sample[:: max(1, len(sample) // 1000)], axis=0)
-    near = np.empty((0, 3))
-    away = np.empty(0)
-    for points in pieces():
-        distance = np.maximum(np.abs(points[:, 0] - centre[0]), np.abs(points[:, 1] - centre[1]))
-        close = distance <= (away.max() if len(away) == MAP_CHECK.neighbour_points else np.inf)
-        if not close.any():
-            continue
-        near = np.concatenate([near, points[close]])
-        away = np.concatenate([away, distance[close]])
-        if len(near) > MAP_CHECK.neighbour_points:
-            chosen = np.sort(np.argpartition(away, MAP_CHECK.neighbour_points - 1)[: MAP_CHECK.neighbour_points])
-            near = near[chosen]
-            away = away[chosen]
-    itself_and_next, _ = nearest(near, near[:: max(1, len(near) // 2000)], 2)
-    return itself_and_next[:, 1]
-
-
-def _units(wide: F64, apart: F64) -> Iterator[Finding]:
-    apart_m = float(np.median(apart))
-    mend = "give the points in metres"
-    if wide.max() < 5.0:
-        problem = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
-        yield Finding("error", problem, mend)
-    elif wide[2] < 0.05:
-        yield Finding("error", "all points lie at one height: the map is flat", "is the column order x, y, z?")
-    elif wide[2] > MAP_CHECK.highest_m or (apart_m > 2.0 and wide[2] > 0.2 * MAP_CHECK.highest_m):
-        problem = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
-        yield Finding("error", problem, mend)
-    elif apart_m > 0.5:
-        problem = f"points are {apart_m:.2f} m apart (median): too sparse to show what stands there, or not metres"
-        yield Finding("warning", problem, "a map needs a point every 0.3 m or so")
-
-
-def _rounded(sample: F64) -> Iterator[Finding]:
-    sample = sample[:: max(1, len(sample) // 20_000)]
-    for axis, name in enumerate("xyz"):
-        for quantum in (1.0, 0.5, 0.25, 0.125):
-            steps = sample[:, axis] / quantum
-            if (np.abs(steps - np.round(steps)) < 1e-3).mean() > 0.95 and np.ptp(sample[:, axis]) > 0.05:
-                problem = f"{name} is rounded to {quantum:g} m in the map"
-                mend = "float32 of large coordinates? Subtract an offset before writing them"
-                yield Finding("error", problem, mend)
-                return
 
 
 def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
@@ -422,7 +308,7 @@ def _lean(standing: F64) -> Iterator[Finding]:
 
 def _sides(standing: F64) -> F64:
     """(m, 3) directions, near the horizontal, square to what stands: normals of walls, two for each pole."""
-    if len(standing) < MAP_CHECK.few_points:
+    if len(standing) < MAP_POINT_CHECK.few_points:
         return np.empty((0, 3))
     voxel = np.floor((standing - standing.min(axis=0)) / LEAN_CHECK.patch_m).astype(np.int64)
     key = np.ravel_multi_index(tuple(voxel.T), tuple(voxel.max(axis=0) + 1))
@@ -449,7 +335,7 @@ def ghost_layer(height: F64) -> float | None:
     ``height`` (n,) of points over the ground. A second road is as sharp a peak of their histogram as the first; kerbs,
     cars and hedges are broad.
     """
-    if (np.abs(height) < 1.0).sum() < MAP_CHECK.few_points:
+    if (np.abs(height) < 1.0).sum() < MAP_POINT_CHECK.few_points:
         return None
     count, edges = np.histogram(height[np.isfinite(height)], bins=np.arange(-2.5, 2.5, MAP_CHECK.bin_m))
     peak = np.convolve(count, np.ones(3), mode="same")
@@ -470,7 +356,7 @@ def ghost_shift(standing: F64) -> tuple[float, float] | None:
     themselves at every shift along them, but less so the larger it is: only a copy is more alike at its shift than at
     half of that.
     """
-    if len(standing) < MAP_CHECK.few_points:
+    if len(standing) < MAP_POINT_CHECK.few_points:
         return None
     reach = int(COPY_CHECK.farthest_m / COPY_CHECK.cell_m)
     near = _likeness(standing, COPY_CHECK.cell_m, COPY_CHECK.side, reach)
