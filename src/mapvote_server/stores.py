@@ -21,8 +21,6 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.doctor import Finding, in_order
-from mapvote.doctor.map_points import check_cloud
-from mapvote.doctor.maps import check_map, classified_ground, tile_by_tile
 from mapvote_server.api.app import URL, in_process
 from mapvote_server.gate import gate_by
 from mapvote_server.questions.history import overview
@@ -125,6 +123,10 @@ def who() -> str:
 
 def check_store(store: Store) -> list[Finding]:
     """Everything that the doctor finds in an open store, errors first. Every byte is read."""
+    # Here, for these import the vehicle, which no other use of a store needs.
+    from mapvote.doctor.map_points import check_cloud
+    from mapvote.doctor.maps import check_map, classified_ground, tile_by_tile
+
     damaged = check(store)
     findings = []
     for kind, count in Counter(damage.kind for damage in damaged).items():

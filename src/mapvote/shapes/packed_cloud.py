@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.kernel import allocating
+from mapvote.core.kernel import kernel
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I64, U8, U16
+from mapvote.core.types import F32, F64, I64, U8, U16, Bool
 from mapvote.core.voxels import found_among
 
 SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
@@ -76,7 +76,9 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 
     low, high = _heights(points)
     sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
     layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, LAYER_RULE.layers)
-    level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: neighbours come close together
+    taken = np.zeros(int((sides * sides * layers).sum()), np.bool_)
+    level = np.empty(len(points), np.uint8)
+    _find_levels(points, low, sizes, sides, layers, taken, level)  # in the tile's order: neighbours come close together
     ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
     room = len(points) if most is None else max(most, int(ends[0]))
     chosen = np.flatnonzero(level <= np.searchsorted(ends, room))
@@ -94,7 +96,9 @@ def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
     step = max(LAYER_RULE.least_z_step_m, (high - low) / _STEPS)
     measured = ground_z[np.isfinite(ground_z)]
     elsewhere = float(np.median(measured)) if len(measured) else low
-    return _pack(points, ground_z, elsewhere, low, step), low, step
+    packed = np.empty((len(points), 4), dtype=np.uint16)
+    _pack(points, ground_z, elsewhere, low, step, packed)
+    return packed, low, step
 
 
 def _heights(points: F32) -> tuple[float, float]:
@@ -108,36 +112,33 @@ def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
     return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
 
 
-@allocating
-def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
-    """(n,) level of each point: the coarsest in whose voxel no point came before.
+@kernel
+def _find_levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64, taken: Bool, out: U8) -> None:
+    """Into ``out`` (n,) the level of each point: the coarsest in whose voxel no point came before. ``taken``: False for
+    each voxel of all levels.
 
     Each voxel lies in one voxel of the coarser level, so a point that takes a voxel takes all those around it.
     """
-    first = np.zeros(len(sizes) + 1, dtype=np.int64)
-    for k in range(len(sizes)):
-        first[k + 1] = first[k] + sides[k] * sides[k] * layers[k]
-    taken = np.zeros(first[-1], dtype=np.bool_)
-    out = np.full(len(points), len(sizes), dtype=np.uint8)
     for i in range(len(points)):
         x = points[i, 0]
         y = points[i, 1]
         z = points[i, 2] - low
+        out[i] = len(sizes)
+        first = len(taken)
         for k in range(len(sizes) - 1, -1, -1):
+            first -= sides[k] * sides[k] * layers[k]
             col = min(max(int(x / sizes[k]), 0), sides[k] - 1)
             row = min(max(int(y / sizes[k]), 0), sides[k] - 1)
-            voxel = first[k] + (min(int(z / sizes[k]), layers[k] - 1) * sides[k] + row) * sides[k] + col
+            voxel = first + (min(int(z / sizes[k]), layers[k] - 1) * sides[k] + row) * sides[k] + col
             if taken[voxel]:
                 break
             taken[voxel] = True
             out[i] = k
-    return out
 
 
-@allocating
-def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) -> U16:
-    """(n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
-    out = np.empty((len(points), 4), dtype=np.uint16)
+@kernel
+def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float, out: U16) -> None:
+    """Into ``out`` (n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
     for i in range(len(points)):
         x = points[i, 0]
         y = points[i, 1]
@@ -151,7 +152,6 @@ def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) 
         out[i, 1] = min(max(round(y * (_STEPS / SIDE_M)), 0), _STEPS)
         out[i, 2] = round((z - z0) / step)
         out[i, 3] = min(max(round((z - ground + 10.0) * 100), 0), _STEPS)  # centimetres from 10 m below the ground
-    return out
 
 
 def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> bytes:
