@@ -100,7 +100,7 @@ def _in_map(points: F32, T: F64, i: int) -> Vector:
 
 
 @kernel
-def pair_up(points: F32, T: F64, window: Window, cells: F64, room: Room) -> None:
+def pair_up(points: F32, T: F64, window: Window, cells: F32, room: Room) -> None:
     """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired.
 
     Block by block: who has moved, where their partners are, what these say. No step waits for the memory of the one
@@ -135,15 +135,18 @@ def pair_up(points: F32, T: F64, window: Window, cells: F64, room: Room) -> None
             for j in range(7):
                 partner[j, w] = flat[np.uint64(at + beside[j])] if inside else np.int32(-1)
         for j in range(7):
+            x = (lowest[0] + SEVEN[j, 0] + 0.5) * size - origin[0]
+            y = (lowest[1] + SEVEN[j, 1] + 0.5) * size - origin[1]
+            z = (lowest[2] + SEVEN[j, 2] + 0.5) * size - origin[2]
             for w in range(m):
-                i = moved[w]
+                i = np.uint64(moved[w])
                 k = np.uint64(max(partner[j, w], np.int32(0)))
                 there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
-                for c in range(3):
-                    low = lowest[c] * size - origin[c]
-                    of[j, c, i] = there * np.float32((home[c, i] + SEVEN[j, c] + 0.5) * size + low + cells[k, c])
-                for c in range(3, 9):
-                    of[j, c, i] = there * np.float32(cells[k, c])
+                of[j, 0, i] = there * np.float32(home[0, i] * size + x + cells[k, 0])
+                of[j, 1, i] = there * np.float32(home[1, i] * size + y + cells[k, 1])
+                of[j, 2, i] = there * np.float32(home[2, i] * size + z + cells[k, 2])
+                for c in range(np.uint64(3), np.uint64(9)):
+                    of[j, c, i] = there * cells[k, c]
 
 
 @inlined
@@ -271,7 +274,7 @@ def linearise(points: F32, room: Room, T: F64, H: F64, M: F64, g: F64) -> tuple[
 
 
 @kernel
-def likelihoods(points: F32, T: F64, window: Window, cells: F64, out: F64) -> None:
+def likelihoods(points: F32, T: F64, window: Window, cells: F32, out: F64) -> None:
     """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4): what
     :func:`linearise` says, for a single look without pairs."""
     rows, lowest, size, flat, beside = window
@@ -418,7 +421,7 @@ def _to_prior(T: F64, T_prior: F64, R: F64, step: F64) -> None:
 
 @kernel
 def align(
-    points: F32, T: F64, window: Window, cells: F64, most: int, tolerance_m: float, map_variance: F64, T_prior: F64,
+    points: F32, T: F64, window: Window, cells: F32, most: int, tolerance_m: float, map_variance: F64, T_prior: F64,
     prior: F64, room: Room, covariance: F64,
 ) -> tuple[float, float, int, bool]:  # fmt: skip
     """Move T (4, 4), in place, to where the points (3, n) of the lidar frame fit the level best.

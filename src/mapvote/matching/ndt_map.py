@@ -247,7 +247,7 @@ def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
     at = at[((at >= 0) & (at < rows.shape)).all(axis=1)]
     k = rows[at[:, 0], at[:, 1], at[:, 2]]
     k = k[k >= 0]
-    cells = grid.voxels.cells[k]
+    cells = grid.voxels.cells[k].astype(np.float64)
     k, cells = (kept[cells[:, 3] + cells[:, 6] + cells[:, 8] != 0.0] for kept in (k, cells))
     sums = grid.voxels.sums[k]
     m, (a, b, c) = sums[:, 0], cells[:, :3].T
