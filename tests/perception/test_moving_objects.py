@@ -268,6 +268,12 @@ def plain_look(offsets: F32, image: U16, counts: LookCounts) -> list[int]:
     return waiting
 
 
+def image_of(seen: F64, sensor: F64) -> U16:
+    image = np.empty((PIXELS.turns, PIXELS.slopes), np.uint16)
+    range_image(rows_from(seen, sensor), PIXELS, image)
+    return image
+
+
 def no_counts(n: int) -> LookCounts:
     return LookCounts(np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.uint8))
 
@@ -279,7 +285,7 @@ def test_an_image_holds_the_nearest_return_of_each_direction_and_of_those_beside
     points = origin + rng.normal(0.0, 1.0, (3000, 3)) * [30.0, 30.0, 3.0]
     points[:5] = [[0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [500.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
     points[:5] += origin
-    np.testing.assert_array_equal(range_image(rows_from(points, origin), PIXELS), plain_image(points, origin))
+    np.testing.assert_array_equal(image_of(points, origin), plain_image(points, origin))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -289,16 +295,18 @@ def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
     counts, expected, wait = no_counts(400), no_counts(400), np.arange(400)
     x, y, z = places.T.copy()
     samples, n = Samples(x, y, z, np.arange(400, dtype=np.int32)), 400
-    for _ in range(5):
-        sensor = rng.normal(0.0, 2.0, 3)
-        seen = sensor + rng.normal(0.0, 1.0, (4000, 3)) * [15.0, 15.0, 2.0]
-        image = range_image(rows_from(seen, sensor), PIXELS)
+    for asked in (1, 2, 2):
+        sensors = rng.normal(0.0, 2.0, (asked, 3))
+        images = [image_of(s + rng.normal(0.0, 1.0, (4000, 3)) * [15.0, 15.0, 2.0], s) for s in sensors]
+        stored = np.array(images[::-1]).reshape(asked, -1)
+        which = np.arange(asked)[::-1].copy()
         rule = MARGIN_M, HEIGHT_M, ENOUGH
-        n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
-        some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
-        left = plain_look(places[wait] - sensor.astype(np.float32), image, some)
-        expected.free[wait], expected.hit[wait], expected.sides[wait] = some
-        wait = wait[left]
+        n = look(samples, n, stored, which, sensors.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
+        for sensor, image in zip(sensors.astype(np.float32), images, strict=True):
+            some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
+            left = plain_look(places[wait] - sensor, image, some)
+            expected.free[wait], expected.hit[wait], expected.sides[wait] = some
+            wait = wait[left]
         np.testing.assert_array_equal(samples.of[:n], wait)
         for found, plane in zip(counts, expected, strict=True):
             np.testing.assert_array_equal(found, plane)

@@ -133,15 +133,12 @@ def _enter_image(rows: F32, pixels: Pixels, pixel: I32, steps: I32, flat: U16, o
             out[k, s] = min(flat[middle + s], min(flat[left + s], flat[right + s]))
 
 
-def range_image(rows: F32, pixels: Pixels) -> U16:
-    """(turns, slopes) nearest horizontal range among the returns ``rows`` (3, n), metres from the sensor, in each
-    direction and to its left and right."""
+def range_image(rows: F32, pixels: Pixels, out: U16) -> None:
+    """Into ``out`` (turns, slopes) the nearest horizontal range among the returns ``rows`` (3, n), metres from the
+    sensor, in each direction and to its left and right."""
     n = rows.shape[1]
-    size = pixels.turns * pixels.slopes
-    out = np.empty((pixels.turns, pixels.slopes), np.uint16)
-    flat = np.empty(size + 1, np.uint16)
+    flat = np.empty(out.size + 1, np.uint16)
     _enter_image(rows, pixels, np.empty(n, np.int32), np.empty(n, np.int32), flat, out)
-    return out
 
 
 class Sought(NamedTuple):
@@ -213,18 +210,31 @@ def _read(n: int, image: U16, sought: Sought) -> None:
 
 @kernel
 def look(
-    samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int],
+    samples: Samples, n: int, images: U16, asked: I64, sensors: F32, pixels: Pixels, rule: tuple[float, float, int],
     counts: LookCounts, sought: Sought,
 ) -> int:  # fmt: skip
-    """Ask one scan about the first ``n`` samples, by its range ``image``, flat.
+    """Ask some scans, one after the other, about the first ``n`` samples: by the range ``images`` (m, size), flat, that
+    are ``asked`` (k,). A call for each would take as long as a tenth of its work.
 
     Counts go up in place; returns how many samples still wait.
 
-    ``sensor`` (3,) where the scan was taken, from the samples' common point. ``rule``: (metres behind a place that a
-    ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
-    of which ``enough`` scans said the same, and none the contrary, waits no longer. No step has a branch that nobody
-    could predict. ``sought``: scratch for ``n`` samples or more.
+    ``sensors`` (k, 3) where the scans were taken, from the samples' common point. ``rule``: (metres behind a place that
+    a ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
+    of which ``enough`` scans said the same, and none the contrary, waits no longer. ``sought``: scratch for ``n``
+    samples or more.
     """
+    left = np.int64(n)
+    for k in range(len(asked)):
+        left = _ask(samples, left, images[asked[k]], sensors[k], pixels, rule, counts, sought)
+    return left
+
+
+@inlined
+def _ask(
+    samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int],
+    counts: LookCounts, sought: Sought,
+) -> np.int64:  # fmt: skip
+    """:func:`look` by one image. No step has a branch that nobody could predict."""
     x, y, z, of = samples
     free, hit, sides = counts
     behind_m, height_m, enough = rule
@@ -252,7 +262,7 @@ def look(
         passed = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == BOTH_SIDES)
         settled = passed | ((free[i] == 0) & (hit[i] >= enough))
         left += np.uint64(0) if settled else np.uint64(1)
-    return int(left)
+    return np.int64(left)
 
 
 @record(votes=True)
@@ -293,13 +303,26 @@ class Movers:
 MOVERS = Movers()
 
 
+@record()
+@dataclass(frozen=True, slots=True)
+class ImageRoom:
+    """Room for the range images of the window."""
+
+    first: int = 32
+    """Images for which there is room at first: one LiDAR's of 3 s. It doubles where they are more."""
+
+
+IMAGE_ROOM = ImageRoom()
+
+
 class _Image(NamedTuple):
     """The ranges that one LiDAR measured."""
 
     origin_map: F64
     """(3,) where its rays begin, map metres."""
-    nearest: U16
-    """(azimuths, slopes) horizontal range of the nearest return around each direction, see ``range_image``."""
+    slot: int
+    """Its place among the filter's images: horizontal range of the nearest return around each direction, see
+    ``range_image``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,6 +361,9 @@ class MovingFilter:
         self._half = int(np.ceil(movers.reach_m / CELL_SIZE)) + 2
         """Cells from the sensor to the sides of the square in which voxels are grouped, which ``_plane`` is of."""
         self._plane = np.full((2 * self._half + 1,) * 2, -1, dtype=np.int32)
+        self._images = np.empty((IMAGE_ROOM.first, turns * slopes), np.uint16)
+        """Those of the window, in any order: one kernel reads many."""
+        self._free_slots = list(range(IMAGE_ROOM.first))
         self._window: deque[_Scan] = deque()
         self._waiting = 0
         """How many of the window's youngest scans are undecided."""
@@ -356,7 +382,7 @@ class MovingFilter:
         if self._window and stamp_ns <= self._window[-1].stamp_ns:
             raise ValueError(f"stamps must increase: {stamp_ns} after {self._window[-1].stamp_ns}")
         origin = np.asarray(origin_map, dtype=np.float64)
-        images = tuple(_Image(one.origin_map(origin), range_image(one.own_rows(rows), self._pixels)) for one in lidars)
+        images = tuple(_Image(one.origin_map(origin), self._drawn(one.own_rows(rows))) for one in lidars)
         chosen, voxel_of, samples = voxels(rows, obstacle, origin, self.movers.reach_m, CELL_SIZE)
         self._window.append(_Scan(stamp_ns, origin, images, len(obstacle), chosen, voxel_of, samples))
         self._waiting += 1
@@ -365,14 +391,30 @@ class MovingFilter:
     def flush(self) -> list[Bool]:
         """Decide what is left, with less than the full look ahead: the drive has ended."""
         decided = self._decide(self._window[-1].stamp_ns) if self._window else []
-        self._window.clear()
+        while self._window:
+            self._drop(self._window.pop())
         return decided
 
     def forget(self, count: int) -> None:
         """The ``count`` youngest scans, none of them decided, were taken elsewhere than told."""
         for _ in range(count):
-            self._window.pop()
+            self._drop(self._window.pop())
         self._waiting -= count
+
+    def _drawn(self, rows: F32) -> int:
+        """The slot of a new image of returns (3, n)."""
+        if not self._free_slots:
+            before = self._images
+            self._images = np.empty((2 * len(before), before.shape[1]), np.uint16)
+            self._images[: len(before)] = before
+            self._free_slots += range(len(before), len(self._images))
+        slot = self._free_slots.pop()
+        range_image(rows, self._pixels, self._images[slot].reshape(self._pixels.turns, -1))
+        return slot
+
+    def _drop(self, scan: _Scan) -> None:
+        """No later scan will ask this one."""
+        self._free_slots += [image.slot for image in scan.images]
 
     def _decide(self, up_to_ns: int) -> list[Bool]:
         """Masks of all waiting scans not younger than ``up_to_ns``; forgets what no later scan will ask for."""
@@ -385,23 +427,24 @@ class MovingFilter:
             self._waiting -= 1
             oldest_ns = self._window[at].stamp_ns - round(self.movers.past_s * 1e9)
             while self._window[0].stamp_ns < oldest_ns:
-                self._window.popleft()
+                self._drop(self._window.popleft())
         return out
 
     def _moving(self, at: int) -> Bool:
         """The mask of the window's scan ``at``, from the other scans of the window."""
         scan = self._window[at]
         movers = self.movers
-        m = left = scan.samples.shape[1]
+        m = scan.samples.shape[1]
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = scan.samples.copy()
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
-        sought = room_to_look(m)
         # Each of the other scans counts what it saw at the samples.
-        for other in (image for scan in self._witnesses(at) for image in scan.images):
-            sensor = (other.origin_map - scan.origin_map).astype(np.float32)
+        others = [image for other in self._witnesses(at) for image in other.images]
+        if others:
+            sensors = (np.array([image.origin_map for image in others]) - scan.origin_map).astype(np.float32)
+            asked = np.array([image.slot for image in others])
             rule = movers.margin_m, movers.height_m, movers.enough
-            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
+            look(waiting, m, self._images, asked, sensors, self._pixels, rule, counts, room_to_look(m))
         # Which voxels were brief, and the cell of each in a square around the sensor.
         place = np.empty(m, np.int64)
         seen_often = np.empty(m, np.bool_)
