@@ -18,6 +18,7 @@ from mapvote.core.types import U64, MapvoteError
 from mapvote.rules.packed_tiles import (
     COUNT_PLANES,
     TILE_PACKING,
+    OpenTile,
     PackedTiles,
     Shelf,
     TilePacking,
@@ -50,11 +51,16 @@ def some_planes(seed: int, share: float) -> U64:
     return np.asarray(np.where(cells, rng.integers(0, 2**64, (256, 256, 16), dtype=np.uint64), np.uint64(0)))
 
 
+def fill(opened: OpenTile, planes: U64) -> None:
+    opened.planes[:] = planes
+    opened.spans[:] = 0, 256
+
+
 def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
     tiles = PackedTiles(LATTICE, 16)
     shares = {(0, 0): 0.0, (0, 1): 0.01, (-1, 0): 1.0}
     for seed, (tile, share) in enumerate(shares.items()):
-        tiles.near(tile)[:] = some_planes(seed, share)
+        fill(tiles.near(tile), some_planes(seed, share))
     far = Grid(LATTICE, 5000, 5000, 100, 100)
     for _ in range(TILE_PACKING.bands):
         tiles.leave(far)
@@ -62,9 +68,12 @@ def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
     assert set(tiles) == set(shares)
     for seed, (tile, share) in enumerate(shares.items()):
         np.testing.assert_array_equal(tiles[tile], some_planes(seed, share))
-        np.testing.assert_array_equal(tiles.near(tile), some_planes(seed, share))
-    tiles.leave(far)
-    assert not tiles.near((5, 5)).any(), "whatever another tile left behind"
+        np.testing.assert_array_equal(tiles.near(tile).planes, some_planes(seed, share))
+    for _ in range(TILE_PACKING.bands):
+        tiles.leave(far)
+    for seed, (tile, share) in enumerate(shares.items()):
+        np.testing.assert_array_equal(tiles[tile], some_planes(seed, share))
+    assert not tiles.near((5, 5)).planes.any(), "whatever another tile left behind"
 
 
 def test_a_tile_is_left_only_when_the_view_is_far_from_it() -> None:
@@ -81,10 +90,10 @@ def test_a_tile_is_left_only_when_the_view_is_far_from_it() -> None:
 def test_what_is_counted_while_a_tile_is_being_packed_is_kept() -> None:
     tiles = PackedTiles(LATTICE, 16)
     far = Grid(LATTICE, 5000, 5000, 100, 100)
-    tiles.near((0, 0))[:] = some_planes(1, 0.01)
+    fill(tiles.near((0, 0)), some_planes(1, 0.01))
     for _ in range(TILE_PACKING.bands - 1):
         tiles.leave(far)
-    tiles.near((0, 0))[:] = some_planes(2, 0.01)
+    fill(tiles.near((0, 0)), some_planes(2, 0.01))
     for _ in range(TILE_PACKING.bands):
         tiles.leave(far)
     assert not tiles._open
@@ -95,7 +104,7 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
     """Walls were crossed seven times or met, or half of both or neither, and things rose, at random."""
     voter, rng = SurfaceVoter(VotingSettings(), point_map), np.random.default_rng(6)
     for tile in point_map.tiles:
-        planes, mapped = voter.counts.settled().near(tile), point_map.tiles[tile].obstacle_words
+        planes, mapped = voter.counts.settled().near(tile).planes, point_map.tiles[tile].obstacle_words
         fate = rng.random(mapped.shape)
         planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
         planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))

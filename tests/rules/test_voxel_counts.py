@@ -70,7 +70,7 @@ def test_a_counter_that_fills_up_is_halved_after_the_same_scan(first: int) -> No
     full[..., first : first + 7] = rng.integers(0, 2**63, (SIDE, SIDE, 1), dtype=np.uint64)
     full[..., first] = 0  # 126 in these voxels
     view = Grid(LATTICE, 0, 0, SIDE, SIDE)
-    counts.settled().near((0, 0))[:SIDE, :SIDE] = full
+    counts.settled().near((0, 0)).planes[:SIDE, :SIDE] = full
     expected.update({(r, c): full[r, c].copy() for r in range(SIDE) for c in range(SIDE)})
     for _ in range(7):
         words = scan_words(rng)

@@ -23,7 +23,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.process_memory import give_back_free_pages, zero_pages
 from mapvote.core.record import record
-from mapvote.core.types import U64, MapvoteError
+from mapvote.core.types import I32, U64, MapvoteError
 
 COUNT_PLANES = 7
 """Bit planes of a counter: counts up to 127 scans."""
@@ -94,6 +94,16 @@ class Overlap(NamedTuple):
     right: int
 
 
+class OpenTile(NamedTuple):
+    """A tile that counts."""
+
+    planes: U64
+    """(256, 256, words)."""
+    spans: I32
+    """(256, 2) of each row the first cell in which anything was counted, and the one behind the last: beside them no
+    page was ever asked for, and reading one takes as long as writing it."""
+
+
 class PackedTiles(Mapping[TileIndex, U64]):
     """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it."""
 
@@ -101,14 +111,15 @@ class PackedTiles(Mapping[TileIndex, U64]):
         self.lattice = lattice
         self.words = words
         self.packing = packing
-        self._open: dict[TileIndex, U64] = {}
+        self._open: dict[TileIndex, OpenTile] = {}
         self._shelf = Shelf(packing)
         self._leaving = defaultdict[TileIndex, list[Slot]](list)
         """Open tiles that lie far away, and those of their bands that are packed already."""
         self._packed = dict[TileIndex, list[Slot]]()
 
     def __getitem__(self, tile: TileIndex) -> U64:
-        return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile], self._new())
+        opened = self._open[tile] if tile in self._open else self._unpacked(self._packed[tile])
+        return opened.planes
 
     def __iter__(self) -> Iterator[TileIndex]:
         yield from self._open
@@ -120,13 +131,12 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def __contains__(self, tile: object) -> bool:
         return tile in self._open or tile in self._packed
 
-    def near(self, tile: TileIndex) -> U64:
-        """The planes of a tile, to be changed in place; zeros if there were none."""
+    def near(self, tile: TileIndex) -> OpenTile:
+        """A tile, to be changed in place; zeros if nothing was counted there."""
         self._leaving.pop(tile, None)
         if tile not in self._open:
             packed = self._packed.pop(tile, None)
-            planes = self._new()
-            self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
+            self._open[tile] = self._new() if packed is None else self._unpacked(packed)
         return self._open[tile]
 
     def overlap(self, tile: TileIndex, view: Grid) -> Overlap:
@@ -138,56 +148,67 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def leave(self, view: Grid) -> None:
         """Pack a band of each tile that lies far from ``view``: for every scan, so that none has it all."""
         around = view.padded(self.packing.far_cells)
-        for tile, planes in list(self._open.items()):
+        for tile, opened in list(self._open.items()):
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
                 bands = self._leaving[tile]
-                band = planes.reshape(self.packing.bands, -1, self.words)[len(bands)]
-                bands.append(self._shelf.put(_packed(band, self.packing.zstd_level)))
+                rows = TILE_CELLS // self.packing.bands
+                band = slice(len(bands) * rows, (len(bands) + 1) * rows)
+                packed = _packed(opened.planes[band], opened.spans[band], self.packing.zstd_level)
+                bands.append(self._shelf.put(packed))
                 if len(bands) == self.packing.bands:
                     self._packed[tile] = self._leaving.pop(tile)
                     del self._open[tile]
                     give_back_free_pages()
 
-    def _new(self) -> U64:
+    def _new(self) -> OpenTile:
         """Zeros in pages of their own: all go back once the tile is left, no holes stay in the heap."""
-        return np.frombuffer(zero_pages(8 * CELLS * self.words), np.uint64).reshape(TILE_CELLS, TILE_CELLS, self.words)
+        planes = np.frombuffer(zero_pages(8 * CELLS * self.words), np.uint64)
+        spans = np.zeros((TILE_CELLS, 2), np.int32)
+        spans[:, 0] = TILE_CELLS
+        return OpenTile(planes.reshape(TILE_CELLS, TILE_CELLS, self.words), spans)
 
-    def _unpacked(self, bands: list[Slot], planes: U64) -> U64:
-        """``planes``, which come empty, with the packed words."""
+    def _unpacked(self, bands: list[Slot]) -> OpenTile:
+        """The tile of these bands."""
+        planes, spans = opened = self._new()
         cells_of_band = CELLS // self.packing.bands
-        for place, band in zip(bands, planes.reshape(self.packing.bands, cells_of_band, self.words), strict=True):
+        for k, place in enumerate(bands):
             data = self._shelf.read(place)
             raw = np.frombuffer(unpack_bytes(data, cells_of_band * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
-            cells, *words = raw.reshape(self.words + 1, -1)
-            band[cells.astype(np.int64)] = np.stack(words, axis=1)
-        return planes
+            numbers, *words = raw.reshape(self.words + 1, -1)
+            rows, cols = np.divmod(numbers.astype(np.int64) + k * cells_of_band, TILE_CELLS)
+            planes[rows, cols] = np.stack(words, axis=1)
+            np.minimum.at(spans[:, 0], rows, cols)
+            np.maximum.at(spans[:, 1], rows, cols + 1)
+        return opened
 
 
-def _packed(band: U64, zstd_level: int) -> bytes:
-    """The cells of a band (cells, words) in which anything was counted, and their words plane by plane: most of the
-    higher ones are empty."""
-    out = np.empty(band.size + len(band), np.uint64)
-    n = _gather_counted(band, out)
-    return compress(out[: n * (1 + band.shape[1])].data, zstd_level)
+def _packed(planes: U64, spans: I32, zstd_level: int) -> bytes:
+    """The cells of a band (rows, 256, words), with its ``spans``, in which anything was counted, and their words plane
+    by plane: most of the higher ones are empty."""
+    cells = int(np.maximum(spans[:, 1] - spans[:, 0], 0).sum())
+    out = np.empty((1 + planes.shape[2]) * cells + 1, np.uint64)
+    n = _gather_counted(planes, spans, out)
+    return compress(out[: n * (1 + planes.shape[2])].data, zstd_level)
 
 
 @kernel
-def _gather_counted(band: U64, out: U64) -> int:
-    """Into ``out`` the numbers of the cells of a band (cells, words) in which anything was counted, then their words
-    plane by plane. Returns how many cells there are."""
-    cells, words = band.shape
+def _gather_counted(planes: U64, spans: I32, out: U64) -> int:
+    """Into ``out`` the flat numbers of the cells of a band (rows, 256, words), with its ``spans``, in which anything
+    was counted, then their words plane by plane. Returns how many cells there are."""
+    rows, cols, words = planes.shape
     n = 0
-    for cell in range(cells):
-        counted = np.uint64(0)
-        for k in range(words):
-            counted |= band[cell, k]
-        out[n] = cell
-        n += 1 if counted else 0
+    for r in range(rows):
+        for c in range(spans[r, 0], spans[r, 1]):
+            counted = np.uint64(0)
+            for k in range(words):
+                counted |= planes[r, c, k]
+            out[n] = r * cols + c
+            n += 1 if counted else 0
     for i in range(n):
-        counted_cell = np.int64(out[i])
+        row, col = divmod(np.int64(out[i]), cols)
         for k in range(words):
-            out[(k + 1) * n + i] = band[counted_cell, k]
+            out[(k + 1) * n + i] = planes[row, col, k]
     return n
 
 

@@ -17,7 +17,7 @@ from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, U64
-from mapvote.rules.packed_tiles import COUNT_PLANES, Overlap, PackedTiles, add_four, add_one
+from mapvote.rules.packed_tiles import COUNT_PLANES, OpenTile, Overlap, PackedTiles, add_four, add_one
 
 CROSSED, HIT, PASSES, PASSED = 0, COUNT_PLANES, 2 * COUNT_PLANES, 3 * COUNT_PLANES
 """First plane of each counter of a cell, and the last of its WORDS: voxels through which any ray ever went."""
@@ -112,11 +112,12 @@ def _of_scan(words: ScanWords, part: Overlap, row: int, col: int) -> tuple[np.ui
 
 @kernel
 def _enter_scans(
-    planes: U64, first: int, last: int, parts: tuple[Overlap, Overlap, Overlap, Overlap],
+    opened: OpenTile, first: int, last: int, parts: tuple[Overlap, Overlap, Overlap, Overlap],
     scans: tuple[ScanWords, ScanWords, ScanWords, ScanWords],
 ) -> None:  # fmt: skip
-    """Enter four scans, the oldest first, into the rows ``first`` to ``last`` of a tile's ``planes``, on which their
-    windows lie by ``parts``. A counter that is full is halved after the same scan as if they came one by one."""
+    """Enter four scans, the oldest first, into the rows ``first`` to ``last`` of a tile, on which their windows lie by
+    ``parts``. A counter that is full is halved after the same scan as if they came one by one."""
+    planes, spans = opened
     west = TILE_CELLS
     east = 0
     for part in parts:
@@ -133,6 +134,8 @@ def _enter_scans(
             hit = hit_a | hit_b | hit_c | hit_d
             if not rays | hit:
                 continue
+            spans[r, 0] = min(spans[r, 0], c)
+            spans[r, 1] = max(spans[r, 1], c + 1)
             cell = planes[r, c]
             cell[PASSED] |= rays
             full = add_four(cell, PASSES, missed_a, missed_b, missed_c, missed_d)
