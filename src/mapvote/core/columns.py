@@ -192,21 +192,17 @@ def lower_rows(z: F64, first: int, end: int, step: int, straight: float, diagona
     rows, cols = z.shape
     for r in range(first, end, step):
         if 0 <= r - step < rows:
-            _reach_from(z[r - step], z[r], straight, diagonal)
+            # No cell depends on another here, so that the loops vectorise.
+            row = z[r]
+            beside = z[r - step]
+            for c in range(cols):
+                row[c] = min(row[c], beside[c] + straight)
+            for c in range(cols - 1):
+                row[c] = min(row[c], beside[c + 1] + diagonal)
+                row[c + 1] = min(row[c + 1], beside[c] + diagonal)
         if step > 0:
             for c in range(1, cols):
                 z[r, c] = min(z[r, c], z[r, c - 1] + straight)
         else:
             for c in range(cols - 2, -1, -1):
                 z[r, c] = min(z[r, c], z[r, c + 1] + straight)
-
-
-@inlined
-def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None:
-    """Lower one row by the row beside it. No cell depends on another, so the compiler vectorises the loop."""
-    last = len(row) - 1
-    for c in range(last + 1):
-        row[c] = min(row[c], beside[c] + straight)
-    for c in range(last):
-        row[c] = min(row[c], beside[c + 1] + diagonal)
-        row[c + 1] = min(row[c + 1], beside[c] + diagonal)

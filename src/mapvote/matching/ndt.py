@@ -139,14 +139,14 @@ def pair_up(points: F32, T: F64, window: Window, cells: F32, room: Room) -> None
             y = (lowest[1] + SEVEN[j, 1] + 0.5) * size - origin[1]
             z = (lowest[2] + SEVEN[j, 2] + 0.5) * size - origin[2]
             for w in range(m):
-                i = np.uint64(moved[w])
+                at = np.uint64(moved[w])
                 k = np.uint64(max(partner[j, w], np.int32(0)))
                 there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
-                of[j, 0, i] = there * np.float32(home[0, i] * size + x + cells[k, 0])
-                of[j, 1, i] = there * np.float32(home[1, i] * size + y + cells[k, 1])
-                of[j, 2, i] = there * np.float32(home[2, i] * size + z + cells[k, 2])
+                of[j, 0, at] = there * np.float32(home[0, at] * size + x + cells[k, 0])
+                of[j, 1, at] = there * np.float32(home[1, at] * size + y + cells[k, 1])
+                of[j, 2, at] = there * np.float32(home[2, at] * size + z + cells[k, 2])
                 for c in range(np.uint64(3), np.uint64(9)):
-                    of[j, c, i] = there * cells[k, c]
+                    of[j, c, at] = there * cells[k, c]
 
 
 @inlined

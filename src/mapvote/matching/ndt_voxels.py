@@ -89,8 +89,8 @@ class Voxels(NamedTuple):
     """(m, 11) count, first and second moments about the voxel's centre (x y z xx xy xz yy yz zz), 1 if the distribution
     is older than they are."""
     cells: F32
-    """(m, 9) mean from the voxel's centre, and the precision xx, xy, xz, yy, yz, zz; zeros without a distribution. A row
-    mostly lies in one line of the processor's cache."""
+    """(m, 9) mean from the voxel's centre, and the precision xx, xy, xz, yy, yz, zz; zeros without a distribution. A
+    row mostly lies in one line of the processor's cache."""
 
 
 @inlined
@@ -191,15 +191,6 @@ def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
 
 
 @inlined
-def _flatten(A: F64, V: F64, thin: float) -> None:
-    """A flat patch constrains its height only. One ring on the road is a line, thin to all sides: taken literally it
-    would hold the next scan's rings where the last ones were. ``thin``: variances below it are none; A is diagonal."""
-    if A[1, 1] < thin:
-        _upright(V)
-    A[1, 1] = A[2, 2] = np.inf
-
-
-@inlined
 def _set_precision(cells: F32, k: int, A: F64, V: F64, floor_variance: float, even: float) -> None:
     """The inverse covariance of voxel ``k`` from eigenvalues (diagonal of A) and eigenvectors (columns of V).
 
@@ -245,7 +236,11 @@ def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, scratch: 
         _diagonalise(A, V)
         _order(A, V)
         if flat:
-            _flatten(A, V, thin)
+            # It constrains its height only. One ring on the road is a line, thin to all sides: taken literally it would
+            # hold the next scan's rings where the last ones were.
+            if A[1, 1] < thin:
+                _upright(V)
+            A[1, 1] = A[2, 2] = np.inf
         even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
         _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
 
@@ -391,7 +386,12 @@ class NdtGrid:
         room = self.n + sum(len(more.place) for more in others)
         if room > len(self._voxels.place):
             more = _room_for(room - self.n)
-            self._voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self._voxels, more, strict=True)))
+            place, sums, cells = self._voxels
+            self._voxels = Voxels(
+                np.concatenate([place[: self.n], more.place]),
+                np.concatenate([sums[: self.n], more.sums]),
+                np.concatenate([cells[: self.n], more.cells]),
+            )
         for part in others:
             shared = np.empty(len(part.place), dtype=np.int64)
             self.n, n_shared = join_voxels(part, self.window, self._voxels, self.n, shared)

@@ -210,11 +210,11 @@ def _read(n: int, image: U16, sought: Sought) -> None:
 
 @kernel
 def look(
-    samples: Samples, n: int, images: U16, asked: I64, sensors: F32, pixels: Pixels, rule: tuple[float, float, int],
+    samples: Samples, n: int, images: U16, slots: I64, sensors: F32, pixels: Pixels, rule: tuple[float, float, int],
     counts: LookCounts, sought: Sought,
-) -> int:  # fmt: skip
-    """Ask some scans, one after the other, about the first ``n`` samples: by the range ``images`` (m, size), flat, that
-    are ``asked`` (k,). A call for each would take as long as a tenth of its work.
+) -> np.int64:  # fmt: skip
+    """Ask some scans, one after the other, about the first ``n`` samples: by the range ``images`` (m, size), flat, in
+    the ``slots`` (k,). A call for each would take a tenth longer.
 
     Counts go up in place; returns how many samples still wait.
 
@@ -223,46 +223,38 @@ def look(
     of which ``enough`` scans said the same, and none the contrary, waits no longer. ``sought``: scratch for ``n``
     samples or more.
     """
-    left = np.int64(n)
-    for k in range(len(asked)):
-        left = _ask(samples, left, images[asked[k]], sensors[k], pixels, rule, counts, sought)
-    return left
-
-
-@inlined
-def _ask(
-    samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int],
-    counts: LookCounts, sought: Sought,
-) -> np.int64:  # fmt: skip
-    """:func:`look` by one image. No step has a branch that nobody could predict."""
     x, y, z, of = samples
     free, hit, sides = counts
     behind_m, height_m, enough = rule
-    _seek(samples, n, sensor, pixels, np.float32(height_m), sought)
-    _read(n, image, sought)
     margin = np.int32(behind_m * PER_M)
-    left = np.uint64(0)
-    for w in range(np.uint64(0), np.uint64(n)):
-        below = sought.below[w]
-        above = sought.above[w]
-        steps = sought.steps[w]
-        r = np.int32(min(sought.here[w], min(below, above)))
-        known = (sought.pixel[w] > 0) & (r != np.int32(NO_RETURN)) & (r >= steps - margin)
-        through = known & (r > steps + margin)
-        low = np.uint8(1) if below < NO_RETURN else np.uint8(0)
-        high = np.uint8(2) if above < NO_RETURN else np.uint8(0)
-        i = np.uint64(of[w])
-        x[left] = x[w]
-        y[left] = y[w]
-        z[left] = z[w]
-        of[left] = of[w]
-        free[i] += 1 if through else 0
-        hit[i] += 1 if known & ~through else 0
-        sides[i] |= low | high if through else np.uint8(0)
-        passed = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == BOTH_SIDES)
-        settled = passed | ((free[i] == 0) & (hit[i] >= enough))
-        left += np.uint64(0) if settled else np.uint64(1)
-    return np.int64(left)
+    waiting = np.int64(n)
+    for k in range(len(slots)):
+        _seek(samples, waiting, sensors[k], pixels, np.float32(height_m), sought)
+        _read(waiting, images[slots[k]], sought)
+        left = np.uint64(0)
+        # No step has a branch that nobody could predict.
+        for w in range(np.uint64(0), np.uint64(waiting)):
+            below = sought.below[w]
+            above = sought.above[w]
+            steps = sought.steps[w]
+            r = np.int32(min(sought.here[w], min(below, above)))
+            known = (sought.pixel[w] > 0) & (r != np.int32(NO_RETURN)) & (r >= steps - margin)
+            through = known & (r > steps + margin)
+            low = np.uint8(1) if below < NO_RETURN else np.uint8(0)
+            high = np.uint8(2) if above < NO_RETURN else np.uint8(0)
+            i = np.uint64(of[w])
+            x[left] = x[w]
+            y[left] = y[w]
+            z[left] = z[w]
+            of[left] = of[w]
+            free[i] += 1 if through else 0
+            hit[i] += 1 if known & ~through else 0
+            sides[i] |= low | high if through else np.uint8(0)
+            passed = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == BOTH_SIDES)
+            settled = passed | ((free[i] == 0) & (hit[i] >= enough))
+            left += np.uint64(0) if settled else np.uint64(1)
+        waiting = np.int64(left)
+    return waiting
 
 
 @record(votes=True)
@@ -442,9 +434,9 @@ class MovingFilter:
         others = [image for other in self._witnesses(at) for image in other.images]
         if others:
             sensors = (np.array([image.origin_map for image in others]) - scan.origin_map).astype(np.float32)
-            asked = np.array([image.slot for image in others])
+            slots = np.array([image.slot for image in others])
             rule = movers.margin_m, movers.height_m, movers.enough
-            look(waiting, m, self._images, asked, sensors, self._pixels, rule, counts, room_to_look(m))
+            look(waiting, m, self._images, slots, sensors, self._pixels, rule, counts, room_to_look(m))
         # Which voxels were brief, and the cell of each in a square around the sensor.
         place = np.empty(m, np.int64)
         seen_often = np.empty(m, np.bool_)
