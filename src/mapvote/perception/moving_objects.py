@@ -447,7 +447,7 @@ class MovingFilter:
         shares = movers.share_whole, movers.share_part
         moves = moving_components(place, self._plane, seen_often, brief, movers.min_voxels, *shares)
         moving = np.zeros(scan.points, np.bool_)
-        _spread_to_points(scan.chosen, scan.voxel_of, moves, moving)
+        moving[scan.chosen.take(np.flatnonzero(moves.take(scan.voxel_of)))] = True
         return moving
 
     def _witnesses(self, at: int) -> list[_Scan]:
@@ -466,13 +466,6 @@ def _spread(scans: list[_Scan], count: int) -> list[_Scan]:
     if len(scans) <= count:
         return scans
     return [scans[(k * len(scans)) // count] for k in range(count)]
-
-
-@kernel
-def _spread_to_points(chosen: I32, voxel_of: I32, moves: Bool, moving: Bool) -> None:
-    """Enter into ``moving`` (n,), of all points, whether the voxel of each of the ``chosen`` (k,) moves (m,)."""
-    for i in range(np.uint64(0), np.uint64(len(chosen))):
-        moving[np.uint64(chosen[i])] = moves[np.uint64(voxel_of[i])]
 
 
 @kernel

@@ -184,32 +184,16 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
 
 def _packed(planes: U64, spans: I32, zstd_level: int) -> bytes:
-    """The cells of a band (rows, 256, words), with its ``spans``, in which anything was counted, and their words plane
-    by plane: most of the higher ones are empty."""
-    cells = int(np.maximum(spans[:, 1] - spans[:, 0], 0).sum())
-    out = np.empty((1 + planes.shape[2]) * cells + 1, np.uint64)
-    n = _gather_counted(planes, spans, out)
-    return compress(out[: n * (1 + planes.shape[2])].data, zstd_level)
-
-
-@kernel
-def _gather_counted(planes: U64, spans: I32, out: U64) -> int:
-    """Into ``out`` the flat numbers of the cells of a band (rows, 256, words), with its ``spans``, in which anything
-    was counted, then their words plane by plane. Returns how many cells there are."""
-    rows, cols, words = planes.shape
-    n = 0
-    for r in range(rows):
-        for c in range(spans[r, 0], spans[r, 1]):
-            counted = np.uint64(0)
-            for k in range(words):
-                counted |= planes[r, c, k]
-            out[n] = r * cols + c
-            n += 1 if counted else 0
-    for i in range(n):
-        row, col = divmod(np.int64(out[i]), cols)
-        for k in range(words):
-            out[(k + 1) * n + i] = planes[row, col, k]
-    return n
+    """The flat numbers of the cells of a band (rows, 256, words), with its ``spans``, in which anything was counted,
+    and their words plane by plane: most of the higher ones are empty."""
+    cols = np.arange(TILE_CELLS)
+    near = np.flatnonzero((cols >= spans[:, :1]) & (cols < spans[:, 1:]))
+    words = planes.reshape(-1, planes.shape[2]).take(near, axis=0)
+    counted = np.flatnonzero(np.bitwise_or.reduce(words, axis=1))
+    out = np.empty((1 + words.shape[1], len(counted)), np.uint64)
+    out[0] = near.take(counted)
+    out[1:] = words.take(counted, axis=0).T
+    return compress(out.data, zstd_level)
 
 
 @kernel
