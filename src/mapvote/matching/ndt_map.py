@@ -62,6 +62,8 @@ class NdtMap:
             NdtGrid(one, window_of(np.round(sides / one.voxel_m).astype(np.int64), np.zeros(3, np.int64), one.voxel_m))
             for one in levels
         ]
+        self._map_variance = np.array([numbers.map_sigma_m**2] * 3 + [np.radians(numbers.map_sigma_deg) ** 2] * 3)
+        self._no_prior = np.eye(4), np.zeros((6, 6))
         self._room = room_for(0)
         """A megabyte that every alignment uses: new memory would be cold."""
         self.recentre(centre)
@@ -105,17 +107,16 @@ class NdtMap:
     ) -> Registration:
         """See :class:`mapvote.matching.matcher.LocalMatcher`. ``prior`` enters as a factor at the finest level."""
         T = np.array(T_map_lidar_guess, dtype=np.float64)
-        map_variance = np.array([self.numbers.map_sigma_m**2] * 3 + [np.radians(self.numbers.map_sigma_deg) ** 2] * 3)
         iterations = 0
         covariance = np.empty((6, 6))
         last = len(self.levels) - 1
         for i in range(first_level, last + 1):
             grid = self.levels[i]
             tolerance_m = max(0.001, settled[i == last] * grid.level.floor_m)
-            believed = (np.eye(4), np.zeros((6, 6)))
+            believed = self._no_prior
             if prior is not None and i == last:
                 believed = np.ascontiguousarray(prior.T_map_lidar), prior.information
-            where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, map_variance
+            where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, self._map_variance
             cloud = clouds[i - len(self.levels)]
             if cloud.shape[1] > self._room.home.shape[1]:
                 self._room = room_for(cloud.shape[1] * 5 // 4)
@@ -157,6 +158,8 @@ class MapWindow:
         self.ndt_map: NdtMap | None = None
         self._ready: dict[TileIndex, list[list[Voxels]]] = {}
         """By tile, by level."""
+        self._all_ready: tuple[int, ...] | None = None
+        """First and last row and column of tiles of a square in which every tile is ready."""
 
     def __call__(self, position: F64) -> NdtMap:
         if self.ndt_map is None or not self.ndt_map.is_central(position):
@@ -170,18 +173,26 @@ class MapWindow:
         self.ndt_map = None
         same = {tile for tile in self._ready if old.tiles.get(tile) is point_map.tiles.get(tile)}
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in same}
+        self._all_ready = None
 
     def prepare(self, position: F64) -> None:
         """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
-        ahead = [
-            tile
-            for tile in tiles_within(self.point_map, position, NDT_WINDOW.ahead_m)
-            if len(self._ready.get(tile, [])) < len(self.levels)
-        ]
+        x, y = position[:2].tolist()
+        square = window_around(self.point_map.lattice, x, y, 2 * NDT_WINDOW.ahead_m)
+        ends = square.row0, square.row0 + square.rows - 1, square.col0, square.col0 + square.cols - 1
+        tiles = tuple(end // TILE_CELLS for end in ends)
+        if tiles == self._all_ready:
+            return
+        ahead = [tile for tile in square.tiles() if tile in self.point_map.tiles and not self._is_ready(tile)]
         if ahead:
             rows, cols = self.point_map.lattice.cells_of(position[None, :2])
             here = np.array([rows[0], cols[0]]) / TILE_CELLS - 0.5
             self._step(min(ahead, key=lambda tile: float(np.hypot(*(tile - here)))))
+        else:
+            self._all_ready = tiles
+
+    def _is_ready(self, tile: TileIndex) -> bool:
+        return len(self._ready.get(tile, [])) == len(self.levels)
 
     def _step(self, tile: TileIndex) -> None:
         """One more level of a tile."""
@@ -191,9 +202,10 @@ class MapWindow:
     def _laid_out(self, position: F64) -> NdtMap:
         kept = set(tiles_within(self.point_map, position, NDT_WINDOW.kept_m))
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in kept}
+        self._all_ready = None
         here = tiles_within(self.point_map, position)
         for tile in here:
-            while len(self._ready.get(tile, [])) < len(self.levels):
+            while not self._is_ready(tile):
                 self._step(tile)
         if self.ndt_map is None:
             self.ndt_map = NdtMap(position, self.levels)

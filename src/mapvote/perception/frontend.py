@@ -172,7 +172,10 @@ class PlacedScan:
 
     def points_at(self, chosen: I64) -> F64:
         """(m, 3) map metres of the points with these indices (m,)."""
-        return np.ascontiguousarray(self.rows.take(chosen, axis=1).T + self.origin_map)
+        points = np.empty((len(chosen), 3))
+        for row, begin, axis in zip(self.rows, self.origin_map, points.T, strict=True):
+            np.add(row.take(chosen), begin, out=axis)
+        return points
 
 
 @dataclass(frozen=True, slots=True)

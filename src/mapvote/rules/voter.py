@@ -240,8 +240,8 @@ class NewPoints:
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 3 + len(self.names))), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
-        first = first_of_each(keys)
-        return every[first[np.argsort(keys[first])]]
+        first = first_of_each(keys, 1 << len(keys).bit_length())  # half of the points have a voxel of their own
+        return every.take(first[np.argsort(keys[first])], axis=0)
 
     def by_tile(self) -> Callable[[TileIndex], F64]:
         """Reader of the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 3 + k) with the k attributes of
