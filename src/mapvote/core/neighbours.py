@@ -20,6 +20,7 @@ def nearest(points: F64, places: F64, count: int, reach_m: float = np.inf) -> tu
     ordered = points[order]
     squared = np.full((len(places), count), reach_m**2)
     which = np.full((len(places), count), len(points), dtype=np.int64)
+    places = np.ascontiguousarray(places)
     _sweep(ordered, axis, places, np.searchsorted(ordered[:, axis], places[:, axis]), squared, which)
     distances = np.where(which < len(points), np.sqrt(squared), np.inf)
     return distances, np.append(order, len(points))[which]
