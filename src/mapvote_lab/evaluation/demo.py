@@ -434,16 +434,17 @@ def demo(
 
     ``show(path)`` is called with the first picture, as soon as the drives are simulated. ``keep``: the drives, the
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
-    was interrupted is continued by the next one. Two processes simulate, then compile the kernels that no run before
-    left; the memory that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
+    was interrupted is continued by the next one. Two processes compile the kernels while this one simulates, or
+    simulate where a run before has compiled them; the memory that a compiler takes ends with them. MapvoteError if
+    ``out`` cannot be written.
     """
     settings = Settings()
     work = out / "work"
     scene = Scene("street" if full else "corner", DEMO_PLAN.seed, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     with processes(2) as helpers:
-        scene.simulate(progress, helpers.map)
         compiling = _compile_in(helpers)
+        scene.simulate(progress, None if compiling else helpers.map)
         first = draw_scans(scene, out / "pictures" / "scans.png")
         if show:
             show(first[0])
