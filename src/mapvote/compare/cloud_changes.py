@@ -24,6 +24,7 @@ from mapvote.compare.register import PATCHES, Registered
 from mapvote.core.columns import rebased
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, CELLS, Grid, Lattice, TileIndex
+from mapvote.core.groups import widened
 from mapvote.core.point_map import SCANS, PointMap, all_points, has_open_ground
 from mapvote.core.record import record
 from mapvote.core.reference import above_ground_points, reference_window
@@ -202,7 +203,7 @@ def compare_cells(
             )
     # Cells with two levels of ground (measured, not filled in), and cells in which only one cloud has a surface.
     apart = (np.abs(a.ground_z - b.ground_z) > numbers.ground_apart_m) & a.own_ground & b.own_ground
-    alone = [own.low & ~_hangs(own) & ~_around(other.low, numbers.reach_cells) for own, other in ((a, b), (b, a))]
+    alone = [own.low & ~_hangs(own) & ~widened(other.low, numbers.reach_cells) for own, other in ((a, b), (b, a))]
     # Bent parts, and points that the bend explains.
     left_out = np.zeros(window.shape, dtype=np.bool_)
     if registered is not None:
@@ -228,10 +229,6 @@ def _hangs(planes: CloudPlanes) -> Bool:
     for layers in (1, 2, 4):
         below |= below >> np.uint64(layers)
     return np.asarray(below & BAND & planes.free & ~planes.words != 0)
-
-
-def _around(cells: Bool, reach: int) -> Bool:
-    return np.asarray(scipy.ndimage.maximum_filter(cells, 2 * reach + 1, mode="constant"))
 
 
 def _explained(

@@ -3,10 +3,14 @@ drive's groups, and 30 MB."""
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from mapvote.core.kernel import kernel
-from mapvote.core.types import I32, I64, U64, Bool, read_only
+from mapvote.core.types import I32, I64, U32, U64, Bool, read_only
+
+Plane = TypeVar("Plane", Bool, U32)
 
 
 def groups_of(words: U64, reach: int, rows: I64, cols: I64) -> I32:
@@ -44,8 +48,9 @@ def _label_near(rows: I64, cols: I64, words: U64, reach: int, labels: I32, stack
                         n += 1
 
 
-def widened(cells: Bool, reach: int) -> Bool:
-    """(rows, cols) the cells at most ``reach`` rows and columns away from one of ``cells`` (rows, cols)."""
+def widened(cells: Plane, reach: int) -> Plane:
+    """(rows, cols) the cells at most ``reach`` rows and columns away from one of ``cells`` (rows, cols); of words, the
+    bits of those cells."""
     out = cells.copy()
     for _ in range(reach):
         along = out.copy()

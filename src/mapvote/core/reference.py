@@ -10,6 +10,7 @@ import numpy as np
 
 from mapvote.core.columns import fill_base, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
+from mapvote.core.groups import widened
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.types import F64, U64, Reference
@@ -95,9 +96,7 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
             tile = point_map.tiles[index]
             rows, cols, here = wide.indices_of(tile.points_map[~tile.columns[1]])
             seen[rows[here], cols[here]] = True
-    seen[1:-1] |= seen[:-2] | seen[2:]
-    near = seen[1:-1, :-2] | seen[1:-1, 1:-1] | seen[1:-1, 2:]
-    return np.where(near, ~np.uint64(0), np.uint64(0))
+    return np.where(widened(seen, 1)[1:-1, 1:-1], ~np.uint64(0), np.uint64(0))
 
 
 class LocalMap:

@@ -17,6 +17,7 @@ import scipy
 from mapvote.config import NdtSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.groups import widened
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.record import record
@@ -179,14 +180,7 @@ def highest(scores: U8, most: int) -> I64:
 
 def _dilated(words: U32) -> U32:
     """Every column with those of its eight neighbours, and one layer up and down."""
-    wide = words | (words << np.uint32(1)) | (words >> np.uint32(1))
-    out = wide.copy()
-    out[1:] |= wide[:-1]
-    out[:-1] |= wide[1:]
-    rows = out.copy()
-    out[:, 1:] |= rows[:, :-1]
-    out[:, :-1] |= rows[:, 1:]
-    return out
+    return widened(words | (words << np.uint32(1)) | (words >> np.uint32(1)), 1)
 
 
 @allocating
