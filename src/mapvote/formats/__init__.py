@@ -14,6 +14,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.geometry import corners
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.options import SaidOfDrive, drive_options
@@ -255,7 +256,7 @@ def _pieces(
 
 def box_of(source: Path, point_map: PointMap) -> F64:
     """(2, 3) the lowest and the highest coordinates of a map's points; MapvoteError if it has none to write there."""
-    boxes = [(t.points_map.min(axis=0), t.points_map.max(axis=0)) for t in point_map.tiles.values() if len(t.points)]
+    boxes = [corners(tile.points_map) for tile in point_map.tiles.values() if len(tile.points)]
     if not boxes:
         raise MapvoteError(f"{source}: the map holds no points, so there is nothing to export")
     low, high = np.array(boxes).transpose(1, 0, 2)

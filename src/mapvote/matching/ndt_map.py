@@ -139,7 +139,7 @@ class NdtMap:
 def build_ndt(points_map: NDArray[np.floating], centre: F64 | None = None) -> NdtMap:
     """The NDT map of points (n, 3) in map metres, its window around ``centre`` (default: the middle of the points)."""
     if centre is None:
-        centre = 0.5 * (points_map.min(axis=0) + points_map.max(axis=0)).astype(np.float64)
+        centre = 0.5 * corners(points_map).sum(axis=0).astype(np.float64)
     ndt_map = NdtMap(centre)
     ndt_map.enter(points_map)
     return ndt_map
@@ -158,8 +158,8 @@ class MapWindow:
         self.ndt_map: NdtMap | None = None
         self._ready: dict[TileIndex, list[list[Voxels]]] = {}
         """By tile, by level."""
-        self._all_ready: tuple[int, ...] | None = None
-        """First and last row and column of tiles of a square in which every tile is ready."""
+        self._all_ready: list[TileIndex] | None = None
+        """Tiles of a square around the vehicle, of which every one in the map is ready."""
 
     def __call__(self, position: F64) -> NdtMap:
         if self.ndt_map is None or not self.ndt_map.is_central(position):
@@ -179,11 +179,10 @@ class MapWindow:
         """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
         x, y = position[:2].tolist()
         square = window_around(self.point_map.lattice, x, y, 2 * NDT_WINDOW.ahead_m)
-        ends = square.row0, square.row0 + square.rows - 1, square.col0, square.col0 + square.cols - 1
-        tiles = tuple(end // TILE_CELLS for end in ends)
+        tiles = list(square.tiles())
         if tiles == self._all_ready:
             return
-        ahead = [tile for tile in square.tiles() if tile in self.point_map.tiles and not self._is_ready(tile)]
+        ahead = [tile for tile in tiles if tile in self.point_map.tiles and not self._is_ready(tile)]
         if ahead:
             rows, cols = self.point_map.lattice.cells_of(position[None, :2])
             here = np.array([rows[0], cols[0]]) / TILE_CELLS - 0.5
