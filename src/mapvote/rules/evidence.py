@@ -113,8 +113,8 @@ def _mark_near(
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of ``occupied`` (rows,
     cols) and of the flat ``planes``: base, near, hit, apart. ``reach``: cells, below a half, so that a return reaches
-    two cells or one along each axis. Four are always entered, be they one: no branch to predict. What is near a return
-    and the map's is hit. ``chosen`` (n + 1,): scratch."""
+    two cells or one along each axis. Four are always entered, be they one: no branch to predict. A voxel near a return
+    is hit if it is the map's. ``chosen`` (n + 1,): scratch."""
     base, near, hit, apart = planes
     rows, cols = occupied.shape
     east = points[0]

@@ -358,10 +358,9 @@ def _wait_for(compiling: Sequence[Future[None]], progress: Progress) -> None:
     if not compiling:
         return
     progress("compiling kernels, once", 0, len(compiling))
-    for done, _ in enumerate(as_completed(compiling), start=1):
-        progress("compiling kernels, once", done, len(compiling))
-    for compiled in compiling:
+    for done, compiled in enumerate(as_completed(compiling), start=1):
         compiled.result()
+        progress("compiling kernels, once", done, len(compiling))
     leave_mark()
 
 
