@@ -13,7 +13,8 @@ scan, and its truth is odometry. Drives and maps are kept in OUT. Each checkout 
 
 ``--against REV`` fails where our whole scan costs a tenth more than that of a revision, in the mean without the dearest
 twentieth of the scans, which the machine may have stopped. Both have the same peers in the same run, so that the ratio
-of their ratios to a peer is the ratio of the two. The revision has our interpreter and our map.
+of their ratios to a peer is the ratio of the two. The revision has our interpreter and our map. It fails only where
+RUNS runs say so, each with new processes: beside other work one run in CI gave 1.15 for two commits with equal kernels.
 """
 
 from __future__ import annotations
@@ -59,6 +60,8 @@ AROUND_M = 40.0
 """Half of the square around the sensor in which clouds are compared, as large as our window."""
 MOST_OF_REV = 1.1
 """Ratio of our whole scan to that of the revision, from which --against fails."""
+RUNS = 3
+"""How often --against asks at most."""
 COUNTED = 0.95
 """Share of the scans, the cheapest, whose mean is compared."""
 Checkout = tuple[Path, Path]
@@ -308,12 +311,16 @@ def main() -> None:
         for side, checkout in checkouts.items():
             build(checkout, surveys, maps[side])
         T_true = read_T_map_lidar(poses, folder)
-        ms, table = judge(options.out, open_drive(folder), maps, T_true, checkouts, options.last)
-        print(table, flush=True)
-        if options.against:
+        for _ in range(RUNS):
+            ms, table = judge(options.out, open_drive(folder), maps, T_true, checkouts, options.last)
+            print(table, flush=True)
+            if not options.against:
+                return
             times = times_of_rev(ms, options.against)
-            dearer |= times > MOST_OF_REV
             print(f"whole scan: {times:.3f} times that of {options.against}; at most {MOST_OF_REV}", flush=True)
+            if times <= MOST_OF_REV:
+                return
+        dearer = True
 
     for scene in options.street:
         from mapvote_lab.simulation import simulate
