@@ -6,9 +6,9 @@ from __future__ import annotations
 from typing import TypeVar
 
 Answer = TypeVar("Answer", bound=type)
-CLOSED = {"extra": "forbid", "use_attribute_docstrings": True}
+CLOSED = {"extra": "forbid", "use_attribute_docstrings": True, "defer_build": True}
 """Configuration for pydantic: OpenAPI declares that no other member comes, and takes the text below a member as its
-description."""
+description. It is read at the first use: reading the sources for it took .5 s of each command on a store."""
 
 
 def answer(cls: Answer) -> Answer:

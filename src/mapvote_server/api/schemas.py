@@ -129,7 +129,7 @@ class RollbackAsk(Ask):
 class Answer(BaseModel):
     """Members that a model does not name never come."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
 def _answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **instead: Any) -> type[Answer]:
