@@ -37,6 +37,7 @@ NOT_RUN = {
     r"\.\./shared/data/kitti": "needs the KITTI scans: tests/evaluation/real runs it where they are",
     r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/real runs it",
     r"^mapvote evaluate court ": "needs the clouds of the real court (docs/diff.md), and takes minutes",
+    r"^mapvote demo$": "takes a minute: tests/evaluation/test_evaluate.py runs it",
     r"^mapvote demo \w*DRIVE": "needs a drive of 24 scans: tests/evaluation/test_evaluate.py runs one",
     r"maps\.example\.org": "names a server that is not here: tests/cli/test_follow.py follows a real one",
     r"^mapvote (evaluate|simulate) (street|street570|as_published)\b": (

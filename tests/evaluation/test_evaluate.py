@@ -7,11 +7,13 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import asdict
 
+from command_line import typed
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
@@ -104,14 +106,23 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_tells_its_story(tmp_path: Path) -> None:
+def test_the_demo_tells_its_story(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from html import escape
 
-    from mapvote_lab.evaluation.demo import WHY_HARDER, demo
+    from mapvote_lab.evaluation import demo
 
-    shown: list[Path] = []
-    evaluation, story = demo(tmp_path / "out", show=shown.append)
-    assert shown == [tmp_path / "out" / "pictures" / "scans.png"], "the first picture, before a map is there"
+    told: list[tuple[Evaluation, demo.Story]] = []
+    run = demo.demo
+
+    def watched(*words: Any, **options: Any) -> tuple[Evaluation, demo.Story]:
+        told.append(run(*words, **options))
+        return told[-1]
+
+    monkeypatch.setattr(demo, "demo", watched)
+    monkeypatch.chdir(tmp_path)
+    said = typed("demo").splitlines()
+    evaluation, story = told[0]
+    assert said.index("first picture: out/pictures/scans.png") < said.index("What changed") < said.index("Next steps")
     assert not (tmp_path / "out" / "work").exists()
     assert story.drives_bytes > sum(file.stat().st_size for file in (tmp_path / "out").rglob("*") if file.is_file())
     assert all(story.objects.found)
@@ -121,7 +132,7 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     html = (tmp_path / "out" / "report.html").read_text()
     assert "Beside the paper&#x27;s own table" in html
     assert evaluation.result.settings["paper"]["occluded"] == "abstains"
-    assert all(escape(sentence) in html for sentence in WHY_HARDER)
+    assert all(escape(sentence) in html for sentence in demo.WHY_HARDER)
     assert len(html) < 12_000_000
     assert "Table IV: F1, mean of the three classes" in html
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
