@@ -14,7 +14,7 @@ from mapvote.compare.point_to_plane import PLANE_MATCH, Surface, refine_on_plane
 from mapvote.core.geometry import exp, exps, hat, inverse, logs, rotation_angle, transform
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.record import record
-from mapvote.core.types import F64, Bool, MapvoteError
+from mapvote.core.types import F64, I64, Bool, MapvoteError
 from mapvote.core.voxels import voxel_downsample
 from mapvote.matching.coarse_search import COARSE_SEARCH, place_without_prior, stands
 from mapvote.matching.matcher import likelihood_at
@@ -86,8 +86,12 @@ class Patches:
     lever_m: F64
     """(k,) from the nearest place of the path from which a, or b, was measured, whichever is farther; 0 if no path is
     known."""
-    points: tuple[tuple[F64, F64], ...]
-    """For each patch: a's points around it, and its own from its centre."""
+    thin_a: F64
+    """(n, 3) points of a, thinned to ``thin_m``."""
+    thin_b: F64
+    """(m, 3) points of b, likewise, in b's frame."""
+    points: tuple[tuple[I64, I64], ...]
+    """For each patch: which of ``thin_a`` lie around it, and which of ``thin_b`` in it."""
     numbers: PatchNumbers = PATCHES
 
     def residuals(self, T_a_b: F64) -> F64:
@@ -100,7 +104,8 @@ class Patches:
     def gain(self, k: int, T_a_b: F64) -> float:
         """Share of its likelihood by which patch k fits better at its own place than under one motion. Only points
         above the ground count: its ground fits everywhere."""
-        near, own_points = self.points[k]
+        near = self.thin_a[self.points[k][0]]
+        own_points = self.thin_b[self.points[k][1]] - self.centre_b[k]
         ndt_map = _ndt(near, self.T_a_patch[k, :3, 3], self.numbers)
         clouds = thin_for_levels(own_points[stands(own_points)])
         other = T_a_b.copy()
@@ -111,15 +116,21 @@ class Patches:
 
     def apart_m(self, T_a_b: F64) -> F64:
         """(m,) how far each compared patch moves from one motion to where it lies on the surfaces of a, metres."""
+        surface_a = Surface.of(self.thin_a)
+        surface_b = Surface.of(self.thin_b)
+        compared = np.flatnonzero(self.compared)
+        # Patches share points: each normal is taken once, and as many as decide where b lies on a.
+        matched = np.unique(np.concatenate([self.points[k][1] for k in compared]))
+        matched = np.random.default_rng(0).permutation(matched)[: PLANE_MATCH.most_points]
+        normal, flatness = surface_b.normals(self.thin_b[matched])
         out = []
-        for k in np.flatnonzero(self.compared):
-            near, own_points = self.points[k]
+        for k in compared:
+            own = np.isin(matched, self.points[k][1])
             start = T_a_b.copy()
             start[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
             information = np.asarray(np.linalg.inv(self.covariance[k]), dtype=np.float64)
-            refined = refine_on_planes(
-                Surface.of(near), own_points, Surface.of(own_points).normals(own_points), start, information
-            )
+            points = self.thin_b[matched[own]] - self.centre_b[k]
+            refined = refine_on_planes(surface_a, points, (normal[own], flatness[own]), start, information)
             out.append(np.linalg.norm(refined[:3, 3] - start[:3, 3]))
         return np.array(out)
 
@@ -159,12 +170,14 @@ def register_patches(
     for corner in corners:
         # The points of b in the patch, and those of a around it.
         middle = numbers.step_m * (corner + 0.5)
-        own_points = thin_b[tree_b.query_ball_point(middle, numbers.side_m / 2, p=np.inf)]
-        if len(own_points) < numbers.min_points:
+        own = np.array(tree_b.query_ball_point(middle, numbers.side_m / 2, p=np.inf), dtype=np.int64)
+        if len(own) < numbers.min_points:
             continue
+        own_points = thin_b[own]
         centre = np.array([*middle, np.median(own_points[:, 2])])
         at = T[:3, :3] @ centre + T[:3, 3]
-        near = thin_a[tree_a.query_ball_point(at[:2], numbers.side_m / 2 + numbers.around_m, p=np.inf)]
+        reach_m = numbers.side_m / 2 + numbers.around_m
+        near = np.array(tree_a.query_ball_point(at[:2], reach_m, p=np.inf), dtype=np.int64)
         clouds = thin_for_levels(own_points - centre)
         if clouds[-1].shape[1] < numbers.min_points or len(near) < numbers.min_points:
             continue
@@ -172,14 +185,14 @@ def register_patches(
         guess = np.eye(4)
         guess[:3, :3] = T[:3, :3]
         guess[:3, 3] = at
-        fit = _ndt(near, at, numbers).refine(clouds, guess)
+        fit = _ndt(thin_a[near], at, numbers).refine(clouds, guess)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1]))
         centres.append(centre)
         poses.append(fit.T_map_lidar)
         covariances.append(fit.covariance)
         inliers.append(fit.inlier_share)
         levers_m.append(max((tree.query(at)[0] for tree in path_trees), default=0.0))
-        kept.append((near, own_points - centre))
+        kept.append((near, own))
         compared.append(fit.inlier_share > numbers.min_inliers and sigma_m < numbers.sure_m)
     if not centres:
         raise MapvoteError("the clouds do not overlap: no piece of one lies where the other has points")
@@ -190,6 +203,8 @@ def register_patches(
         np.array(inliers),
         np.array(compared),
         np.array(levers_m),
+        thin_a,
+        thin_b,
         tuple(kept),
         numbers,
     )
