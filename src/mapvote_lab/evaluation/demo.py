@@ -25,6 +25,7 @@ from mapvote.core.record import record
 from mapvote.core.types import F64, Bool, CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, write_map
 from mapvote.formats.atomic import whole_file, write_whole
+from mapvote.formats.drives.trajectory import read_poses
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.matching.localiser import GivenPoses
@@ -41,6 +42,7 @@ from mapvote_lab.evaluation.real_street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.scene import Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
+from mapvote_lab.evaluation.truths import read_moving
 from mapvote_lab.simulation.processes import processes
 from mapvote_server.questions.changes import changes_between, cutouts_between
 from mapvote_server.store.store import Store, url_of
@@ -234,32 +236,32 @@ def drives_sentence(story: Story, folder: Path) -> str:
     return f"{size} are in {folder.parent}." if story.kept else f"{size} were written and deleted; --keep keeps them."
 
 
-def draw_scans(scene: Scene, path: Path) -> Picture:
-    """Draw what the survey and the first vehicle measured, at the true poses of the simulator: what a vote compares."""
+def draw_scans(folder: Path, survey: str, vehicle: str, path: Path) -> Picture:
+    """Draw what a survey and a vehicle of a simulated scene measured, at the true poses: what a vote compares."""
     panels = []
-    for name, title in ((scene.drive_names("survey_")[0], "(a) The survey"), (scene.drive_names("v")[0], "(b) Later")):
-        points, moving, ground_z = _measured(scene, name)
+    for name, title in ((survey, "(a) The survey"), (vehicle, "(b) Later")):
+        points, moving, ground_z = _measured(folder, name)
         colours = figures.shades(points[:, 2] - ground_z)
         colours[moving] = to_rgb(Colour.MOVING)
         panels.append((f"{title}: {len(points):,} returns", points, colours))
-    middle = scene.true_poses(scene.drive_names("v")[0])[:, :3, 3].mean(axis=0)
+    middle = read_poses(folder / "truth" / vehicle / "poses.txt")[:, :3, 3].mean(axis=0)
     camera = figures.Camera((float(middle[0]), float(middle[1]), 0.0), 62.0, 205.0, 40.0)
     save(figures.draw(panels, camera, legend=[("moving", Colour.MOVING)], size_m=0.12), path)
     return path, "Points of the LiDARs before and after the change, at the true poses; bodies that move in orange."
 
 
-def _measured(scene: Scene, name: str, step: int = 4) -> tuple[F64, Bool, float]:
+def _measured(folder: Path, name: str, step: int = 4) -> tuple[F64, Bool, float]:
     """(points (n, 3) in map metres, whether each is on a moving body (n,), height of the road) of every ``step``-th
     scan of a drive."""
-    drive = scene.drive(name)
-    poses = scene.true_poses(name)
+    drive = open_drive(folder / name)
+    poses = read_poses(folder / "truth" / name / "poses.txt")
     localise = GivenPoses(drive.stamps_ns, poses)
     points = []
     moving = []
     for i in range(0, len(drive), step):
         [fix] = localise.push(drive.read_scan(i), None)
         points.append(transform(fix.registration.T_map_lidar, fix.points))
-        moving.append(scene.truth.moving(name, i))
+        moving.append(read_moving(folder / "truth", name, i))
     road_z = float(np.median(poses[:, 2, 3]) - drive.T_base_lidar[2, 3])
     return np.concatenate(points), np.concatenate(moving), road_z
 
@@ -431,7 +433,7 @@ def demo(
 ) -> tuple[Evaluation, Story]:
     """Simulate, build, let three vehicles vote, update, evaluate; everything into ``out``.
 
-    ``show(path)`` is called with the first picture, as soon as the drives are simulated. ``keep``: the drives, the
+    ``show(path)`` is called with the first picture, as soon as two drives are simulated. ``keep``: the drives, the
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
     was interrupted is continued by the next one. Two processes compile the kernels while this one simulates, or
     simulate where a run before has compiled them; the memory that a compiler takes ends with them. MapvoteError if
@@ -441,12 +443,16 @@ def demo(
     work = out / "work"
     scene = Scene("street" if full else "corner", DEMO_PLAN.seed, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
+    pictures: list[Picture] = []
+
+    def begun(folder: Path, survey: str, vehicle: str) -> None:
+        pictures.append(draw_scans(folder, survey, vehicle, out / "pictures" / "scans.png"))
+        if show:
+            show(pictures[0][0])
+
     with processes(2) as helpers:
         compiling = _compile_in(helpers)
-        scene.simulate(progress, None if compiling else helpers.map)
-        first = draw_scans(scene, out / "pictures" / "scans.png")
-        if show:
-            show(first[0])
+        scene.simulate(progress, None if compiling else helpers.map, begun)
         _wait_for(compiling, progress)
     evaluation = evaluate(scene, cases, progress=progress)
     give_back_free_pages()
@@ -455,7 +461,7 @@ def demo(
     ballots = [drive.ballots[CASE] for drive in evaluation.drives]
     with ThreadPoolExecutor(1) as waiting:
         serving = waiting.submit(vote_by_http, ballots, out / "map_before", work / "server")
-        pictures = [first, *gallery(evaluation, CASE, out / "pictures")]
+        pictures += gallery(evaluation, CASE, out / "pictures")
         done = serving.result()
     if not follows(evaluation.first_map, done.updated, evaluation.outcomes[CASE].updated):
         raise MapvoteError("the server's map is not the one that the offline rule makes; please report this bug")

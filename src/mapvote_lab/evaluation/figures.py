@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from mapvote import plots as style
 from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
+from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
 from mapvote_lab.evaluation.scores import NEIGHBOURS, PAPER_F1, CaseResult, Reliability, cells_with
 
@@ -61,6 +61,10 @@ class Camera:
         return pixels, depth
 
 
+MOST_PIXELS = 9
+"""Side of the largest square that a point is drawn as."""
+
+
 def shades(height: F64) -> F32:
     """(n, 3) grey-blue by height above ground (n,), metres: pale ground, darker walls."""
     share = np.clip((height[:, None] - 0.2) / 9.0, 0.0, 1.0)
@@ -75,32 +79,33 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
     """(height, width, 4) opaque image of points (n, 3) in their ``colours`` (n, 3), each a square of ``size_m``.
 
     Bytes with a fourth channel: matplotlib resamples them as float32, an image without one as float64."""
-    image = np.ones((camera.height, camera.width, 3), dtype=np.float32)
-    depth_image = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    # The nearest point of each pixel, in an image with a margin: the squares of the others lie behind its square.
     pixels, depth = camera.project(points)
+    rows, cols = camera.height + 2 * MOST_PIXELS, camera.width + 2 * MOST_PIXELS
+    x, y = np.floor(pixels.T).astype(np.int64) + MOST_PIXELS
     order = np.argsort(-depth, kind="stable")
-    order = order[depth[order] > 1.0]
-    corner: I64 = np.floor(pixels[order]).astype(np.int64)
-    sizes = np.clip(np.ceil(size_m * camera.focal / depth[order]), 2, 9).astype(np.int64)
+    order = order[((depth > 1.0) & (x >= 0) & (x < cols) & (y >= 0) & (y < rows))[order]]
+    nearest = np.full(rows * cols, -1)
+    nearest[(y * cols + x)[order]] = order
+    nearest = nearest[nearest >= 0]
+    depth = depth[nearest].astype(np.float32)
     # Sizes fall into few groups; far ones first, so that nearer points overwrite.
+    sizes = np.clip(np.ceil(size_m * camera.focal / depth), 2, MOST_PIXELS).astype(np.int64)
+    corner = (y * cols + x)[nearest] - (sizes // 2) * (cols + 1)
+    drawn = np.full((rows + MOST_PIXELS) * cols, -1)
+    depths = np.full(len(drawn), np.inf, dtype=np.float32)
     for size in np.unique(sizes):
-        chosen = order[sizes == size]
-        at = corner[sizes == size] - size // 2
-        for dx in range(size):
-            for dy in range(size):
-                x = at[:, 0] + dx
-                y = at[:, 1] + dy
-                inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-                xi = x[inside]
-                yi = y[inside]
-                who = chosen[inside]
-                nearer = depth[who] <= depth_image[yi, xi]
-                xi = xi[nearer]
-                yi = yi[nearer]
-                who = who[nearer]
-                image[yi, xi] = colours[who]
-                depth_image[yi, xi] = depth[who]
-    image *= _eye_dome(depth_image)[..., None]
+        chosen = np.flatnonzero(sizes == size)
+        for offset in (np.arange(size)[:, None] * cols + np.arange(size)).ravel():
+            at = corner[chosen] + offset
+            nearer = depth[chosen] <= depths[at]
+            drawn[at[nearer]] = chosen[nearer]
+            depths[at[nearer]] = depth[chosen][nearer]
+    # Without the margin, in colour.
+    inside = np.s_[MOST_PIXELS : MOST_PIXELS + camera.height, MOST_PIXELS : MOST_PIXELS + camera.width]
+    drawn = drawn.reshape(-1, cols)[inside]
+    image = np.where((drawn >= 0)[..., None], colours[nearest[drawn]], np.float32(1.0))
+    image *= _eye_dome(depths.reshape(-1, cols)[inside])[..., None]
     opaque = np.full((camera.height, camera.width, 4), 255, dtype=np.uint8)
     opaque[..., :3] = np.rint(255.0 * image)
     return opaque

@@ -47,6 +47,7 @@ from mapvote.vehicle import write_ballot
 from mapvote_lab.evaluation.cases import Case, CountedBy, KeptDrive, Progress, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.drives import Begun
 from mapvote_lab.simulation.processes import Run, processes
 from mapvote_lab.simulation.scenario import load_scenario
 
@@ -106,12 +107,15 @@ class Scene:
         key = key_of(sources_digest(_MAP_FROM), *settings, self.poses)
         return self.folder.with_name(f"{self.folder.name}-made") / key
 
-    def simulate(self, progress: Progress = untold, run: Run | None = None) -> None:
-        """Simulate the drives, unless the cache holds them. ``run``: by these processes."""
-        if not self.folder.exists():
+    def simulate(self, progress: Progress = untold, run: Run | None = None, begun: Begun | None = None) -> None:
+        """Simulate the drives, unless the cache holds them. ``run``: by these processes. ``begun``: see there."""
+        if self.folder.exists():
+            if begun:
+                begun(self.folder, self.drive_names("survey_")[0], self.drive_names("v")[0])
+        else:
             made = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
             report = partial(progress, "simulating")
-            simulate(self.scenario, made, self.seed, progress=report, overrides=self.overrides, run=run)
+            simulate(self.scenario, made, self.seed, progress=report, overrides=self.overrides, run=run, begun=begun)
             os.replace(made, self.folder) if not self.folder.exists() else shutil.rmtree(made)
 
     def prepare(self, progress: Progress = untold) -> None:

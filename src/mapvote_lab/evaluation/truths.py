@@ -112,7 +112,7 @@ class Truth:
 
     def moving(self, drive: str, scan: int) -> Bool:
         """(n,) which points of the scan's file hit a body that moves."""
-        return np.asarray(np.load(self.folder / drive / "moving" / f"{scan:06d}.npy"), dtype=np.bool_)
+        return read_moving(self.folder, drive, scan)
 
     def surfaces(self) -> tuple[F64, F64, F64]:
         """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
@@ -133,6 +133,11 @@ class Truth:
         for (cx, cy), (nx, ny) in zip(corners, outward, strict=True):
             inside &= (x[None, :] - cx) * nx + (y[:, None] - cy) * ny <= around_m
         return inside
+
+
+def read_moving(truth: Path, drive: str, scan: int) -> Bool:
+    """(n,) which points of the scan's file hit a body that moves, from the folder of a truth."""
+    return np.asarray(np.load(truth / drive / "moving" / f"{scan:06d}.npy"), dtype=np.bool_)
 
 
 def read_truth(scene: Path) -> Truth:

@@ -39,6 +39,8 @@ from mapvote_lab.simulation.world import Role, World, make_world
 
 Progress = Callable[[int, int], None]
 """Called with (scans done, scans in all)."""
+Begun = Callable[[Path, str, str], None]
+"""Called with (folder, first survey, first vehicle) when these two drives and their truth are in the folder."""
 
 
 def simulate(
@@ -50,13 +52,15 @@ def simulate(
     overrides: Mapping[str, Any] | None = None,
     workers: int | None = None,
     run: Run | None = None,
+    begun: Begun | None = None,
 ) -> None:
     """Write the drive folders ``out``/survey_1.., ``out``/v1.. and ``out``/truth; ``out`` appears whole.
 
     ``scenario`` is a name (:func:`mapvote_lab.simulation.scenario.scenario_names`) or a TOML file, ``overrides``
     replace its fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per
-    core for long drives) nor on ``run``, a map over tasks by processes that are there already. MapvoteError if ``out``
-    exists or the scenario is not valid.
+    core for long drives) nor on ``run``, a map over tasks by processes that are there already. The first survey and the
+    first vehicle drive before all others, and then ``begun`` is called. MapvoteError if ``out`` exists or the scenario
+    is not valid.
     """
     out = Path(out)
     if out.exists():
@@ -70,13 +74,22 @@ def simulate(
         writers = [_writer(partial, route, stage).open() for route in stage.routes]
         for route in stage.routes:
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
+        T = T_map_street(spec)
+        survey, vehicle = first = _first_drives(stage)
+        waiting = {*first}
+
+        def close(drive: int) -> None:
+            route = stage.routes[drive]
+            writers[drive].close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, drive])))
+            write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
+            if drive in waiting:
+                waiting.remove(drive)
+                if begun and not waiting:
+                    begun(partial, stage.routes[survey].name, stage.routes[vehicle].name)
+
         with nullcontext(run) if run else mapping(workers or _processes(stage)) as by_task:
+            recorded = _drive_all(stage, partial, by_task, progress, close)
             dense = by_task(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
-            recorded = _drive_all(stage, partial, by_task, progress)
-            T = T_map_street(spec)
-            for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
-                writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
-                write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
             write_truth(partial / "truth", stage.world, spec, list(dense), recorded)
         os.replace(partial, out)
     finally:
@@ -161,12 +174,22 @@ def _processes(stage: Stage) -> int:
     return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
 
 
-def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) -> Recorded:
-    """Drive every route."""
+def _first_drives(stage: Stage) -> tuple[int, int]:
+    """(first survey, first vehicle): indices of their routes."""
+    surveys = [route.vehicle is None for route in stage.routes]
+    return surveys.index(True), surveys.index(False)
+
+
+def _drive_all(
+    stage: Stage, folder: Path, run: Run, progress: Progress | None, close: Callable[[int], None]
+) -> Recorded:
+    """Drive every route, the first survey and the first vehicle before the others; ``close(route)`` ends each."""
+    first_drives = _first_drives(stage)
+    order = [*first_drives, *(drive for drive in range(len(stage.routes)) if drive not in first_drives)]
     scans_a_task = 40  # small enough to keep two processes busy to the end
     tasks = [
         (stage.scenario, stage.seed, folder, drive, first, min(first + scans_a_task, route.scans))
-        for drive, route in enumerate(stage.routes)
+        for drive, route in ((drive, stage.routes[drive]) for drive in order)
         for first in range(0, route.scans, scans_a_task)
     ]
     scans = sum(route.scans for route in stage.routes)
@@ -183,6 +206,8 @@ def _drive_all(stage: Stage, folder: Path, run: Run, progress: Progress | None) 
         done += task[5] - task[4]
         if progress:
             progress(done, scans)
+        if task[5] == stage.routes[task[3]].scans:
+            close(task[3])
     return Recorded(survey=totals[0], vehicles=totals[1], densest=densest, passed=passed)
 
 
