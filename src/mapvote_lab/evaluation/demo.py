@@ -436,7 +436,7 @@ def demo(
     ``show(path)`` is called with the first picture, as soon as two drives are simulated. ``keep``: the drives, the
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
     was interrupted is continued by the next one. Two processes compile the kernels while this one simulates, or
-    simulate where a run before has compiled them; the memory that a compiler takes ends with them. MapvoteError if
+    simulate where a run before has compiled them. Two of the three vehicles drive in them. MapvoteError if
     ``out`` cannot be written.
     """
     settings = Settings()
@@ -454,7 +454,7 @@ def demo(
         compiling = _compile_in(helpers)
         scene.simulate(progress, None if compiling else helpers.map, begun)
         _wait_for(compiling, progress)
-    evaluation = evaluate(scene, cases, progress=progress)
+        evaluation = evaluate(scene, cases, progress=progress, helpers=helpers)
     give_back_free_pages()
     progress("server and pictures", 0, 1)
     write_map(evaluation.first_map, out / "map_before")

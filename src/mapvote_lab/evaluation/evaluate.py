@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -196,8 +197,9 @@ def evaluate(
     with_yardsticks: bool = False,
     progress: Progress = untold,
     readings: str | None = None,
+    helpers: Executor | None = None,
 ) -> Evaluation:
-    """Run what the cache lacks, decide and score every case. Two processes where there are two cores.
+    """Run what the cache lacks, decide and score every case. Two processes where there are two cores, or ``helpers``.
 
     ``readings``: the open sentence of the paper (a setting of ``[paper]``) whose other readings are scored too; "all":
     every sentence; None: no other reading.
@@ -206,7 +208,7 @@ def evaluate(
     scene.prepare(progress)
     prepared = time.perf_counter()
     workers = min(2, os.cpu_count() or 1)
-    drives = passes(scene, cases, workers, progress, keep=readings is not None)
+    drives = passes(scene, cases, workers, progress, readings is not None, helpers)
     voted = time.perf_counter()
     truth = scene.truth
     first_map = scene.point_map

@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -238,12 +238,17 @@ class Pass:
 
 
 def passes(
-    scene: Scene, cases: Sequence[Case], workers: int, progress: Progress = untold, keep: bool = False
-) -> list[Pass]:  # fmt: skip
+    scene: Scene,
+    cases: Sequence[Case],
+    workers: int,
+    progress: Progress = untold,
+    keep: bool = False,
+    helpers: Executor | None = None,
+) -> list[Pass]:
     """The passes of all voting vehicles, in order of their numbers; those that the cache lacks are driven.
 
-    The first is driven in this process, the others in ``workers`` - 1 further ones. ``keep``: what each scan says is
-    kept too.
+    The first is driven in this process, the others by ``helpers``, or else in ``workers`` - 1 further processes.
+    ``keep``: what each scan says is kept too.
     """
     names = scene.drive_names("v")
     missing = [name for name in names if not pass_folder(scene, cases, name, keep).exists()]
@@ -253,8 +258,8 @@ def passes(
         progress("voting", next(done), len(names))
 
     tell()
-    shared = workers > 1 and len(missing) > 1
-    with processes(workers - 1) if shared else nullcontext() as pool:
+    shared = workers > 1 and len(missing) > 1 and not helpers
+    with processes(workers - 1) if shared else nullcontext(helpers) as pool:
         elsewhere = [pool.submit(drive_once, scene, cases, name, keep) for name in missing[1:]] if pool else []
         for name in missing[:1] if pool else missing:
             drive_once(scene, cases, name, keep)
