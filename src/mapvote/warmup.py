@@ -118,14 +118,16 @@ def leave_mark() -> None:
 
 
 def compile_for_maps() -> None:
-    """Compile what a map that is built by SLAM needs."""
+    """Compile what a map that is built by SLAM and a vehicle that localises in it need. What falls comes first: beside
+    :func:`compile_for_votes` in another process the voters, which both need, are in the cache after that."""
     with seldom_collecting():
-        build_map([_drive(_street(demolished=False), turning=True)], Settings())
+        _let_fall()
+        point_map = build_map([_drive(_street(demolished=False), turning=True)], Settings())[0]
+        vote_drive(_drive(_street(demolished=True), turning=True), point_map, Settings())
 
 
 def compile_for_votes() -> None:
-    """Compile what a drive that votes and the fusion need. The localisation comes last, for the SLAM shares most of its
-    kernels: beside :func:`compile_for_maps` in another process they are in the cache by then."""
+    """Compile what a drive that votes at given poses and the fusion need."""
     with seldom_collecting():
         point_map = map_from_points(_street(demolished=False))
         drive = _drive(_street(demolished=True), turning=True)
@@ -134,8 +136,6 @@ def compile_for_votes() -> None:
         by_case = [choose_case(Settings(), rule) for rule in RULES]
         ballots = [vote_drive(drive, point_map, settings, localise=given)[0] for settings in by_case]
         _fuse(point_map, ballots, Settings())
-        _let_fall()
-        vote_drive(drive, point_map, Settings())
 
 
 def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:
