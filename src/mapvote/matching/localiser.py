@@ -321,8 +321,8 @@ class Localiser:
             self._doubt()
 
     def _doubt(self) -> bool:
-        """The track does not hold at the newest scan. What was given out of it stands if it holds at the scan before,
-        and is taken back if not. Returns which."""
+        """The track does not hold at the newest scan. Poses that were given out stand if it holds at the scan before,
+        and are taken back if not. Returns which."""
         stands = self._confirmed and len(self._waiting) > 1 and self.judge.holds(self._verdict(-2))
         if stands:
             self._learn_of_given()

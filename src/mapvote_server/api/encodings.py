@@ -1,4 +1,4 @@
-"""What a client takes: content codings and media types with their weights (RFC 9110, 12.5)."""
+"""Preferences of a client: content codings and media types with their weights (RFC 9110, 12.5)."""
 
 from __future__ import annotations
 

@@ -10,9 +10,10 @@ import sqlalchemy as sa
 
 from mapvote.codec.manifest import TileHashes
 from mapvote.codec.tile_planes import unpack_points_plane
+from mapvote.core.geometry import corners
 from mapvote.core.grid import TileIndex
 from mapvote.core.times import utc
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.geo.stac import Extent, MapVersion, stac_catalog, stac_collection, stac_item
 from mapvote_server.errors import NotFound
@@ -84,24 +85,23 @@ def _absolute(content: dict[str, Any], url: str) -> dict[str, Any]:
     return content | {"links": links} | ({"assets": assets} if assets else {})
 
 
-_boxes: PerStore[dict[str, F64]] = PerStore(dict)
+_boxes: PerStore[dict[str, F32]] = PerStore(dict)
 """(2, 3) lowest and highest point of a plane, from the tile's corner, by the plane's hash: planes never change."""
 
 
 def _corners(store: Store, connection: sa.Connection, tiles: dict[TileIndex, TileHashes]) -> F64:
     """(2, 3) lowest and highest coordinates, map metres."""
     boxes = _boxes.of(store)
-    corners = []
+    boxes_map = []
     for index, hashes in tiles.items():
         box = boxes.get(hashes.points)
         if box is None:
             check_time()
             points = unpack_points_plane(load_blob(connection, hashes.points), hashes.points)
-            box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.empty((0, 3))
+            box = (corners(points) if len(points) else points).astype(np.float32)
             boxes[hashes.points] = box
         if len(box):
-            corners.append(store.lattice.tile(index).to_map(box.astype(np.float32)))
-    if not corners:
+            boxes_map.append(store.lattice.tile(index).to_map(box))
+    if not boxes_map:
         raise MapvoteError("the map holds no points, so the catalogue has no place for it")
-    low, high = np.array(corners).transpose(1, 0, 2)
-    return np.array([low.min(axis=0), high.max(axis=0)])
+    return np.asarray(corners(np.concatenate(boxes_map)), dtype=np.float64)

@@ -37,7 +37,7 @@ max_body_bytes = 300000
 work_s_per_minute = 1e9
 rows_per_minute = 1e12
 """
-EXAMPLES = os.environ.get("EXAMPLES", "10")
+EXAMPLES = os.environ.get("EXAMPLES", "6")
 """Generated requests of each kind and route."""
 MUTANTS = int(os.environ.get("MUTANTS", "3000"))
 
