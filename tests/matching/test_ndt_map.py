@@ -152,8 +152,8 @@ def assert_whole(joined: NdtMap, point_map: PointMap, position: F64) -> None:
     for ours, theirs in zip(joined.levels, whole.levels, strict=True):
         found, expected = by_place(ours), by_place(theirs)
         assert found.keys() == expected.keys()
-        for place, values in expected.items():
-            np.testing.assert_allclose(found[place], values, rtol=1e-9, atol=1e-9)
+        values = np.array([found[place] for place in expected])
+        np.testing.assert_allclose(values, np.array([*expected.values()]), rtol=1e-9, atol=1e-9)
 
 
 def test_tiles_joined_are_the_map_of_all_their_points_also_if_they_were_made_ready_ahead(point_map: PointMap) -> None:

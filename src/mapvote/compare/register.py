@@ -170,14 +170,13 @@ def register_patches(
     for corner in corners:
         # The points of b in the patch, and those of a around it.
         middle = numbers.step_m * (corner + 0.5)
-        own = np.array(tree_b.query_ball_point(middle, numbers.side_m / 2, p=np.inf), dtype=np.int64)
+        own = _in_square(tree_b, middle, numbers.side_m / 2)
         if len(own) < numbers.min_points:
             continue
         own_points = thin_b[own]
         centre = np.array([*middle, np.median(own_points[:, 2])])
         at = T[:3, :3] @ centre + T[:3, 3]
-        reach_m = numbers.side_m / 2 + numbers.around_m
-        near = np.array(tree_a.query_ball_point(at[:2], reach_m, p=np.inf), dtype=np.int64)
+        near = _in_square(tree_a, at[:2], numbers.side_m / 2 + numbers.around_m)
         clouds = thin_for_levels(own_points - centre)
         if clouds[-1].shape[1] < numbers.min_points or len(near) < numbers.min_points:
             continue
@@ -208,6 +207,11 @@ def register_patches(
         tuple(kept),
         numbers,
     )
+
+
+def _in_square(tree: scipy.spatial.KDTree, middle: F64, half_m: float) -> I64:
+    """Which points of a tree lie in the square around ``middle`` (2,)."""
+    return np.array(tree.query_ball_point(middle, half_m, p=np.inf), dtype=np.int64)
 
 
 def _thinned(points: F64, size_m: float) -> F64:
