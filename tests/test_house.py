@@ -81,8 +81,13 @@ def parsed(source: Path) -> ast.Module:
     return ast.parse(source.read_text())
 
 
+@cache
+def nodes(source: Path) -> list[ast.AST]:
+    return list(ast.walk(parsed(source)))
+
+
 def functions(source: Path) -> Iterator[Function]:
-    for node in ast.walk(parsed(source)):
+    for node in nodes(source):
         if isinstance(node, Function):
             yield node
 
@@ -135,7 +140,7 @@ def imports(sources: list[Path], root: Path) -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for name, source in modules.items():
         named: set[str] = set()
-        for node in ast.walk(parsed(source)):
+        for node in nodes(source):
             if isinstance(node, ast.Import):
                 named.update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -232,7 +237,7 @@ def test_benchmarks_import_names_that_are_there() -> None:
         [],
     )
     for source in sorted((ROOT / "benchmarks").glob("*.py")):
-        for node in ast.walk(parsed(source)):
+        for node in nodes(source):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ours:
                 module = importlib.import_module(node.module)
                 names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
@@ -246,7 +251,7 @@ def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:
     late = [
         f"{source.relative_to(ROOT)}:{call.lineno}"
         for source in SOURCES
-        for call in ast.walk(parsed(source))
+        for call in nodes(source)
         if isinstance(call, ast.Call)
         and ast.unparse(call.func) in ("msgspec.msgpack.decode", "msgspec.json.decode")
         and any(keyword.arg == "type" for keyword in call.keywords)
@@ -262,8 +267,8 @@ def answer_models(source: Path) -> set[str]:
             if isinstance(decorator, ast.Call) and ast.unparse(decorator.func).startswith("router."):
                 told = [keyword.value for keyword in decorator.keywords if keyword.arg == "response_model"]
                 models = told or ([] if function.returns is None else [function.returns])
-                nodes = [node for model in models for node in ast.walk(model)]
-                found |= {node.id for node in nodes if isinstance(node, ast.Name)}
+                parts = [node for model in models for node in ast.walk(model)]
+                found |= {node.id for node in parts if isinstance(node, ast.Name)}
     return found - {"Response", "StreamingResponse"}
 
 
@@ -364,7 +369,7 @@ def is_number(value: ast.expr) -> bool:
 
 
 def docstrings(source: Path) -> Iterator[str]:
-    for node in ast.walk(parsed(source)):
+    for node in nodes(source):
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef | ast.Module):
             yield " ".join((ast.get_docstring(node) or "").split())
 
@@ -437,7 +442,7 @@ OTHER_M = OTHER.side_m
 def test_a_ballot_has_five_types() -> None:
     """On the vehicle, on the wire and in the server; the laboratory measures, and has its own."""
     product = [source for source in SOURCES if "mapvote_lab" not in source.parts]
-    classes = [node for source in product for node in ast.walk(parsed(source)) if isinstance(node, ast.ClassDef)]
+    classes = [node for source in product for node in nodes(source) if isinstance(node, ast.ClassDef)]
     assert {node.name for node in classes if is_of_a_ballot(node)} == BALLOT_TYPES | OF_NO_BALLOT
     more = "class A:\n  why: str\n  spent: str\n  alike: int\nclass B(Planes): ...\nclass AVote: ...\nclass C: ..."
     assert [is_of_a_ballot(node) for node in ast.parse(more).body if isinstance(node, ast.ClassDef)] == [
@@ -467,14 +472,14 @@ def test_tests_hand_numbers_in_and_patch_no_constant() -> None:
     patched = [
         f"{test.relative_to(ROOT)}:{call.lineno}"
         for test in TESTS
-        for call in ast.walk(parsed(test))
+        for call in nodes(test)
         if isinstance(call, ast.Call) and patches_a_constant(call)
     ]
     assert patched == []
 
 
 def test_a_line_holds_one_assignment() -> None:
-    assigned = [n for s in SOURCES for n in ast.walk(parsed(s)) if isinstance(n, ast.Assign)]
+    assigned = [n for s in SOURCES for n in nodes(s) if isinstance(n, ast.Assign)]
     assert sum(map(packs, assigned)) <= MOST_PACKED_SHARE * len(assigned)
 
 
