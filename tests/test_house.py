@@ -86,10 +86,9 @@ def nodes(source: Path) -> list[ast.AST]:
     return list(ast.walk(parsed(source)))
 
 
-def functions(source: Path) -> Iterator[Function]:
-    for node in nodes(source):
-        if isinstance(node, Function):
-            yield node
+@cache
+def functions(source: Path) -> list[Function]:
+    return [node for node in nodes(source) if isinstance(node, Function)]
 
 
 def arguments(function: Function) -> int:
