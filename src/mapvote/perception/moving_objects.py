@@ -496,16 +496,23 @@ def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, c
     voxels, into the first of ``chosen`` (n,) and ``keys`` (n,)."""
     count = np.uint64(0)
     reach2 = np.float32(reach * reach)
+    east = rows[0]
+    north = rows[1]
+    up = rows[2]
+    x0 = origin[0]
+    y0 = origin[1]
+    z0 = origin[2]
+    per_m = 1.0 / cell
     for i in range(np.uint64(0), np.uint64(len(obstacle))):  # what is not chosen is written over: no branch to predict
-        x = rows[0, i]
-        y = rows[1, i]
+        x = east[i]
+        y = north[i]
         chosen[count] = i
         count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach2) else np.uint64(0)
     for k in range(np.uint64(0), count):
         p = np.uint64(chosen[k])
-        x = np.float64(rows[0, p]) + origin[0]
-        y = np.float64(rows[1, p]) + origin[1]
-        keys[k] = voxel_key(x, y, np.float64(rows[2, p]) + origin[2], cell)
+        x = (np.float64(east[p]) + x0) * per_m
+        y = (np.float64(north[p]) + y0) * per_m
+        keys[k] = voxel_key(x, y, (np.float64(up[p]) + z0) * per_m, 1.0)
     return int(count)
 
 
