@@ -100,72 +100,75 @@ def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64,
     cell = scan.cell if here is scan.reference else cells_and_obstacles(scan.rows, scan.origin_map, here)[0]
     from_corner = scan.origin_map - np.array([grid.x0, grid.y0, 0.0])
     chosen = np.empty(len(cell) + 1, np.int32)
-    planes = np.ascontiguousarray(here.base).reshape(-1), near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
+    mapped = np.ascontiguousarray(here.base).reshape(-1), np.ascontiguousarray(here.occupied).reshape(-1)
+    marked = near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
     reach = rule.hit_reach_m / CELL_SIZE
-    _mark_near(scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, here.occupied, planes, chosen)
+    _mark_near(scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, grid.shape, mapped, marked, chosen)
     return near, hit, apart
 
 
 @kernel
 def _mark_near(
-    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: F64, reach: float, occupied: U64,
-    planes: tuple[I32, U64, U64, U64], chosen: I32,
+    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: F64, reach: float, shape: tuple[int, int],
+    mapped: tuple[I32, U64], marked: tuple[U64, U64, U64], chosen: I32,
 ) -> None:  # fmt: skip
-    """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of ``occupied`` (rows,
-    cols) and of the flat ``planes``: base, near, hit, apart. ``reach``: cells, below a half, so that a return reaches
-    two cells or one along each axis. Four are always entered, be they one: no branch to predict. A voxel near a return
-    is hit if it is the map's. ``chosen`` (n + 1,): scratch."""
-    base, near, hit, apart = planes
-    rows, cols = occupied.shape
+    """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of planes of this
+    ``shape``, all flat: ``mapped`` are base and occupied, ``marked`` near, hit, apart. ``reach``: cells, below a half,
+    so that a return reaches two cells or one along each axis. Four are always entered, be they one: no branch to
+    predict. A voxel near a return is hit if it is the map's. ``chosen`` (n + 1,): scratch."""
+    base, occupied = mapped
+    near, hit, apart = marked
+    rows, cols = shape
     east = points[0]
     north = points[1]
     up = points[2]
+    x0 = origin[0]
+    y0 = origin[1]
+    z0 = origin[2]
+    per_m = 1.0 / CELL_SIZE
     count = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(cell))):
         chosen[count] = i
         count += np.uint64(1) if obstacle[i] & (not moving[i]) & (cell[i] >= 0) else np.uint64(0)
     for k in range(np.uint64(0), count):
         p = np.uint64(chosen[k])
-        x = (np.float64(east[p]) + origin[0]) / CELL_SIZE
-        y = (np.float64(north[p]) + origin[1]) / CELL_SIZE
-        z = (np.float64(up[p]) + origin[2]) / CELL_SIZE
+        x = (np.float64(east[p]) + x0) * per_m
+        y = (np.float64(north[p]) + y0) * per_m
+        z = (np.float64(up[p]) + z0) * per_m
         lowest = np.int64(np.floor(z - reach))
         highest = np.int64(np.floor(z + reach))
         left = np.int64(max(x - reach, 0.0))
         right = min(np.int64(x + reach), np.int64(cols - 1))
-        first = np.int64(max(y - reach, 0.0))
-        last = min(np.int64(y + reach), np.int64(rows - 1))
-        a = np.uint64(first * cols + left)
-        b = np.uint64(first * cols + right)
-        c = np.uint64(last * cols + left)
-        d = np.uint64(last * cols + right)
-        of_a = _layers(lowest, highest, np.int64(base[a]))
-        of_b = _layers(lowest, highest, np.int64(base[b]))
-        of_c = _layers(lowest, highest, np.int64(base[c]))
-        of_d = _layers(lowest, highest, np.int64(base[d]))
+        first = np.int64(max(y - reach, 0.0)) * cols
+        last = min(np.int64(y + reach), np.int64(rows - 1)) * cols
+        a = np.uint64(first + left)
+        b = np.uint64(first + right)
+        c = np.uint64(last + left)
+        d = np.uint64(last + right)
+        of_a = _layers(lowest, highest, base[a])
+        of_b = _layers(lowest, highest, base[b])
+        of_c = _layers(lowest, highest, base[c])
+        of_d = _layers(lowest, highest, base[d])
         near[a] |= of_a
         near[b] |= of_b
         near[c] |= of_c
         near[d] |= of_d
-        of_a &= occupied[first, left]
-        of_b &= occupied[first, right]
-        of_c &= occupied[last, left]
-        of_d &= occupied[last, right]
-        if not of_a | of_b | of_c | of_d:
+        if not (of_a & occupied[a]) | (of_b & occupied[b]) | (of_c & occupied[c]) | (of_d & occupied[d]):
             at = np.uint64(cell[p])
-            layer = np.int64(np.floor(z))
-            apart[at] |= _layers(layer, layer, np.int64(base[at]))
-    for r in range(rows):
-        for column in range(cols):
-            at = np.uint64(r * cols + column)
-            hit[at] = near[at] & occupied[r, column] | apart[at]
+            layer = np.int64(np.floor((np.float64(up[p]) + z0) / CELL_SIZE))  # as all say in which voxel a point lies
+            apart[at] |= _layers(layer, layer, base[at])
+    for i in range(np.uint64(0), np.uint64(len(hit))):
+        hit[i] = near[i] & occupied[i] | apart[i]
 
 
 @inlined
-def _layers(lowest: np.int64, highest: np.int64, base: np.int64) -> np.uint64:
-    """The word of the layers ``lowest`` to ``highest`` of the world in a column that begins at ``base``."""
-    low = np.uint64(layer_bit(lowest, base))
-    high = np.uint64(layer_bit(highest, base))
+def _layers(lowest: np.int64, highest: np.int64, base: np.int32) -> np.uint64:
+    """The word of one layer of the world or two, ``lowest`` and ``highest``, in a column that begins at ``base``."""
+    from_ = lowest - base
+    if (from_ >= 0) & (highest - base <= TOP_BIT):
+        return np.uint64(1 + 2 * (highest - lowest)) << np.uint64(from_)
+    low = np.uint64(layer_bit(lowest, np.int64(base)))
+    high = np.uint64(layer_bit(highest, np.int64(base)))
     return (np.uint64(2) << high) - (np.uint64(1) << low)
 
 
