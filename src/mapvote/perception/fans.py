@@ -15,7 +15,7 @@ import numpy as np
 
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.kernel import inlined, kernel
+from mapvote.core.kernel import inlined, kernel, one_bit
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, U32, U64
 
@@ -202,69 +202,112 @@ class Crossed(NamedTuple):
     """Voxels of the lower half of each column that the fan's rays pass ..."""
     high: U32
     """... and of the upper."""
+    left: F32
+    """Scratch: horizontal metres at which the fan leaves each of the lines of cells that it runs across, ..."""
+    steps: I32
+    """... how many steps to the side it has taken by then, ..."""
+    beside: F32
+    """... and the horizontal metres to the next of them."""
 
 
 def _room_for(cells: int) -> Crossed:
     room = cells + _LANES
-    low = np.zeros(room, np.uint32)
-    high = np.zeros(room, np.uint32)
-    return Crossed(np.zeros(room, np.int32), np.zeros(room + 1, np.float32), np.zeros(room, np.int32), low, high)
+    low, high = np.zeros((2, room), np.uint32)
+    cell, bottom, steps = np.zeros((3, room), np.int32)
+    entered, left, beside = np.zeros((3, room + 1), np.float32)
+    return Crossed(cell, entered, bottom, low, high, left, steps, beside)
 
 
 @inlined
-def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer: int, out: Crossed) -> int:
+def _cross_cells(
+    way: Way, ahead: tuple[int, int], end: float, base: I32, shape: tuple[int, int], layer: int, out: Crossed
+) -> np.int64:
     """Fill ``out`` with the cells of a way that steps ``ahead`` rows and columns, up to ``end`` metres or the window's
-    edge. Returns how many there are. The direction of a step needs no branch, which nothing could predict."""
-    rows, cols = base.shape
-    r, c, t, next_r, next_c, width_r, width_c = way
-    n = 0
-    while 0 <= r < rows and 0 <= c < cols and t < end:
-        k = np.uint64(r * cols + c)
+    edge. Returns how many there are. Of rows and columns, lines are those of which the way crosses more: between two of
+    their borders it takes one step to the side or none. Where it takes them needs no branch, which nothing could
+    predict: the cell beside is always written, and overwritten if the way does not come there."""
+    rows, cols = shape
+    over = way.width_c <= way.width_r  # lines are columns
+    lines = (cols - way.c if ahead[1] > 0 else way.c + 1) if over else (rows - way.r if ahead[0] > 0 else way.r + 1)
+    most = (rows - way.r if ahead[0] > 0 else way.r + 1) if over else (cols - way.c if ahead[1] > 0 else way.c + 1)
+    on = np.int32(ahead[1] if over else ahead[0] * cols)
+    aside = np.int32(ahead[0] * cols if over else ahead[1])
+    next_line, next_side = (way.next_c, way.next_r) if over else (way.next_r, way.next_c)
+    width, width_side = (way.width_c, way.width_r) if over else (way.width_r, way.width_c)
+    edge = next_side + (most - 1) * width_side  # where the way leaves the window to the side
+    until = min(np.float64(end), edge)
+    inside = (0 <= way.r < rows) & (0 <= way.c < cols) & (way.entered < until)
+    count = np.uint64(min(lines, max(int(np.ceil((until - next_line) / width)), 0) + 1) if inside else 0)
+    per_side = 1.0 / width_side
+    for i in range(np.uint64(0), count):
+        at = next_line + np.float64(np.int32(i)) * width
+        steps = min(max(np.int32(np.ceil((at - next_side) * per_side)), np.int32(0)), np.int32(most))
+        out.left[i] = at
+        out.steps[i] = steps
+        out.beside[i] = next_side + np.float64(steps) * width_side
+    n = np.uint64(0)
+    k = np.int32(way.r * cols + way.c)
+    steps = np.int32(0)
+    t = np.float32(way.entered)
+    beside = np.float32(next_side)
+    for i in range(np.uint64(0), count):
         out.cell[n] = k
         out.entered[n] = t
-        out.bottom[n] = base[r, c] - layer
-        n += 1
-        t = min(next_c, next_r)
-        column = next_c < next_r
-        c += ahead[1] if column else 0
-        r += 0 if column else ahead[0]
-        next_c += width_c if column else 0.0
-        next_r += 0.0 if column else width_r
-    for j in range(n, n + _LANES):
-        out.entered[j] = t
+        n += np.uint64(1)
+        out.cell[n] = np.int32(k + aside)
+        out.entered[n] = beside
+        taken = out.steps[i] != steps
+        steps = out.steps[i]
+        n += np.uint64(taken & (steps < np.int32(most)))
+        k += np.int32(on + (aside if taken else np.int32(0)))
+        t = out.left[i]
+        beside = out.beside[i]
+    for j in range(np.uint64(0), n):
+        out.bottom[j] = base[np.uint64(out.cell[j])] - np.int32(layer)
+    for j in range(n, n + np.uint64(_LANES)):
+        out.entered[j] = min(t, np.float32(edge))
         out.bottom[j] = 0
-    return n
+    return np.int64(n)
+
+
+_GENTLE = np.float32(0.999 / (np.sqrt(2.0) * CELL_SIZE))
+"""Voxels of height per metre, 35 deg, up to which a ray passes two voxels of a column at most."""
 
 
 @inlined
 def _pass(
-    slope: np.float32, stop: np.float32, height: np.float32, up: int, n: int, crossed: Crossed, words: U32
+    slope: np.float32, stop: np.float32, height: np.float32, up: int, n: np.int64, crossed: Crossed, words: U32
 ) -> None:
     """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
     and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above the
-    columns."""
+    columns. What lies behind ``stop`` is masked."""
     t = crossed.entered
     bottom = crossed.bottom
+    one = np.uint64(1)  # unsigned: an index that cannot be negative vectorises
+    lanes = np.uint64((n + _LANES - 1) // _LANES * _LANES)
+    if abs(slope) <= _GENTLE:
+        for j in range(np.uint64(0), lanes):
+            lowest = np.int32(bottom[j] + up)
+            enter = np.int32(np.int32(np.floor(height + slope * t[j])) - lowest)
+            leave = np.int32(np.int32(np.floor(height + slope * min(t[j + one], stop))) - lowest)
+            words[j] |= one_bit(enter) | one_bit(leave) if t[j] < stop else np.uint32(0)
+        return
     none = np.int32(0)
     most = np.int32(_HALF_COLUMN - 1)
-    b = np.uint64(0)
-    while b < np.uint64(n) and t[b] < stop:
-        for i in range(np.uint64(_LANES)):  # unsigned: an index that cannot be negative vectorises
-            j = b + i
-            enter = np.int32(np.floor(height + slope * t[j]))
-            leave = np.int32(np.floor(height + slope * min(t[j + np.uint64(1)], stop)))
-            from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + up))
-            to = np.int32(max(enter, leave) - np.int32(bottom[j] + up))
-            here = (t[j] < stop) & (to >= none) & (from_ <= most)
-            first = np.uint32(min(max(from_, none), most))
-            last = np.uint32(min(max(to, none), most))
-            bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
-            words[j] |= np.uint32(bits) if here else np.uint32(0)
-        b += np.uint64(_LANES)
+    for j in range(np.uint64(0), lanes):
+        enter = np.int32(np.floor(height + slope * t[j]))
+        leave = np.int32(np.floor(height + slope * min(t[j + one], stop)))
+        from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + up))
+        to = np.int32(max(enter, leave) - np.int32(bottom[j] + up))
+        here = (t[j] < stop) & (to >= none) & (from_ <= most)
+        first = np.uint32(min(max(from_, none), most))
+        last = np.uint32(min(max(to, none), most))
+        bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
+        words[j] |= np.uint32(bits) if here else np.uint32(0)
 
 
 @inlined
-def _enter(crossed: Crossed, n: int, passed: U64) -> None:
+def _enter(crossed: Crossed, n: np.int64, passed: U64) -> None:
     """Enter the voxels that a fan passed into the plane (flat), and clear the words. Bit 63, all above, is never
     passed."""
     for j in range(n):
@@ -277,13 +320,14 @@ def _enter(crossed: Crossed, n: int, passed: U64) -> None:
 
 def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
     """Take every fan from where it marks to the end of its rays, and enter what they pass into ``passed`` (flat)."""
-    _mark_passed(fans, origin, corner, base, passed, _room_for(sum(base.shape) + 1))
+    _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, _room_for(sum(base.shape) + 1))
 
 
 @kernel
 def _mark_passed(
-    fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64, crossed: Crossed
-) -> None:
+    fans: Fans, origin: F64, corner: tuple[float, float], base: I32, shape: tuple[int, int], passed: U64,
+    crossed: Crossed,
+) -> None:  # fmt: skip
     layer = int(np.floor(origin[2] / CELL_SIZE))
     height = np.float32(origin[2] / CELL_SIZE - layer)
     x = (origin[0] - corner[0]) / CELL_SIZE
@@ -293,15 +337,19 @@ def _mark_passed(
             continue
         dx, dy = fans.direction[f]
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        n = _cross_cells(set_out(x, y, dx, dy, _MARKS_FROM[f]), ahead, fans.end[f], base, layer, crossed)
+        way = set_out(x, y, dx, dy, _MARKS_FROM[f])
+        n = _cross_cells(way, ahead, fans.end[f], base, shape, layer, crossed)
         lowest = crossed.bottom[0]
         for j in range(1, n):
             lowest = min(lowest, crossed.bottom[j])
+        cells_a_metre = np.float32((abs(dx) + abs(dy)) / CELL_SIZE)
         for k in range(fans.first[f], fans.last[f]):
             slope = fans.slope[k]
             stop = fans.stop[k]
+            # A ray that ends before the fan marks has a cell or none.
+            reached = min(n, np.int64(max(stop - crossed.entered[0], np.float32(0.0)) * cells_a_metre) + 3)
             halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF_COLUMN else 1
             for half in range(halves):
                 words = crossed.low if half == 0 else crossed.high
-                _pass(slope, stop, height, half * _HALF_COLUMN, n, crossed, words)
+                _pass(slope, stop, height, half * _HALF_COLUMN, reached, crossed, words)
         _enter(crossed, n, passed)
