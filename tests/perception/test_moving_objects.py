@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from mapvote.config import MovingSettings, VotingSettings
 from mapvote.core.geometry import rows_from, turn
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F32, F64, U16, Bool
+from mapvote.core.types import F32, F64, I32, U16, Bool
 from mapvote.perception.moving_objects import (
+    BELOW,
+    HIT,
     MOVERS,
     NO_RETURN,
-    LookCounts,
     Movers,
     MovingFilter,
     Pixels,
@@ -249,6 +251,19 @@ def plain_image(points: F64, origin: F64) -> U16:
     return image
 
 
+class LookCounts(NamedTuple):
+    """What scans saw at places, (m,) each."""
+
+    free: I32
+    hit: I32
+    sides: I32
+    """1 if a ray passed below, 2 if one passed above, 3 for both."""
+
+    @property
+    def packed(self) -> I32:
+        return np.asarray(self.free + self.hit * HIT + self.sides * BELOW, np.int32)
+
+
 def plain_look(offsets: F32, image: U16, counts: LookCounts) -> list[int]:
     """Which samples still wait."""
     waiting = []
@@ -274,10 +289,6 @@ def image_of(seen: F64, sensor: F64) -> U16:
     return image
 
 
-def no_counts(n: int) -> LookCounts:
-    return LookCounts(np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.uint8))
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_an_image_holds_the_nearest_return_of_each_direction_and_of_those_beside_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -292,7 +303,7 @@ def test_an_image_holds_the_nearest_return_of_each_direction_and_of_those_beside
 def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     places = (rng.normal(0.0, 1.0, (400, 3)) * [12.0, 12.0, 1.0]).astype(np.float32)
-    counts, expected, wait = no_counts(400), no_counts(400), np.arange(400)
+    seen, expected, wait = np.zeros(400, np.int32), LookCounts(*np.zeros((3, 400), np.int32)), np.arange(400)
     x, y, z = places.T.copy()
     samples, n = Samples(x, y, z, np.arange(400, dtype=np.int32)), 400
     for asked in (1, 2, 2):
@@ -301,14 +312,13 @@ def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
         stored = np.array(images[::-1]).reshape(asked, -1)
         which = np.arange(asked)[::-1].copy()
         rule = MARGIN_M, HEIGHT_M, ENOUGH
-        n = look(samples, n, stored, which, sensors.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
+        n = look(samples, n, stored, which, sensors.astype(np.float32), PIXELS, rule, seen, room_to_look(400))
         for sensor, image in zip(sensors.astype(np.float32), images, strict=True):
             some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
             left = plain_look(places[wait] - sensor, image, some)
             expected.free[wait], expected.hit[wait], expected.sides[wait] = some
             wait = wait[left]
         np.testing.assert_array_equal(samples.of[:n], wait)
-        for found, plane in zip(counts, expected, strict=True):
-            np.testing.assert_array_equal(found, plane)
+        np.testing.assert_array_equal(seen, expected.packed)
     assert 0 < n < 400
-    assert counts.free.sum() > 50
+    assert expected.free.sum() > 50

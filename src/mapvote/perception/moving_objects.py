@@ -37,7 +37,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, I64, U8, U16, Bool
+from mapvote.core.types import F32, F64, I32, I64, U16, Bool
 from mapvote.core.voxels import grouped, voxel_key
 from mapvote.perception.placement import ONE_LIDAR, LidarPart
 
@@ -59,6 +59,11 @@ PER_M = np.float32(RANGE_IMAGES.steps_per_m)
 NO_RETURN = np.uint16(65535)
 """Value of a range image in directions without a return."""
 LEAST_RANGE_M = np.float32(RANGE_IMAGES.least_range_m)
+# What scans saw at a place is one int32: how many saw through it, in the lowest byte, and
+HIT = np.int32(1 << 8)
+"""for each that saw something in it, in the next byte;"""
+BELOW, ABOVE = np.int32(1 << 16), np.int32(1 << 17)
+"""a ray passed below, and above: a ray that only ever passes over a roof proves nothing about the roof."""
 
 
 class Pixels(NamedTuple):
@@ -81,18 +86,6 @@ class Samples(NamedTuple):
     z: F32
     of: I32
     """(m,) which of the counts each place belongs to."""
-
-
-class LookCounts(NamedTuple):
-    """Observations of scans at each place, (m,) each."""
-
-    free: I32
-    """Scans that saw through it."""
-    hit: I32
-    """Scans that saw something in it."""
-    sides: U8
-    """Whether a ray passed below (1) and above (2): a ray that only ever passes over a roof proves nothing about
-    the roof."""
 
 
 @inlined
@@ -155,16 +148,18 @@ class Sought(NamedTuple):
     """Range at the sample's pixel, and the least range below and above it."""
     below: U16
     above: U16
+    observed: I32
+    """What scans saw at the sample, and whether it waits (1) or is settled (0)."""
+    waits: I32
 
 
 def room_to_look(n: int) -> Sought:
     """Scratch for :func:`look` at up to n samples."""
-    steps, pixel, around = np.empty((3, n), np.int32)
-    return Sought(steps, pixel, around, *np.empty((3, n), np.uint16))
+    steps, pixel, around, observed, waits = np.empty((5, n), np.int32)
+    here, below, above = np.empty((3, n), np.uint16)
+    return Sought(steps, pixel, around, here, below, above, observed, waits)
 
 
-BOTH_SIDES = np.uint8(3)
-"""Rays passed below and above."""
 _LEAST_PIXELS, _MOST_PIXELS = 2, 8
 """Pixels above and below that are read: at 8 m and beyond the fewest."""
 
@@ -189,34 +184,58 @@ def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.fl
 
 
 @inlined
-def _read(n: int, image: U16, sought: Sought) -> None:
-    """Read the ranges at, below and above each sample's pixel. Most samples read only _LEAST_PIXELS to each side: the
-    first loop is short, so that it requests many pixels at once and waits less for memory."""
-    here = sought.here
-    below = sought.below
-    above = sought.above
+def _ask(n: int, image: U16, rule: tuple[np.int32, np.int32], sought: Sought) -> int:
+    """Add what one scan saw at each of the first ``n`` samples; returns how many still wait. ``rule``: steps behind a
+    sample that a ray must end to have seen through it, and ``enough``, see :func:`look`.
+
+    Most samples read only _LEAST_PIXELS to each side: the first loop is short, so that it requests many pixels at once
+    and waits less for memory. The last one has no branch, so that it vectorises."""
+    steps, pixel, around, here, below, above, observed, waits = sought
     for w in range(np.uint64(0), np.uint64(n)):
-        p = np.uint64(max(sought.pixel[w], np.int32(_LEAST_PIXELS)))
+        p = np.uint64(max(pixel[w], np.int32(_LEAST_PIXELS)))
         here[w] = image[p]
         below[w] = min(image[p - np.uint64(1)], image[p - np.uint64(2)])
         above[w] = min(image[p + np.uint64(1)], image[p + np.uint64(2)])
     for w in range(np.uint64(0), np.uint64(n)):
-        p = np.uint64(sought.pixel[w])
-        if (sought.around[w] > _LEAST_PIXELS) & (p > 0):
-            for s in range(np.uint64(_LEAST_PIXELS + 1), np.uint64(sought.around[w] + 1)):
+        p = np.uint64(pixel[w])
+        if (around[w] > _LEAST_PIXELS) & (p > 0):
+            for s in range(np.uint64(_LEAST_PIXELS + 1), np.uint64(around[w] + 1)):
                 below[w] = min(below[w], image[p - s])
                 above[w] = min(above[w], image[p + s])
+    margin, enough = rule
+    none = np.int32(0)
+    waiting = 0
+    for w in range(np.uint64(0), np.uint64(n)):
+        under = np.int32(below[w])
+        over = np.int32(above[w])
+        nearest = min(np.int32(here[w]), min(under, over))
+        behind = np.int32(nearest - steps[w])
+        answers = (pixel[w] > 0) & (nearest != np.int32(NO_RETURN)) & (behind >= -margin)
+        low = BELOW if under < np.int32(NO_RETURN) else none
+        high = ABOVE if over < np.int32(NO_RETURN) else none
+        before = observed[w]
+        through = np.int32(np.int32(before + np.int32(1)) | low | high)
+        seen = through if behind > margin else np.int32(before + HIT)
+        after = seen if answers else before
+        observed[w] = after
+        free = np.int32(after & np.int32(255))
+        hit = np.int32(after >> np.int32(8) & np.int32(255))
+        passed = (hit == 0) & (free >= enough) & (after >= BELOW + ABOVE)
+        settled = passed | ((free == 0) & (hit >= enough))
+        waits[w] = none if settled else np.int32(1)
+        waiting += waits[w]
+    return waiting
 
 
 @kernel
 def look(
     samples: Samples, n: int, images: U16, slots: I64, sensors: F32, pixels: Pixels, rule: tuple[float, float, int],
-    counts: LookCounts, sought: Sought,
+    seen: I32, sought: Sought,
 ) -> np.int64:  # fmt: skip
     """Ask some scans, one after the other, about the first ``n`` samples: by the range ``images`` (m, size), flat, in
     the ``slots`` (k,). A call for each would take a tenth longer.
 
-    Counts go up in place; returns how many samples still wait.
+    What they saw goes into ``seen`` (m,), by ``samples.of``: see HIT. Returns how many samples still wait.
 
     ``sensors`` (k, 3) where the scans were taken, from the samples' common point. ``rule``: (metres behind a place that
     a ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
@@ -224,37 +243,29 @@ def look(
     samples or more.
     """
     x, y, z, of = samples
-    free, hit, sides = counts
+    observed = sought.observed
     behind_m, height_m, enough = rule
-    margin = np.int32(behind_m * PER_M)
-    waiting = np.int64(n)
+    asked = np.int32(behind_m * PER_M), np.int32(enough)
+    waiting = np.uint64(n)
+    for w in range(np.uint64(0), waiting):
+        observed[w] = seen[np.uint64(of[w])]
     for k in range(len(slots)):
         _seek(samples, waiting, sensors[k], pixels, np.float32(height_m), sought)
-        _read(waiting, images[slots[k]], sought)
+        if _ask(waiting, images[slots[k]], asked, sought) == np.int64(waiting):
+            continue
         left = np.uint64(0)
-        # No step has a branch that nobody could predict.
-        for w in range(np.uint64(0), np.uint64(waiting)):
-            below = sought.below[w]
-            above = sought.above[w]
-            steps = sought.steps[w]
-            r = np.int32(min(sought.here[w], min(below, above)))
-            known = (sought.pixel[w] > 0) & (r != np.int32(NO_RETURN)) & (r >= steps - margin)
-            through = known & (r > steps + margin)
-            low = np.uint8(1) if below < NO_RETURN else np.uint8(0)
-            high = np.uint8(2) if above < NO_RETURN else np.uint8(0)
-            i = np.uint64(of[w])
+        for w in range(np.uint64(0), waiting):  # a settled sample is overwritten: no branch to predict
+            seen[np.uint64(of[w])] = observed[w]
             x[left] = x[w]
             y[left] = y[w]
             z[left] = z[w]
             of[left] = of[w]
-            free[i] += 1 if through else 0
-            hit[i] += 1 if known & ~through else 0
-            sides[i] |= low | high if through else np.uint8(0)
-            passed = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == BOTH_SIDES)
-            settled = passed | ((free[i] == 0) & (hit[i] >= enough))
-            left += np.uint64(0) if settled else np.uint64(1)
-        waiting = np.int64(left)
-    return waiting
+            observed[left] = observed[w]
+            left += np.uint64(sought.waits[w])
+        waiting = left
+    for w in range(np.uint64(0), waiting):
+        seen[np.uint64(of[w])] = observed[w]
+    return np.int64(waiting)
 
 
 @record(votes=True)
@@ -427,7 +438,7 @@ class MovingFilter:
         scan = self._window[at]
         movers = self.movers
         m = scan.samples.shape[1]
-        counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
+        observed = np.zeros(m, np.int32)
         x, y, z = scan.samples.copy()
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         # Each of the other scans counts what it saw at the samples.
@@ -436,13 +447,13 @@ class MovingFilter:
             sensors = (np.array([image.origin_map for image in others]) - scan.origin_map).astype(np.float32)
             slots = np.array([image.slot for image in others])
             rule = movers.margin_m, movers.height_m, movers.enough
-            look(waiting, m, self._images, slots, sensors, self._pixels, rule, counts, room_to_look(m))
+            look(waiting, m, self._images, slots, sensors, self._pixels, rule, observed, room_to_look(m))
         # Which voxels were brief, and the cell of each in a square around the sensor.
         place = np.empty(m, np.int64)
         seen_often = np.empty(m, np.bool_)
         brief = np.empty(m, np.bool_)
         bounds = movers.min_free, movers.free_share
-        _weigh(scan.samples, scan.origin_map, self._half, counts, bounds, place, seen_often, brief)
+        _weigh(scan.samples, scan.origin_map, self._half, observed, bounds, place, seen_often, brief)
         # Connected cells move together.
         shares = movers.share_whole, movers.share_part
         moves = moving_components(place, self._plane, seen_often, brief, movers.min_voxels, *shares)
@@ -470,12 +481,12 @@ def _spread(scans: list[_Scan], count: int) -> list[_Scan]:
 
 @kernel
 def _weigh(
-    samples: F32, origin: F64, half: int, counts: LookCounts, bounds: tuple[int, float], place: I64, seen: Bool,
+    samples: F32, origin: F64, half: int, observed: I32, bounds: tuple[int, float], place: I64, seen: Bool,
     brief: Bool,
 ) -> None:  # fmt: skip
     """For each of ``samples`` (3, m) from ``origin``: its cell in the square of ``half`` cells to each side, whether
     enough scans could see it, and whether it is brief: rays passed it on both sides, and most scans that could see it
-    saw through it. ``bounds``: min_free and free_share."""
+    saw through it, by what they ``observed`` (m,). ``bounds``: min_free and free_share."""
     min_free, free_share = bounds
     side = 2 * half + 1
     col0 = np.int64(np.floor(origin[0] / CELL_SIZE)) - half
@@ -484,10 +495,10 @@ def _weigh(
         col = np.int64(np.floor((np.float64(samples[0, i]) + origin[0]) / CELL_SIZE)) - col0
         row = np.int64(np.floor((np.float64(samples[1, i]) + origin[1]) / CELL_SIZE)) - row0
         place[i] = row * side + col
-        free = counts.free[i]
-        total = free + counts.hit[i]
+        free = observed[i] & np.int32(255)
+        total = free + (observed[i] >> np.int32(8) & np.int32(255))
         seen[i] = total >= min_free
-        brief[i] = (counts.sides[i] == BOTH_SIDES) & (free >= min_free) & (free >= free_share * total)
+        brief[i] = (observed[i] >= BELOW + ABOVE) & (free >= min_free) & (free >= free_share * total)
 
 
 @kernel
