@@ -36,40 +36,42 @@ def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
 
 
 @inlined
-def slot_of(key: np.int64, table: I64) -> np.int64:
+def slot_of(key: np.int64, table: I64) -> np.uint64:
     """Where a hash table (2^k,) of keys holds ``key``, or the free slot (0) where it belongs: open addressing, linear
-    probing; Fibonacci hashing with the high half folded in, so that the low bits depend on all three indices."""
-    mask = len(table) - 1
-    h = key * np.int64(-7046029254386353131)
-    slot = (h ^ (h >> 32)) & mask
+    probing; Fibonacci hashing with the high half folded in, so that the low bits depend on all three indices.
+    Unsigned: an index that cannot be negative needs no test for it."""
+    mask = np.uint64(len(table) - 1)
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = (h ^ (h >> np.uint64(32))) & mask
     while table[slot] != 0 and table[slot] != key:
-        slot = (slot + 1) & mask
+        slot = (slot + np.uint64(1)) & mask
     return slot
 
 
 @kernel
-def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
+def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> np.int64:
     """Number equal keys (n,) > 0 in the order in which they come; a key of 0 belongs to none.
 
     Returns how many there are, with ``of`` (n,) the number of each key, -1 for 0, and in ``first`` (n,) the index of
     the first of each; or -1 if they would fill more than half of ``table`` (2^k,), which holds zeros. ``place`` (2^k,):
     scratch.
     """
-    m = 0
+    m = np.uint64(0)
+    most = np.uint64(len(table) // 2)
     for i in range(np.uint64(0), np.uint64(len(keys))):
         of[i] = -1
         if keys[i] == 0:
             continue
         slot = slot_of(keys[i], table)
         if table[slot] == 0:
-            if 2 * m >= len(table):
-                return -1
+            if m >= most:
+                return np.int64(-1)
             table[slot] = keys[i]
-            place[slot] = m
+            place[slot] = np.int32(m)
             first[m] = i
-            m += 1
+            m += np.uint64(1)
         of[i] = place[slot]
-    return m
+    return np.int64(m)
 
 
 def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
@@ -84,19 +86,20 @@ def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
 
 
 @kernel
-def _first(keys: I64, table: I64, first: I64) -> int:
+def _first(keys: I64, table: I64, first: I64) -> np.int64:
     """Half of :func:`_group`, in half of its time: how many different keys (n,) > 0 there are, and into ``first`` the
     index of the first of each; -1 if they would fill more than half of ``table`` (2^k,), which holds zeros."""
-    m = 0
+    m = np.uint64(0)
+    most = np.uint64(len(table) // 2)
     for i in range(np.uint64(0), np.uint64(len(keys))):
         slot = slot_of(keys[i], table)
         if table[slot] == 0:
-            if 2 * m >= len(table):
-                return -1
+            if m >= most:
+                return np.int64(-1)
             table[slot] = keys[i]
             first[m] = i
-            m += 1
-    return m
+            m += np.uint64(1)
+    return np.int64(m)
 
 
 def first_of_each(keys: I64, slots: int = 1 << 14) -> I64:
