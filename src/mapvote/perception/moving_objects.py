@@ -534,36 +534,39 @@ def voxels(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float) ->
     chosen = np.empty(n, np.int32)
     keys = np.empty(n, np.int64)
     count = _choose(rows, obstacle, origin, reach, cell, chosen, keys)
-    of, first = grouped(keys[:count])  # scans of 66,000 points have 7,000 voxels
+    of, first = grouped(keys[:count], 1 << 15)  # scans of 66,000 points have 7,000 voxels: few share a slot
     return chosen[:count].copy(), of, rows.take(chosen[first], axis=1)
 
 
 @inlined
-def _flood(cells: I64, n: int, wanted: I64, side: int, plane: I32, label: I64, stack: I64) -> None:
-    """Label of each of n cells by 8-connected component of the wanted ones, from 0; -1 for the unwanted.
+def _flood(cells: I64, n: int, wanted: I64, seeds: I64, side: int, plane: I32, label: I64, stack: I64) -> None:
+    """Label of each of n cells by 8-connected component of the wanted ones, from 0; negative for the unwanted, and
+    where no cell of a component is among the ``seeds``.
 
     ``cells`` (n,) are distinct indices row * side + col with 0 < row, col < side - 1; ``plane`` (side * side,) the
     place of each cell in them, -1 elsewhere. ``stack`` (n,): scratch.
     """
-    for k in range(n):
-        label[k] = -1
+    open_, shut = -1, -2
+    for k in range(np.uint64(0), np.uint64(n)):
+        label[k] = open_ if wanted[k] != 0 else shut
     count = 0
-    for seed in range(n):
-        if wanted[seed] == 0 or label[seed] >= 0:
+    for seed in range(np.uint64(0), np.uint64(n)):
+        if seeds[seed] == 0 or label[seed] != open_:
             continue
         label[seed] = count
         stack[0] = seed
-        top = 1
+        top = np.uint64(1)
         while top > 0:
-            top -= 1
-            at = cells[stack[top]]
-            for dr in range(-1, 2):
-                for dc in range(-1, 2):
-                    k = plane[at + dr * side + dc]
-                    if k >= 0 and wanted[k] != 0 and label[k] < 0:
-                        label[k] = count
+            top -= np.uint64(1)
+            corner = np.uint64(cells[np.uint64(stack[top])] - side - 1)
+            for dr in range(np.uint64(0), np.uint64(3)):
+                at = corner + dr * np.uint64(side)
+                for dc in range(np.uint64(0), np.uint64(3)):
+                    k = plane[at + dc]
+                    if k >= 0 and label[np.uint64(k)] == open_:
+                        label[np.uint64(k)] = count
                         stack[top] = k
-                        top += 1
+                        top += np.uint64(1)
         count += 1
 
 
@@ -600,7 +603,7 @@ def _components(
         out[i] = False
     for pass_ in range(2):
         share = share_whole if pass_ == 0 else share_part
-        _flood(cells, n, wanted, side, plane, label, stack)
+        _flood(cells, n, wanted, n_brief, side, plane, label, stack)  # nothing moves without brief voxels
         for k in range(n):
             total[k] = moving[k] = 0
         for k in range(n):
