@@ -61,7 +61,7 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
     def has(plane: np.ndarray, k: int = bit) -> bool:
         return bool(int(plane[r, c]) >> k & 1)
 
-    passed, (near, hits, apart) = seen.view.passed, near_hits(seen)
+    passed, (near, hits, apart, _) = seen.view.passed, near_hits(seen)
     above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
     below = bit <= 1 or has(passed, bit - 1)
     crossed = has(passed) and above and below and not has(near)
@@ -209,7 +209,7 @@ def test_a_return_hits_every_mapped_voxel_near_it_else_the_voxel_it_lies_in(seed
             row, col = divmod(int(here.scan.cell[k]), SIDE)
             layer = int(points[k, 2] // CELL_SIZE) - base[row, col]
             struck[row, col] |= np.uint64(1) << np.uint64(np.clip(layer, 0, TOP_BIT))
-    near, _, apart = near_hits(here)
+    near, _, apart, _ = near_hits(here)
     assert np.array_equal(near, by_boxes(here))
     assert np.array_equal(apart, struck)
 

@@ -19,7 +19,10 @@ SIDE = 5
 def scan_words(rng: np.random.Generator) -> ScanWords:
     passed, near, hit = rng.integers(0, 2**63, (3, SIDE, SIDE), dtype=np.uint64)
     ground_z = np.where(rng.random((SIDE, SIDE)) < 0.2, np.nan, 0.0).astype(np.float32)
-    return ScanWords(passed, near, hit, ground_z)
+    west, east = rng.integers(0, SIDE, SIDE), rng.integers(0, SIDE, SIDE) + 1
+    for words in (passed, hit):
+        words[(np.arange(SIDE) < west[:, None]) | (np.arange(SIDE) >= east[:, None])] = 0
+    return ScanWords(passed, near, hit, ground_z, np.column_stack([west, east]).astype(np.int32))
 
 
 def count_one_by_one(cells: dict[tuple[int, int], U64], view: Grid, words: ScanWords) -> None:

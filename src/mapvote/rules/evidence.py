@@ -78,53 +78,57 @@ class SurfaceRule:
 SURFACE_RULE = SurfaceRule()
 
 NO_VOXELS = np.uint64(0)
+Origin = tuple[float, float, float]
 
 
 def count_scan(counts: VoxelCounts, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
     """Count one scan in the ``counts`` of a drive, a vehicle's or a survey's. Returns (rows, cols) words of the voxels
     that hold a return which the map does not explain."""
-    near, hit, apart = near_hits(seen, rule)
+    near, hit, apart, spans = near_hits(seen, rule)
     ground_z = np.ascontiguousarray(seen.reference.ground_z)
-    counts.enter(seen.view.grid, ScanWords(seen.view.passed, near, hit, ground_z))
+    counts.enter(seen.view.grid, ScanWords(seen.view.passed, near, hit, ground_z, spans))
     return apart
 
 
-def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64, U64, U64]:
-    """(near, hit, apart), words (rows, cols) of one scan: the voxels within ``hit_reach_m``, along each axis, of a
-    return that stands still; the voxels that are hit; those of them that are not the map's."""
+def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64, U64, U64, I32]:
+    """(near, hit, apart, spans) of one scan, words (rows, cols): the voxels within ``hit_reach_m``, along each axis, of
+    a return that stands still; the voxels that are hit; those of them that are not the map's. ``spans`` (rows, 2): of
+    each row the first cell with rays or a hit, and the one behind the last."""
     here = seen.reference
     scan = seen.scan
     grid = seen.view.grid
     near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
     hit = np.empty(grid.shape, dtype=np.uint64)
     cell = scan.cell if here is scan.reference else cells_and_obstacles(scan.rows, scan.origin_map, here)[0]
-    from_corner = scan.origin_map - np.array([grid.x0, grid.y0, 0.0])
+    x, y, z = map(float, scan.origin_map)
+    from_corner = x - grid.x0, y - grid.y0, z
     chosen = np.empty(len(cell) + 1, np.int32)
     mapped = np.ascontiguousarray(here.base).reshape(-1), np.ascontiguousarray(here.occupied).reshape(-1)
-    marked = near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
+    marked = np.ascontiguousarray(seen.view.passed).reshape(-1), near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
+    spans = np.empty((len(near), 2), np.int32)
     reach = rule.hit_reach_m / CELL_SIZE
-    _mark_near(scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, grid.shape, mapped, marked, chosen)
-    return near, hit, apart
+    _mark_near(
+        scan.rows, cell, scan.obstacle, seen.moving, from_corner, reach, grid.shape, mapped, marked, spans, chosen
+    )
+    return near, hit, apart, spans
 
 
 @kernel
 def _mark_near(
-    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: F64, reach: float, shape: tuple[int, int],
-    mapped: tuple[I32, U64], marked: tuple[U64, U64, U64], chosen: I32,
+    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: Origin, reach: float, shape: tuple[int, int],
+    mapped: tuple[I32, U64], marked: tuple[U64, U64, U64, U64], spans: I32, chosen: I32,
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of planes of this
-    ``shape``, all flat: ``mapped`` are base and occupied, ``marked`` near, hit, apart. ``reach``: cells, below a half,
-    so that a return reaches two cells or one along each axis. Four are always entered, be they one: no branch to
-    predict. A voxel near a return is hit if it is the map's. ``chosen`` (n + 1,): scratch."""
+    ``shape``, all flat: ``mapped`` are base and occupied, ``marked`` passed, near, hit, apart. ``reach``: cells, below
+    a half, so that a return reaches two cells or one along each axis. Four are always entered, be they one: no branch
+    to predict. A voxel near a return is hit if it is the map's. ``chosen`` (n + 1,): scratch."""
     base, occupied = mapped
-    near, hit, apart = marked
+    passed, near, hit, apart = marked
     rows, cols = shape
     east = points[0]
     north = points[1]
     up = points[2]
-    x0 = origin[0]
-    y0 = origin[1]
-    z0 = origin[2]
+    x0, y0, z0 = origin
     per_m = 1.0 / CELL_SIZE
     count = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(cell))):
@@ -157,8 +161,18 @@ def _mark_near(
             at = np.uint64(cell[p])
             layer = np.int64(np.floor((np.float64(up[p]) + z0) / CELL_SIZE))  # as all say in which voxel a point lies
             apart[at] |= _layers(layer, layer, base[at])
-    for i in range(np.uint64(0), np.uint64(len(hit))):
-        hit[i] = near[i] & occupied[i] | apart[i]
+    for r in range(rows):
+        begin = np.uint64(r * cols)
+        west = np.int32(cols)
+        east = np.int32(0)
+        for i in range(np.uint64(0), np.uint64(cols)):
+            struck = near[begin + i] & occupied[begin + i] | apart[begin + i]
+            hit[begin + i] = struck
+            empty = struck | passed[begin + i] == 0
+            west = min(west, np.int32(cols) if empty else np.int32(i))
+            east = max(east, np.int32(0) if empty else np.int32(np.int32(i) + 1))
+        spans[r, 0] = west
+        spans[r, 1] = east
 
 
 @inlined

@@ -141,16 +141,18 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
     def overlap(self, tile: TileIndex, view: Grid) -> Overlap:
         """The overlap of ``view`` and a tile."""
-        window = self.lattice.tile(tile)
-        rows, cols = window.intersection(view).slices_in(view)
-        return Overlap(rows.start, rows.stop, cols.start, cols.stop, view.row0 - window.row0, view.col0 - window.col0)
+        down = view.row0 - tile[0] * TILE_CELLS
+        right = view.col0 - tile[1] * TILE_CELLS
+        row, col = max(-down, 0), max(-right, 0)
+        end_row, end_col = min(TILE_CELLS - down, view.rows), min(TILE_CELLS - right, view.cols)
+        return Overlap(row, max(row, end_row), col, max(col, end_col), down, right)
 
     def leave(self, view: Grid) -> None:
         """Pack a band of each tile that lies far from ``view``: for every scan, so that none has it all."""
         around = view.padded(self.packing.far_cells)
         for tile, opened in list(self._open.items()):
-            common = self.lattice.tile(tile).intersection(around)
-            if common.rows == 0 or common.cols == 0:
+            part = self.overlap(tile, around)
+            if part.row == part.end_row or part.col == part.end_col:
                 bands = self._leaving[tile]
                 rows = TILE_CELLS // self.packing.bands
                 band = slice(len(bands) * rows, (len(bands) + 1) * rows)

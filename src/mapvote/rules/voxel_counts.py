@@ -15,8 +15,8 @@ import numpy as np
 
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
-from mapvote.core.kernel import kernel
-from mapvote.core.types import F32, U64
+from mapvote.core.kernel import inlined, kernel
+from mapvote.core.types import F32, I32, U64
 from mapvote.rules.packed_tiles import COUNT_PLANES, OpenTile, Overlap, PackedTiles, add_four, add_one
 
 CROSSED, HIT, PASSES, PASSED = 0, COUNT_PLANES, 2 * COUNT_PLANES, 3 * COUNT_PLANES
@@ -36,6 +36,9 @@ class ScanWords(NamedTuple):
     """A return lies in the voxel."""
     ground_z: F32
     """Height of the ground, map metres; NaN where it is unknown: heights mean nothing there, nothing is counted."""
+    spans: I32
+    """(rows, 2) of each row the first cell with rays or a hit, and the one behind the last: half of all cells lie
+    between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +62,15 @@ class VoxelCounts:
         self._waiting: deque[_Waiting] = deque()
         self._count = 0
         no_words = np.zeros((1, 1), np.uint64)
-        self._none = _Waiting(-1, ScanWords(no_words, no_words, no_words, np.zeros((1, 1), np.float32)), {})
+        no_ground = np.zeros((1, 1), np.float32)
+        self._none = _Waiting(-1, ScanWords(no_words, no_words, no_words, no_ground, np.zeros((1, 2), np.int32)), {})
         """Takes the place of a scan where fewer than AT_ONCE are entered."""
         self._entered = [0] * self.AT_ONCE
         """How many scans each band has taken in."""
+        self._row = np.zeros((3 * self.AT_ONCE + 2) * TILE_CELLS, np.uint64)
+        """Scratch of :func:`_enter_scans`: the words of one row of a tile. Of each scan the voxels that rays went
+        through without a return near, those of them that were crossed, those hit; of all scans the voxels that rays
+        went through, and these and those hit."""
 
     def enter(self, view: Grid, words: ScanWords) -> None:
         """Count one scan, whose window is ``view``."""
@@ -92,65 +100,94 @@ class VoxelCounts:
         for tile in dict.fromkeys(tile for one in scans for tile in one.parts):
             parts = tuple(one.parts.get(tile, Overlap(0, 0, 0, 0, 0, 0)) for one in scans)
             if any(part.row + part.down < last and part.end_row + part.down > first for part in parts):
-                _enter_scans(self._tiles.near(tile), first, last, parts, words)
+                _enter_scans(self._tiles.near(tile), first, last, parts, words, self._row)
 
 
-@kernel
-def _of_scan(words: ScanWords, part: Overlap, row: int, col: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """(passed, missed, crossed, hit) words of a tile's cell in one scan, whose window lies on the tile by ``part``:
-    voxels that rays went through, those of them without a return near, those crossed, and those hit."""
+@inlined
+def _take_row(words: ScanWords, part: Overlap, row: int, scan: int, out: U64) -> tuple[int, int]:
+    """Enter the words of a tile's ``row`` in one of four scans, whose window lies on the tile by ``part``, into ``out``
+    (see VoxelCounts). Returns the columns from and to which there are any."""
     r = row - part.down
-    c = col - part.right
+    if r < part.row or r >= part.end_row:
+        return TILE_CELLS, 0
+    west = max(int(words.spans[r, 0]), part.col)
+    east = min(int(words.spans[r, 1]), part.end_col)
+    if west >= east:
+        return TILE_CELLS, 0
+    passed = words.passed[r]
+    near = words.near[r]
+    hits = words.hit[r]
+    ground_z = words.ground_z[r]
+    kind = np.uint64(TILE_CELLS)
+    missed = np.uint64(3 * scan) * kind + np.uint64(west + part.right)
+    crossed = missed + kind
+    hit = crossed + kind
+    rays = np.uint64(12) * kind + np.uint64(west + part.right)
+    either = rays + kind
     none = np.uint64(0)
-    if r < part.row or r >= part.end_row or c < part.col or c >= part.end_col or np.isnan(words.ground_z[r, c]):
-        return none, none, none, none
-    rays = words.passed[r, c]
-    missed = rays & ~words.near[r, c]
-    crossed = missed & (rays >> np.uint64(1) | _HIGHEST) & (rays << np.uint64(1) | _LOWEST)
-    return rays, missed, crossed, words.hit[r, c]
+    for i in range(none, np.uint64(east - west)):
+        j = np.uint64(west) + i
+        counts = ground_z[j] == ground_z[j]
+        here = passed[j] if counts else none
+        struck = hits[j] if counts else none
+        free = here & ~near[j]
+        out[missed + i] = free
+        out[crossed + i] = free & (here >> np.uint64(1) | _HIGHEST) & (here << np.uint64(1) | _LOWEST)
+        out[hit + i] = struck
+        out[rays + i] |= here
+        out[either + i] |= here | struck
+    return west + part.right, east + part.right
 
 
 @kernel
 def _enter_scans(
     opened: OpenTile, first: int, last: int, parts: tuple[Overlap, Overlap, Overlap, Overlap],
-    scans: tuple[ScanWords, ScanWords, ScanWords, ScanWords],
+    scans: tuple[ScanWords, ScanWords, ScanWords, ScanWords], words: U64,
 ) -> None:  # fmt: skip
     """Enter four scans, the oldest first, into the rows ``first`` to ``last`` of a tile, on which their windows lie by
-    ``parts``. A counter that is full is halved after the same scan as if they came one by one."""
+    ``parts``. A counter that is full is halved after the same scan as if they came one by one. ``words``: scratch that
+    holds 0, and does so again afterwards, into which each row is taken by loops that vectorise."""
     planes, spans = opened
-    west = TILE_CELLS
-    east = 0
-    for part in parts:
-        if part.end_row > part.row:
-            west = min(west, part.col + part.right)
-            east = max(east, part.end_col + part.right)
+    kind = np.uint64(TILE_CELLS)
     for r in range(first, last):
-        for c in range(west, east):
-            rays_a, missed_a, crossed_a, hit_a = _of_scan(scans[0], parts[0], r, c)
-            rays_b, missed_b, crossed_b, hit_b = _of_scan(scans[1], parts[1], r, c)
-            rays_c, missed_c, crossed_c, hit_c = _of_scan(scans[2], parts[2], r, c)
-            rays_d, missed_d, crossed_d, hit_d = _of_scan(scans[3], parts[3], r, c)
-            rays = rays_a | rays_b | rays_c | rays_d
-            hit = hit_a | hit_b | hit_c | hit_d
-            if not rays | hit:
+        west = TILE_CELLS
+        east = 0
+        for k in range(4):
+            begin, end = _take_row(scans[k], parts[k], r, k, words)
+            west = min(west, begin)
+            east = max(east, end)
+        for c in range(np.uint64(west), np.uint64(max(west, east))):
+            if not words[np.uint64(13) * kind + c]:
                 continue
             spans[r, 0] = min(spans[r, 0], c)
-            spans[r, 1] = max(spans[r, 1], c + 1)
-            cell = planes[r, c]
-            cell[PASSED] |= rays
-            full = add_four(cell, PASSES, missed_a, missed_b, missed_c, missed_d)
-            full |= add_four(cell, CROSSED, crossed_a, crossed_b, crossed_c, crossed_d)
-            if hit:
-                full |= add_four(cell, HIT, hit_a, hit_b, hit_c, hit_d)
+            spans[r, 1] = max(spans[r, 1], c + np.uint64(1))
+            cell = planes[np.uint64(r), c]
+            cell[PASSED] |= words[np.uint64(12) * kind + c]
+            b = c + np.uint64(3) * kind
+            d = b + np.uint64(3) * kind
+            e = d + np.uint64(3) * kind
+            missed = words[c], words[b], words[d], words[e]
+            crossed = words[c + kind], words[b + kind], words[d + kind], words[e + kind]
+            hit = (
+                words[c + np.uint64(2) * kind],
+                words[b + np.uint64(2) * kind],
+                words[d + np.uint64(2) * kind],
+                words[e + np.uint64(2) * kind],
+            )
+            full = add_four(cell, PASSES, missed[0], missed[1], missed[2], missed[3])
+            full |= add_four(cell, CROSSED, crossed[0], crossed[1], crossed[2], crossed[3])
+            if hit[0] | hit[1] | hit[2] | hit[3]:
+                full |= add_four(cell, HIT, hit[0], hit[1], hit[2], hit[3])
             if full:  # what was added is taken away again, as x - y = ~(~x + y), and the scans come one by one
                 for k in range(PASSED):
                     cell[k] = ~cell[k]
-                add_four(cell, PASSES, missed_a, missed_b, missed_c, missed_d)
-                add_four(cell, CROSSED, crossed_a, crossed_b, crossed_c, crossed_d)
-                add_four(cell, HIT, hit_a, hit_b, hit_c, hit_d)
+                add_four(cell, PASSES, missed[0], missed[1], missed[2], missed[3])
+                add_four(cell, CROSSED, crossed[0], crossed[1], crossed[2], crossed[3])
+                add_four(cell, HIT, hit[0], hit[1], hit[2], hit[3])
                 for k in range(PASSED):
                     cell[k] = ~cell[k]
-                add_one(cell, (crossed_a, hit_a, missed_a))
-                add_one(cell, (crossed_b, hit_b, missed_b))
-                add_one(cell, (crossed_c, hit_c, missed_c))
-                add_one(cell, (crossed_d, hit_d, missed_d))
+                for k in range(4):
+                    add_one(cell, (crossed[k], hit[k], missed[k]))
+        for k in range(np.uint64(14)):
+            for c in range(np.uint64(west), np.uint64(max(west, east))):
+                words[k * kind + c] = np.uint64(0)
