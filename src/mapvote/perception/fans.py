@@ -180,12 +180,15 @@ def set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     """The way from (x, y), in cells, in direction (dx, dy), where it has come ``at`` metres."""
     far = 1e18
     along = 1e-9  # a fan along an axis never comes to the next row or column
-    c = int(np.floor(x + dx * at / CELL_SIZE))
-    r = int(np.floor(y + dy * at / CELL_SIZE))
-    next_c = far if abs(dx) < along else ((c + (dx > 0)) - x) / dx * CELL_SIZE
-    next_r = far if abs(dy) < along else ((r + (dy > 0)) - y) / dy * CELL_SIZE
-    width_c = far if abs(dx) < along else CELL_SIZE / abs(dx)
-    width_r = far if abs(dy) < along else CELL_SIZE / abs(dy)
+    per_cell = at * (1.0 / CELL_SIZE)
+    c = int(np.floor(x + dx * per_cell))
+    r = int(np.floor(y + dy * per_cell))
+    across_c = CELL_SIZE / dx
+    across_r = CELL_SIZE / dy
+    next_c = far if abs(dx) < along else ((c + (dx > 0)) - x) * across_c
+    next_r = far if abs(dy) < along else ((r + (dy > 0)) - y) * across_r
+    width_c = far if abs(dx) < along else abs(across_c)
+    width_r = far if abs(dy) < along else abs(across_r)
     return Way(r, c, max(0.0, next_c - width_c, next_r - width_r), next_r, next_c, width_r, width_c)
 
 
