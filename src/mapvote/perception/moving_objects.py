@@ -502,7 +502,7 @@ def _weigh(
 
 
 @kernel
-def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, chosen: I32, keys: I64) -> int:
+def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, chosen: I32, keys: I64) -> np.int64:
     """How many points ``rows`` (3, n) from ``origin`` are obstacles within ``reach``: which, and the keys of their
     voxels, into the first of ``chosen`` (n,) and ``keys`` (n,)."""
     count = np.uint64(0)
@@ -515,16 +515,18 @@ def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, c
     z0 = origin[2]
     per_m = 1.0 / cell
     for i in range(np.uint64(0), np.uint64(len(obstacle))):  # what is not chosen is written over: no branch to predict
-        x = east[i]
-        y = north[i]
         chosen[count] = i
-        count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach2) else np.uint64(0)
+        count += np.uint64(obstacle[i])
+    within = np.uint64(0)
     for k in range(np.uint64(0), count):
         p = np.uint64(chosen[k])
-        x = (np.float64(east[p]) + x0) * per_m
-        y = (np.float64(north[p]) + y0) * per_m
-        keys[k] = voxel_key(x, y, (np.float64(up[p]) + z0) * per_m, 1.0)
-    return int(count)
+        x = east[p]
+        y = north[p]
+        z = (np.float64(up[p]) + z0) * per_m
+        chosen[within] = p
+        keys[within] = voxel_key((np.float64(x) + x0) * per_m, (np.float64(y) + y0) * per_m, z, 1.0)
+        within += np.uint64(x * x + y * y <= reach2)
+    return np.int64(within)
 
 
 def voxels(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I32, F32]:
