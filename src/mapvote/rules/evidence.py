@@ -133,9 +133,11 @@ def _mark_near(
     count = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(cell))):
         chosen[count] = i
-        count += np.uint64(1) if obstacle[i] & (not moving[i]) & (cell[i] >= 0) else np.uint64(0)
+        count += np.uint64(obstacle[i] & (not moving[i]))
     for k in range(np.uint64(0), count):
         p = np.uint64(chosen[k])
+        if cell[p] < 0:
+            continue
         x = (np.float64(east[p]) + x0) * per_m
         y = (np.float64(north[p]) + y0) * per_m
         z = (np.float64(up[p]) + z0) * per_m

@@ -112,12 +112,15 @@ def _select(
 ) -> np.int64:
     """:func:`select` into the first of ``chosen`` (n + 1,); returns how many. Each index is written, and written over
     if its point is not chosen: a branch could not be predicted."""
-    near = np.uint64(0)
+    count = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(cell))):
-        k = np.uint64(max(cell[i], np.int32(0)))
-        here = wanted[i] & (not unwanted[i]) & (cell[i] >= 0)
-        chosen[near] = i
-        near += np.uint64(1) if here & (words[k] != 0) else np.uint64(0)
+        chosen[count] = i
+        count += np.uint64(wanted[i] & (not unwanted[i]))
+    near = np.uint64(0)
+    for w in range(np.uint64(0), count):
+        point = np.uint64(chosen[w])
+        chosen[near] = point
+        near += np.uint64((cell[point] >= 0) & (words[np.uint64(max(cell[point], np.int32(0)))] != 0))
     found = np.uint64(0)
     for w in range(np.uint64(0), near):
         point = np.uint64(chosen[w])
