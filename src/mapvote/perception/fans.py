@@ -122,26 +122,29 @@ def gather_rays(rays: Rays) -> Fans:
     stop = np.empty(room, np.float32)
     end = np.zeros(FANS, np.float32)
     fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
-    _gather(rays, fans, np.empty(len(rays.reach) + 1, np.int32))
+    _gather(rays, fans, np.empty(len(rays.reach), np.int32))
     return fans
 
 
 @kernel
 def _gather(rays: Rays, fans: Fans, kept: I32) -> None:
-    """``kept`` (n + 1,): scratch, which rays mark anything: a third."""
+    """``kept`` (n,): scratch, first whether each ray marks anything, in a loop that vectorises, then which do: a third.
+    Told in one loop, LLVM made branches of it, which nothing could predict."""
     n = np.uint64(len(rays.reach))
     own = np.float32(CELL_SIZE)
     first, last, slope, stop, end, direction = fans
+    for i in range(n):
+        kept[i] = np.int32((rays.reach[i] >= own) & (rays.stop[i] > _TOO_SHORT[np.uint64(rays.fan[i])]))
     count = np.uint64(0)
     for i in range(n):
         fan = np.uint64(rays.fan[i])
         if rays.reach[i] >= own:
             direction[fan, 0] += rays.x[i]
             direction[fan, 1] += rays.y[i]
-            keep = rays.stop[i] > _TOO_SHORT[fan]
-            first[fan] += np.int32(keep)
-            kept[count] = i  # a ray that is not kept is overwritten: no branch to predict
-            count += np.uint64(keep)
+        keep = kept[i]
+        first[fan] += keep
+        kept[count] = i  # a ray that is not kept is overwritten
+        count += np.uint64(keep)
     room = 0
     for f in range(FANS):
         room, first[f], last[f] = room + first[f] + 1, room, room
