@@ -38,8 +38,8 @@ class LocalMatcher(Protocol):
     """A part of the map, ready to be matched with scans taken in its middle.
 
     Clouds are (3, n) float32 rows x, y, z of the lidar frame, de-skewed, one per level of
-    :data:`mapvote.matching.ndt_voxels.LEVELS`, coarse to fine; a matcher of fewer levels takes the last ones. Poses are
-    T_map_lidar (4, 4).
+    :data:`mapvote.matching.ndt_voxels.LEVELS`, coarse to fine; a matcher of fewer levels takes the last ones, and those
+    before the first level that is asked for may be missing. Poses are T_map_lidar (4, 4).
     """
 
     def refine(

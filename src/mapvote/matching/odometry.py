@@ -51,6 +51,8 @@ class Tracking:
 
 
 TRACKING = Tracking()
+FINEST = len(LEVELS) - 1
+"""The last level."""
 
 
 @dataclass(slots=True)
@@ -121,14 +123,14 @@ class Tracker:
             self.twist if self._knows_motion(scan) else self.guess_motion(around, scan.stamp_ns, sample, seed, prior)
         )
         # The pose from the first guess; others where it fits badly.
-        clouds = sample.clouds(twist)
-        result = around.refine(clouds, seed, prior, self._first_level(reach))
+        first_level = self._first_level(reach)
+        result = around.refine(sample.clouds(twist, first_level), seed, prior, first_level)
         if result.score < self.numbers.poor * self._usual_score:
-            result = self._reconsider(around, clouds, scan.stamp_ns, result, prior)
+            result = self._reconsider(around, sample.clouds(twist), scan.stamp_ns, result, prior)
         trusted = self.is_sound(result)
         if not trusted:
             centre = prior.T_map_lidar if prior is not None else seed
-            result = self._search(around, clouds, centre, reach, prior)
+            result = self._search(around, sample.clouds(twist), centre, reach, prior)
             trusted = self.is_sound(result)
         # De-skewed anew while the motion to the new pose changes.
         moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
@@ -136,7 +138,7 @@ class Tracker:
             if scan.time_s is None or moved is None or not _differ(twist, moved):
                 break
             twist = moved
-            result = around.refine(sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
+            result = around.refine(sample.clouds(twist, FINEST), result.T_map_lidar, prior, FINEST)
             trusted = self.is_sound(result)
             moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         if trusted:
@@ -149,7 +151,7 @@ class Tracker:
         """The coarsest level that a guess needs which may be off by ``reach`` metres."""
         if self.last_pose is None or reach > 0.5 * self.numbers.step_m:
             return 0
-        return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
+        return FINEST if reach <= LEVELS[-1].floor_m else 1
 
     @property
     def has_motion(self) -> bool:

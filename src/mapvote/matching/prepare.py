@@ -41,13 +41,15 @@ class ScanPreparation:
 
 
 SCAN_PREPARATION = ScanPreparation()
+SIZES_M = sorted({level.points_m for level in LEVELS})
+"""Sides of the voxels that scans are thinned by."""
 
 
 def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F32]:
     """The scan for each level, (3, m): one point per voxel of the level's ``points_m``."""
     source = np.ascontiguousarray(points_lidar, dtype=np.float32)
-    chosen = thinned(source)
-    return [in_rows(source[chosen[level.points_m]]) for level in LEVELS]
+    thinned = Thinned(source)
+    return [in_rows(source[thinned.by(level.points_m)]) for level in LEVELS]
 
 
 def in_rows(points_lidar: NDArray[np.floating]) -> F32:
@@ -55,15 +57,23 @@ def in_rows(points_lidar: NDArray[np.floating]) -> F32:
     return np.ascontiguousarray(points_lidar.T, dtype=np.float32)
 
 
-def thinned(points_lidar: F32, numbers: ScanPreparation = SCAN_PREPARATION) -> dict[float, I64]:
-    """Size of voxel, metres -> ascending indices of one of (n, 3) points per voxel, for each size of the levels."""
-    sizes = sorted({level.points_m for level in LEVELS})
-    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // numbers.enough - 1) | 1))
-    chosen = {sizes[0]: few}
-    for size in sizes[1:]:
-        few = few[thin(points_lidar.take(few, axis=0), size)]
-        chosen[size] = few
-    return chosen
+class Thinned:
+    """One point of a scan per voxel, for each size of the levels. Those of a size are chosen once they are asked for: a
+    track that holds is compared at the finest level alone."""
+
+    def __init__(self, points_lidar: F32, numbers: ScanPreparation = SCAN_PREPARATION) -> None:
+        """``points_lidar`` (n, 3)."""
+        self._points = points_lidar
+        every = max(1, (len(points_lidar) // numbers.enough - 1) | 1)
+        self._chosen = [thin(points_lidar, SIZES_M[0], every)]
+
+    def by(self, size_m: float) -> I64:
+        """(m,) ascending indices, for voxels of side ``size_m``."""
+        k = SIZES_M.index(size_m)
+        while len(self._chosen) <= k:
+            few = self._chosen[-1]
+            self._chosen.append(few[thin(self._points.take(few, axis=0), SIZES_M[len(self._chosen)])])
+        return self._chosen[k]
 
 
 @kernel
@@ -195,17 +205,21 @@ class Sample:
     """The points of one scan that each level compares with the map."""
 
     def __init__(self, scan: Scan) -> None:
-        time_s = scan.time_s
-        self._parts = {
-            size: (scan.points.take(few, axis=0), None if time_s is None else time_s.take(few))
-            for size, few in thinned(scan.points).items()
-        }
+        self._scan = scan
+        self._thinned = Thinned(scan.points)
 
-    def clouds(self, twist: F64) -> list[F32]:
-        """(3, m) by level, at the scan's stamp if the sensor's motion per second was ``twist`` (6,)."""
-        clouds = {size: deskewed_rows(*part, twist) for size, part in self._parts.items()}
-        return [clouds[level.points_m] for level in LEVELS]
+    def clouds(self, twist: F64, first_level: int = 0) -> list[F32]:
+        """(3, m) of ``first_level`` and each finer one, at the scan's stamp if the sensor's motion per second was
+        ``twist`` (6,)."""
+        sizes_m = [level.points_m for level in LEVELS[first_level:]]
+        clouds = {size_m: self._cloud(size_m, twist) for size_m in set(sizes_m)}
+        return [clouds[size_m] for size_m in sizes_m]
 
     def coarse(self, twist: F64) -> list[F32]:
         """The clouds of the fewest points at every level: to try many guesses."""
-        return [deskewed_rows(*self._parts[max(self._parts)], twist)] * len(LEVELS)
+        return [self._cloud(SIZES_M[-1], twist)] * len(LEVELS)
+
+    def _cloud(self, size_m: float, twist: F64) -> F32:
+        chosen = self._thinned.by(size_m)
+        time_s = None if self._scan.time_s is None else self._scan.time_s.take(chosen)
+        return deskewed_rows(self._scan.points.take(chosen, axis=0), time_s, twist)
