@@ -18,7 +18,7 @@ import numpy as np
 from mapvote.core.kernel import fast_math, inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64
-from mapvote.matching.ndt_voxels import SEVEN, Vector, Window, holds, voxel_of
+from mapvote.matching.ndt_voxels import SEVEN, Window
 
 
 @record(votes=True)
@@ -33,10 +33,8 @@ class NdtAlignment:
     freedom."""
     cutoff_e: float = 25.0
     """Squared Mahalanobis distance beyond which a voxel's pull on a point, exp(-e / 2), is neglected."""
-    sum_block: int = 1024
-    """Points whose sums are taken in float32 before they are added up in float64."""
-    paired_at_once: int = 64
-    """Points that are paired together."""
+    block: int = 240
+    """Points that are paired together, and whose sums are taken in float32 before they are added up in float64."""
     turn_lever_m: float = 20.0
     """Distance at which a rotation is weighed against a shift, metres."""
 
@@ -46,30 +44,49 @@ NDT_ALIGNMENT = NdtAlignment()
 COVARIANCE_SCALE = NDT_ALIGNMENT.covariance_scale
 INLIER_E = NDT_ALIGNMENT.inlier_e
 CUTOFF_E = NDT_ALIGNMENT.cutoff_e
-_SUM_BLOCK = NDT_ALIGNMENT.sum_block
-PAIRED_AT_ONCE = NDT_ALIGNMENT.paired_at_once
+BLOCK = NDT_ALIGNMENT.block
 TURN_LEVER_M = NDT_ALIGNMENT.turn_lever_m
-_UNPAIRED = np.int32(-(1 << 30))
+_UNPAIRED = np.int32(-2)
 """No point's home: all are to be paired."""
 
 
 class Room(NamedTuple):
-    """Buffers of an alignment of up to n points: an allocation in a kernel takes 50 ms to compile."""
+    """Buffers of an alignment of up to n points: an allocation in a kernel takes 50 ms to compile.
+
+    Points lie in blocks, those with most partners first, so that few places for partners stay empty. The first three
+    arrays are flat, and what belongs to a block lies together: its places are known to the compiler.
+    """
 
     of: F32
-    """(7, 9, n) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its precision xx, xy,
-    xz, yy, yz, zz; zeros where there is no partner."""
+    """(blocks, 7, 9, BLOCK) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its
+    precision xx, xy, xz, yy, yz, zz; zeros where there is no partner."""
+    points: F32
+    """(blocks, 3, BLOCK) in the lidar frame ..."""
+    placed: F32
+    """... and from ``origin`` in map axes, at the pose at which they were paired last."""
     home: I32
-    """(3, n) the voxel that the point lay in when it was paired, as an index of the window."""
+    """(blocks, BLOCK) the voxel that the point lay in when it was paired, as an index of the window's flat rows; -1
+    outside."""
+    partners: I64
+    """(blocks,) the most partners of a point of the block."""
     origin: F64
-    """(3,) map metres: near the sensor, so that float32 suffices."""
+    """(3,) map metres, the corner of a voxel near the sensor: float32 suffices from there."""
+    here: I32
+    """(BLOCK,) ``home`` at another pose."""
     moved: I64
-    """(PAIRED_AT_ONCE,) and below (7, PAIRED_AT_ONCE): who is paired, with whom."""
+    """(BLOCK,) and below (7, BLOCK) and (BLOCK,): who is paired, with whom, with how many."""
     partner: I32
+    counts: I64
+    centre: F32
+    """(3, BLOCK) the centres of their voxels, from ``origin``."""
+    pull: F32
+    """(10, BLOCK) flat: of :func:`_pull_together`."""
     sums: F64
     """(50,), (3, 3) and (3,): of :func:`linearise`."""
     R: F32
     d: F32
+    from_lowest: I32
+    """(3,) voxels from the window's lowest one to the origin's."""
     matrices: F64
     """(7, 6, 6), (3, 6, 1) and (3, 3, 3): of :func:`align`."""
     columns: F64
@@ -78,75 +95,164 @@ class Room(NamedTuple):
 
 def room_for(n: int) -> Room:
     """Any number of alignments of up to n points, one after the other, may use it."""
+    blocks = -(-n // BLOCK)
+    points = blocks * 3 * BLOCK
     return Room(
-        np.empty((7, 9, n), np.float32), np.empty((3, n), np.int32), np.zeros(3),
-        np.empty(PAIRED_AT_ONCE, np.int64), np.empty((7, PAIRED_AT_ONCE), np.int32),
-        np.empty(50), np.empty((3, 3), np.float32), np.empty(3, np.float32),
+        np.empty(blocks * 63 * BLOCK, np.float32), np.empty(points, np.float32), np.empty(points, np.float32),
+        np.empty(blocks * BLOCK, np.int32), np.empty(blocks, np.int64), np.zeros(3), np.empty(BLOCK, np.int32),
+        np.empty(BLOCK, np.int64), np.empty((7, BLOCK), np.int32), np.empty(BLOCK, np.int64),
+        np.empty((3, BLOCK), np.float32), np.empty(10 * BLOCK, np.float32), np.empty(50),
+        np.empty((3, 3), np.float32), np.empty(3, np.float32), np.empty(3, np.int32),
         np.empty((7, 6, 6)), np.empty((3, 6, 1)), np.empty((3, 3, 3)),
     )  # fmt: skip
 
 
+@kernel
+def _place(block: int, T: F64, window: Window, room: Room, home: I32) -> None:
+    """Move a block of points into the map by the pose T (4, 4); into ``home`` (BLOCK,) where it lies then."""
+    rows, lowest, size, _, _ = window
+    R = room.R
+    d = room.d
+    for r in range(3):
+        d[r] = T[r, 3] - room.origin[r]
+        for c in range(3):
+            R[r, c] = T[r, c]
+    first = 3 * BLOCK * block
+    points = room.points
+    placed = room.placed
+    each = np.float32(1.0 / size)
+    from_lowest = room.from_lowest
+    for r in range(3):  # how far beyond the window does not matter
+        between = np.int64(np.round(room.origin[r] / size)) - lowest[r]
+        from_lowest[r] = min(max(between, -(1 << 20)), 1 << 20)
+    nx = np.int32(rows.shape[0] - 2)
+    ny = np.int32(rows.shape[1] - 2)
+    nz = np.int32(rows.shape[2] - 2)
+    for i in range(np.uint64(0), np.uint64(BLOCK)):  # unsigned: an index that cannot be negative vectorises
+        east = np.uint64(first) + i
+        north = east + np.uint64(BLOCK)
+        up = north + np.uint64(BLOCK)
+        x, y, z = points[east], points[north], points[up]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + d[0]
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + d[1]
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + d[2]
+        placed[east] = px
+        placed[north] = py
+        placed[up] = pz
+        ix = np.int32(np.int32(np.floor(px * each)) + from_lowest[0])
+        iy = np.int32(np.int32(np.floor(py * each)) + from_lowest[1])
+        iz = np.int32(np.int32(np.floor(pz * each)) + from_lowest[2])
+        inside = (ix >= 1) & (iy >= 1) & (iz >= 1) & (ix <= nx) & (iy <= ny) & (iz <= nz)
+        at = np.int32(np.int32(ix * (ny + np.int32(2)) + iy) * (nz + np.int32(2)) + iz)
+        home[i] = at if inside else np.int32(-1)
+
+
 @inlined
-def _in_map(points: F32, T: F64, i: int) -> Vector:
-    """Point i in map metres."""
-    x = np.float64(points[0, i])
-    y = np.float64(points[1, i])
-    z = np.float64(points[2, i])
-    return (
-        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-    )
+def _voxel_beside(window: Window, at: np.int64, way: int) -> tuple[np.uint64, bool]:
+    """(row, whether there is one) of the voxel beside the one ``at``; without a branch, so that no search waits for the
+    memory of the one before."""
+    beside = window.beside
+    inside = at >= 0
+    at = at if inside else np.int64(beside[1] + beside[3] + beside[5])  # the first that has others to all sides
+    k = window.flat[np.uint64(at + beside[way])]
+    there = inside & (k >= 0)
+    return np.uint64(k if there else 0), there
+
+
+@inlined
+def _find_partners(window: Window, at: np.int64, w: int, partner: I32) -> int:
+    """How many voxels with points are at and beside the voxel ``at``, and into ``partner`` (7, n), of w, their rows
+    times 8, plus the way there."""
+    n = 0
+    for j in range(7):
+        k, there = _voxel_beside(window, at, j)
+        partner[n, w] = np.int32(k * np.uint64(8) + np.uint64(j))
+        n += 1 if there else 0
+    return n
 
 
 @kernel
-def pair_up(points: F32, T: F64, window: Window, cells: F32, room: Room) -> None:
-    """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired.
+def arrange(points: F32, T: F64, window: Window, room: Room) -> None:
+    """Lay points (3, n) out in the room, those with most partners at the pose T (4, 4) first. All are to be paired."""
+    n = points.shape[1]
+    size = window.size
+    blocks = -(-n // BLOCK)
+    for r in range(3):
+        room.origin[r] = np.floor(T[r, 3] / size) * size
+        for i in range(BLOCK * blocks):
+            at = 3 * BLOCK * (i // BLOCK) + r * BLOCK + i % BLOCK
+            room.points[at] = points[r, i] if i < n else np.float32(1e9)  # what fills the last block is outside
+    # A counting sort by how many of the seven partners are missing.
+    first_with = room.moved
+    for most in range(9):
+        first_with[most] = 0
+    for block in range(blocks):
+        room.partners[block] = 0
+        missing = room.home[BLOCK * block : BLOCK * (block + 1)]
+        _place(block, T, window, room, missing)
+        for i in range(min(BLOCK, n - BLOCK * block)):
+            missing[i] = 7 - _find_partners(window, np.int64(missing[i]), 0, room.partner)
+            first_with[missing[i] + 1] += 1
+    for most in range(1, 8):
+        first_with[most] += first_with[most - 1]
+    for i in range(n):
+        at = first_with[room.home[i]]
+        first_with[room.home[i]] += 1
+        for r in range(3):
+            room.points[3 * BLOCK * (at // BLOCK) + r * BLOCK + at % BLOCK] = points[r, i]
+    for i in range(BLOCK * blocks):
+        room.home[i] = _UNPAIRED
+
+
+@kernel
+def pair_up(n: int, T: F64, window: Window, cells: F32, room: Room) -> None:
+    """Pair those of the n points that lie in another voxel at pose T (4, 4) than when they were last paired.
 
     Block by block: who has moved, where their partners are, what these say. No step waits for the memory of the one
-    before, nor guesses whether there is a partner: where there is none, the first voxel's numbers are masked.
+    before, nor guesses whether there is a partner.
     """
-    rows, lowest, size, flat, beside = window
+    side = np.float32(window.size)
+    each = np.float32(1.0 / window.size)
     of = room.of
-    home = room.home
-    origin = room.origin
     moved = room.moved
     partner = room.partner
-    stride = rows.shape[1] * rows.shape[2]
-    for first in range(0, points.shape[1], PAIRED_AT_ONCE):
+    home = room.here
+    for block in range(-(-n // BLOCK)):
+        _place(block, T, window, room, home)
         m = 0
-        for i in range(first, min(first + PAIRED_AT_ONCE, points.shape[1])):
-            x, y, z = _in_map(points, T, i)
-            ax, ay, az = voxel_of(size, x, y, z)
-            ix = ax - lowest[0]
-            iy = ay - lowest[1]
-            iz = az - lowest[2]
+        before = BLOCK * block
+        for i in range(BLOCK):
             moved[m] = i
-            m += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
-            home[0, i] = ix
-            home[1, i] = iy
-            home[2, i] = iz
+            m += 1 if home[i] != room.home[before + i] else 0
+            room.home[before + i] = home[i]
+        most = 0
         for w in range(m):
-            ix = np.int64(home[0, moved[w]])
-            iy = np.int64(home[1, moved[w]])
-            iz = np.int64(home[2, moved[w]])
-            inside = holds(rows, ix, iy, iz, 1)
-            at = ix * stride + iy * rows.shape[2] + iz if inside else stride + rows.shape[2] + 1
-            for j in range(7):
-                partner[j, w] = flat[np.uint64(at + beside[j])] if inside else np.int32(-1)
-        for j in range(7):
-            x = (lowest[0] + SEVEN[j, 0] + 0.5) * size - origin[0]
-            y = (lowest[1] + SEVEN[j, 1] + 0.5) * size - origin[1]
-            z = (lowest[2] + SEVEN[j, 2] + 0.5) * size - origin[2]
+            room.counts[w] = _find_partners(window, np.int64(home[moved[w]]), w, partner)
+            most = max(most, room.counts[w])
+        for j in range(room.partners[block], most if m < BLOCK else 0):
+            for i in range(9 * BLOCK):
+                of[(7 * block + j) * 9 * BLOCK + i] = 0.0
+        most = max(most, room.partners[block])
+        room.partners[block] = most
+        for w in range(m):
+            east = np.uint64(3 * BLOCK * block + moved[w])
+            for r in range(np.uint64(0), np.uint64(3)):
+                of_voxel = np.floor(room.placed[east + r * np.uint64(BLOCK)] * each)
+                room.centre[r, w] = (of_voxel + np.float32(0.5)) * side
+        for j in range(most):
+            first = np.uint64((7 * block + j) * 9 * BLOCK)
             for w in range(m):
-                at = np.uint64(moved[w])
-                k = np.uint64(max(partner[j, w], np.int32(0)))
-                there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
-                of[j, 0, at] = there * np.float32(home[0, at] * size + x + cells[k, 0])
-                of[j, 1, at] = there * np.float32(home[1, at] * size + y + cells[k, 1])
-                of[j, 2, at] = there * np.float32(home[2, at] * size + z + cells[k, 2])
+                at = first + np.uint64(moved[w])
+                if j >= room.counts[w]:
+                    for c in range(np.uint64(9)):
+                        of[at + c * np.uint64(BLOCK)] = np.float32(0.0)
+                    continue
+                k = np.uint64(partner[j, w] >> 3)
+                way = np.uint64(partner[j, w] & 7)
+                for r in range(np.uint64(0), np.uint64(3)):
+                    of[at + r * np.uint64(BLOCK)] = room.centre[r, w] + side * np.float32(SEVEN[way, r]) + cells[k, r]
                 for c in range(np.uint64(3), np.uint64(9)):
-                    of[j, c, at] = there * cells[k, c]
+                    of[at + c * np.uint64(BLOCK)] = cells[k, c]
 
 
 @inlined
@@ -165,44 +271,56 @@ def _likelihood(e: np.float32) -> np.float32:
 
 
 @fast_math
-def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
-    """The j-th partner of point i, which lies at (x, y, z) from the origin, as (e, w C, w C u) with u the point from
-    the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
-    x = x - of[j, 0, i]
-    y = y - of[j, 1, i]
-    z = z - of[j, 2, i]
-    c00 = of[j, 3, i]
-    c01 = of[j, 4, i]
-    c02 = of[j, 5, i]
-    c11 = of[j, 6, i]
-    c12 = of[j, 7, i]
-    c22 = of[j, 8, i]
-    b0 = c00 * x + c01 * y + c02 * z
-    b1 = c01 * x + c11 * y + c12 * z
-    b2 = c02 * x + c12 * y + c22 * z
-    e = x * b0 + y * b1 + z * b2
-    w = _likelihood(e)
-    e = e if c00 + c11 + c22 > np.float32(0.0) else np.float32(1e9)
-    return e, w * c00, w * c01, w * c02, w * c11, w * c12, w * c22, w * b0, w * b1, w * b2
+def _pull_together(of: F32, placed: F32, partners: int, pull: F32) -> None:
+    """What all partners of a block say, into ``pull`` (10, BLOCK) flat: the smallest e, and the sums of w C and of
+    w C u, with u the point from the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq.
+    (6.9) with d1 = d2 = 1. ``of`` (7, 9, BLOCK) and ``placed`` (3, BLOCK), flat: of the block."""
+    n = np.uint64(BLOCK)
+    for i in range(np.uint64(0), n):
+        pull[i] = np.float32(1e9)
+    for i in range(n, np.uint64(10) * n):
+        pull[i] = np.float32(0.0)
+    for j in range(partners):
+        first = np.uint64(j * 9 * BLOCK)
+        for i in range(np.uint64(0), n):  # one vector lane a point
+            at = first + i
+            x = placed[i] - of[at]
+            y = placed[i + n] - of[at + n]
+            z = placed[i + np.uint64(2) * n] - of[at + np.uint64(2) * n]
+            c00 = of[at + np.uint64(3) * n]
+            c01 = of[at + np.uint64(4) * n]
+            c02 = of[at + np.uint64(5) * n]
+            c11 = of[at + np.uint64(6) * n]
+            c12 = of[at + np.uint64(7) * n]
+            c22 = of[at + np.uint64(8) * n]
+            b0 = c00 * x + c01 * y + c02 * z
+            b1 = c01 * x + c11 * y + c12 * z
+            b2 = c02 * x + c12 * y + c22 * z
+            e = x * b0 + y * b1 + z * b2
+            w = _likelihood(e)
+            e = e if c00 + c11 + c22 > np.float32(0.0) else np.float32(1e9)
+            pull[i] = min(pull[i], e)
+            pull[i + n] += w * c00
+            pull[i + np.uint64(2) * n] += w * c01
+            pull[i + np.uint64(3) * n] += w * c02
+            pull[i + np.uint64(4) * n] += w * c11
+            pull[i + np.uint64(5) * n] += w * c12
+            pull[i + np.uint64(6) * n] += w * c22
+            pull[i + np.uint64(7) * n] += w * b0
+            pull[i + np.uint64(8) * n] += w * b1
+            pull[i + np.uint64(9) * n] += w * b2
 
 
 @fast_math
-def _both(p: tuple[np.float32, ...], q: tuple[np.float32, ...]) -> tuple[np.float32, ...]:
-    """The smaller e, and the sums of the rest."""
-    p0, p1, p2, p3, p4, p5, p6, p7, p8, p9 = p
-    q0, q1, q2, q3, q4, q5, q6, q7, q8, q9 = q
-    return min(p0, q0), p1 + q1, p2 + q2, p3 + q3, p4 + q4, p5 + q5, p6 + q6, p7 + q7, p8 + q8, p9 + q9
-
-
-@fast_math
-def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums: F64) -> None:
-    """Add up points from ``first`` to ``last`` at rotation R (3, 3), the sensor at ``d`` (3,) metres from the origin.
+def _sum_block(placed: F32, pull: F32, d: F32, sums: F64) -> None:
+    """Add up a block of points, ``placed`` (3, BLOCK) flat, and what their partners say (:func:`_pull_together`), the
+    sensor being at ``d`` (3,) metres from the origin.
 
     ``sums`` (50,): the upper triangle of H = J^T w C J row by row, g = J^T w C u (the sums of Eqs. (6.13) and (6.12),
     of which Gauss-Newton drops the other terms), the upper triangle of the sum of g_i g_i^T, likelihoods, inliers.
     J = [I, -[p]x] is the derivative of the point by (rho, phi). One vector lane a point; no stores, no branches.
     """
-    zero, at = np.float32(0.0), np.int64(0)  # a number: by seven literals _pull would be compiled seven times
+    zero, n = np.float32(0.0), np.uint64(BLOCK)
     h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
     q00, q01, q02, q10, q11, q12, q20, q21, q22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     r00, r01, r02, r11, r12, r22 = zero, zero, zero, zero, zero, zero
@@ -210,16 +328,20 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
     m00, m01, m02, m03, m04, m05, m11, m12 = zero, zero, zero, zero, zero, zero, zero, zero
     m13, m14, m15, m22, m23, m24, m25 = zero, zero, zero, zero, zero, zero, zero
     m33, m34, m35, m44, m45, m55 = zero, zero, zero, zero, zero, zero
-    for i in range(np.uint64(first), np.uint64(last)):  # unsigned: an index that cannot be negative vectorises
-        x, y, z = points[0, i], points[1, i], points[2, i]
-        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        x, y, z = px + d[0], py + d[1], pz + d[2]
-        pull = _both(_pull(of, at, i, x, y, z), _pull(of, at + 1, i, x, y, z))
-        pull = _both(pull, _both(_pull(of, at + 2, i, x, y, z), _pull(of, at + 3, i, x, y, z)))
-        pull = _both(pull, _both(_pull(of, at + 4, i, x, y, z), _pull(of, at + 5, i, x, y, z)))
-        e, c00, c01, c02, c11, c12, c22, g0, g1, g2 = _both(pull, _pull(of, at + 6, i, x, y, z))
+    for i in range(np.uint64(0), n):
+        px = placed[i] - d[0]
+        py = placed[i + n] - d[1]
+        pz = placed[i + np.uint64(2) * n] - d[2]
+        e = pull[i]
+        c00 = pull[i + n]
+        c01 = pull[i + np.uint64(2) * n]
+        c02 = pull[i + np.uint64(3) * n]
+        c11 = pull[i + np.uint64(4) * n]
+        c12 = pull[i + np.uint64(5) * n]
+        c22 = pull[i + np.uint64(6) * n]
+        g0 = pull[i + np.uint64(7) * n]
+        g1 = pull[i + np.uint64(8) * n]
+        g2 = pull[i + np.uint64(9) * n]
         likelihood += _likelihood(e)
         inliers += np.float32(1.0) if e < np.float32(INLIER_E) else zero
         # Columns of Q = C (-[p]x) = C times ((0, pz, -py), (-pz, 0, px), (py, -px, 0)).
@@ -249,20 +371,18 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
 
 
 @inlined
-def linearise(points: F32, room: Room, T: F64, H: F64, M: F64, g: F64) -> tuple[float, float]:
-    """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
-    (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
+def linearise(n: int, room: Room, H: F64, M: F64, g: F64) -> tuple[float, float]:
+    """The reweighted least squares of the n points at the pose at which they were paired last: fills H (6, 6), the
+    scatter M (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
     sums = room.sums
-    R = room.R
-    d = room.d
     sums[:] = 0.0
-    for r in range(3):
-        d[r] = T[r, 3] - room.origin[r]
-        for c in range(3):
-            R[r, c] = T[r, c]
-    n = points.shape[1]
-    for first in range(0, n, _SUM_BLOCK):
-        _sum_block(points, room.of, first, min(first + _SUM_BLOCK, n), R, d, sums)
+    for block in range(-(-n // BLOCK)):
+        if room.partners[block] == 0:
+            continue
+        placed = room.placed[3 * BLOCK * block : 3 * BLOCK * (block + 1)]
+        of = room.of[63 * BLOCK * block : 63 * BLOCK * (block + 1)]
+        _pull_together(of, placed, room.partners[block], room.pull)
+        _sum_block(placed, room.pull, room.d, sums)
     k = 0
     for r in range(6):
         for c in range(r, 6):
@@ -274,39 +394,43 @@ def linearise(points: F32, room: Room, T: F64, H: F64, M: F64, g: F64) -> tuple[
 
 
 @kernel
-def likelihoods(points: F32, T: F64, window: Window, cells: F32, out: F64) -> None:
-    """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4): what
-    :func:`linearise` says, for a single look without pairs."""
-    rows, lowest, size, flat, beside = window
-    stride = rows.shape[1] * rows.shape[2]
+def likelihoods(points: F32, T: F64, window: Window, cells: F32, room: Room, out: F64) -> None:
+    """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4), all near the
+    first: what :func:`linearise` says, for a single look without pairs.
+
+    Without a branch: which voxels have points cannot be guessed, and a wrong guess costs as much as the rest.
+    """
+    side = np.float32(window.size)
+    each = np.float32(1.0 / window.size)
+    n = points.shape[1]
+    home = room.here
+    arrange(points, T[0], window, room)
     for pose in range(len(T)):
-        total = 0.0
-        for i in range(points.shape[1]):
-            x, y, z = _in_map(points, T[pose], i)
-            ax, ay, az = voxel_of(size, x, y, z)
-            ix = ax - lowest[0]
-            iy = ay - lowest[1]
-            iz = az - lowest[2]
-            if not holds(rows, ix, iy, iz, 1):
-                continue
-            x = x - (ax + 0.5) * size
-            y = y - (ay + 0.5) * size
-            z = z - (az + 0.5) * size
-            nearest = CUTOFF_E + 1.0
-            at = ix * stride + iy * rows.shape[2] + iz
-            for j in range(7):
-                k = flat[at + beside[j]]
-                if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
-                    continue
-                ux = x - SEVEN[j, 0] * size - cells[k, 0]
-                uy = y - SEVEN[j, 1] * size - cells[k, 1]
-                uz = z - SEVEN[j, 2] * size - cells[k, 2]
-                # e = u C u, C the precision: the squared Mahalanobis distance.
-                vx = cells[k, 3] * ux + 2.0 * (cells[k, 4] * uy + cells[k, 5] * uz)
-                vy = cells[k, 6] * uy + 2.0 * cells[k, 7] * uz
-                nearest = min(nearest, vx * ux + vy * uy + cells[k, 8] * uz * uz)
-            total += np.float64(_likelihood(np.float32(nearest)))
-        out[pose] = total / max(1, points.shape[1])
+        total = np.float32(0.0)
+        for block in range(-(-n // BLOCK)):
+            _place(block, T[pose], window, room, home)
+            first = np.uint64(3 * BLOCK * block)
+            for i in range(np.uint64(min(BLOCK, n - BLOCK * block))):
+                x = room.placed[first + i]
+                y = room.placed[first + i + np.uint64(BLOCK)]
+                z = room.placed[first + i + np.uint64(2 * BLOCK)]
+                x -= (np.floor(x * each) + np.float32(0.5)) * side
+                y -= (np.floor(y * each) + np.float32(0.5)) * side
+                z -= (np.floor(z * each) + np.float32(0.5)) * side
+                nearest = np.float32(1e9)
+                for j in range(np.uint64(0), np.uint64(7)):
+                    k, there = _voxel_beside(window, np.int64(home[i]), j)
+                    ux = x - side * np.float32(SEVEN[j, 0]) - cells[k, 0]
+                    uy = y - side * np.float32(SEVEN[j, 1]) - cells[k, 1]
+                    uz = z - side * np.float32(SEVEN[j, 2]) - cells[k, 2]
+                    # e = u C u, C the precision: the squared Mahalanobis distance.
+                    vx = cells[k, 3] * ux + np.float32(2.0) * (cells[k, 4] * uy + cells[k, 5] * uz)
+                    vy = cells[k, 6] * uy + np.float32(2.0) * cells[k, 7] * uz
+                    e = vx * ux + vy * uy + cells[k, 8] * uz * uz
+                    there = there & (cells[k, 3] + cells[k, 6] + cells[k, 8] > np.float32(0.0))
+                    nearest = min(nearest, e if there else np.float32(1e9))
+                total += _likelihood(nearest)
+        out[pose] = total / max(1, n)
 
 
 @kernel
@@ -389,14 +513,6 @@ def _move(T: F64, step: F64, W: F64, turn: F64, turned: F64) -> None:
 
 
 @inlined
-def _length(step: F64) -> float:
-    """How far a step shifts the sensor, or a point 20 m away by its turn, whichever is more."""
-    shift = np.sqrt(step[0, 0] ** 2 + step[1, 0] ** 2 + step[2, 0] ** 2)
-    turn = np.sqrt(step[3, 0] ** 2 + step[4, 0] ** 2 + step[5, 0] ** 2)
-    return max(shift, turn * TURN_LEVER_M)
-
-
-@inlined
 def _to_prior(T: F64, T_prior: F64, R: F64, step: F64) -> None:
     """Into ``step`` (6, 1) what leads to the prior: phi with R_prior = exp(phi) R, for turns below pi. R (3, 3):
     scratch."""
@@ -444,10 +560,8 @@ def align(
     to_prior = room.columns[2]
     size = window.size
     has_prior = prior[0, 0] > 0.0
-    for r in range(3):
-        for i in range(points.shape[1]):
-            room.home[r, i] = _UNPAIRED
-        room.origin[r] = T[r, 3]
+    n = points.shape[1]
+    arrange(points, T, window, room)
     for r in range(6):
         for c in range(6):
             covariance[r, c] = 1.0 if r == c else 0.0
@@ -458,8 +572,8 @@ def align(
     floor = 0.0
     while iterations < most and not converged:
         iterations += 1
-        pair_up(points, T, window, cells, room)
-        likelihood, inliers = linearise(points, room, T, H, M, g)
+        pair_up(n, T, window, cells, room)
+        likelihood, inliers = linearise(n, room, H, M, g)
         trace = 0.0
         for k in range(6):
             trace += H[k, k]
@@ -482,7 +596,10 @@ def align(
                     information[r, c] += prior[r, c]
             inverse_of(information, left, covariance)
             _times(covariance, g, step)
-        length = _length(step)
+        # How far it shifts the sensor, or a point 20 m away by its turn, whichever is more.
+        shift = np.sqrt(step[0, 0] ** 2 + step[1, 0] ** 2 + step[2, 0] ** 2)
+        turn = np.sqrt(step[3, 0] ** 2 + step[4, 0] ** 2 + step[5, 0] ** 2)
+        length = max(shift, turn * TURN_LEVER_M)
         if length > 0.5 * size:
             for k in range(6):
                 step[k, 0] *= 0.5 * size / length

@@ -324,19 +324,6 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
     return n, n_shared
 
 
-@kernel
-def reindex(window: Window, place: I64, n: int) -> None:
-    """Enter the first ``n`` voxels, whose world voxels are ``place`` (m, 3), into a window without any."""
-    rows = window.rows
-    lowest = window.lowest
-    for k in range(n):
-        ix = place[k, 0] - lowest[0]
-        iy = place[k, 1] - lowest[1]
-        iz = place[k, 2] - lowest[2]
-        if holds(rows, ix, iy, iz, 0):
-            rows[ix, iy, iz] = k
-
-
 class NdtGrid:
     """One level of the map: voxels of one size. All are kept; those inside the window can be found."""
 
@@ -368,7 +355,10 @@ class NdtGrid:
         """Let the window begin at this corner (3,), map metres: what was entered and lies inside is found again."""
         self.window.lowest[:] = np.round(lowest_map / self.level.voxel_m).astype(np.int64)
         self.window.rows.fill(-1)
-        reindex(self.window, self._voxels.place, self.n)
+        if self.n:
+            at = self._voxels.place[: self.n] - self.window.lowest
+            inside = np.flatnonzero(((at >= 0) & (at < self.window.rows.shape)).all(axis=1))
+            self.window.rows[tuple(at[inside].T)] = inside
 
     def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""

@@ -146,16 +146,18 @@ class Judge:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
         coarse = in_rows(standing[:: max(1, len(standing) // self.check.coarse)])
+        arms = [T @ arm for arm in self._arms]
+        fit_here, *fits_there = np.split(
+            around.likelihood(coarse, np.concatenate([T[None], *arms])), np.cumsum([1, *map(len, arms[:-1])])
+        )
         peaks = []
-        for arm in self._arms:
-            guesses = T @ arm
-            fits = around.likelihood(coarse, guesses)
+        for guesses, fits in zip(arms, fits_there, strict=True):
             rising = fits[1:] > fits[:-1]
             falling = np.append(fits[1:-1] >= fits[2:], True)
             peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
         peaks.sort(key=lambda peak: -peak[0])
         if quick:  # the pose itself was held lately: only what comes near to its fit can be a rival
-            least = self.check.quick_rival * float(around.likelihood(coarse, T[None])[0])
+            least = self.check.quick_rival * float(fit_here[0])
             peaks = [peak for peak in peaks if peak[0] >= least]
         unsettled = [T @ self._arms[0][0], T @ self._arms[1][0]]
         on_the_way = in_rows(few[:: self.check.quick_every if quick else 1])
