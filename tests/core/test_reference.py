@@ -44,6 +44,15 @@ def test_a_reference_prepared_on_the_way_is_the_one_laid_out_at_once(point_map: 
         assert_same(outer, reference_window(point_map, outer.grid))
 
 
+def test_a_reference_without_measures_has_the_same_ground_and_obstacles(point_map: PointMap) -> None:
+    for position in along(np.array([20.0, 100.0, 300.0])):
+        whole, light = (LocalMap(point_map, 20.0, measured=measured).at(position)[1] for measured in (True, False))
+        for name in ("grid", "ground_z", "base", "occupied", "free"):
+            np.testing.assert_array_equal(getattr(light, name), getattr(whole, name))
+        assert light.occupied.any()
+        assert not light.counts.any()
+
+
 def test_an_unused_preparation_does_no_harm(point_map: PointMap) -> None:
     local = LocalMap(point_map, 20.0)
     there, back, elsewhere = along(np.array([70.0, 80.0])), along(np.array([60.0])), along(np.array([250.0]))

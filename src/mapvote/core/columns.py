@@ -167,14 +167,17 @@ def fill_base(ground_z: F32, base: I32, band_rows: int) -> Iterator[None]:
     slope = 0.02 * CELL_SIZE
     bands = [(first, min(first + band_rows, rows)) for first in range(0, rows, band_rows)]
     for first, end in bands:
-        own = ground_z[first:end]
-        low[first:end] = np.where(np.isfinite(own), own, np.inf)
+        np.fmin(ground_z[first:end], np.inf, out=low[first:end])
         lower_rows(low, first, end, 1, slope, slope * np.sqrt(2.0))
         yield
+    layer = np.empty((band_rows, ground_z.shape[1]))
     for first, end in reversed(bands):
         lower_rows(low, end - 1, first - 1, -1, slope, slope * np.sqrt(2.0))
         own = ground_z[first:end]
-        base[first:end] = np.floor(np.where(np.isfinite(own), own, low[first:end]) / CELL_SIZE)
+        layers = layer[: end - first]
+        np.divide(low[first:end], CELL_SIZE, out=layers)
+        np.divide(own, CELL_SIZE, out=layers, where=np.isfinite(own), dtype=np.float64)
+        base[first:end] = np.floor(layers, out=layers)
         yield
 
 

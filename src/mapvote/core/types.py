@@ -292,7 +292,11 @@ class Registration:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The partial reference map R_i (paper III-A) as planes over one window."""
+    """The partial reference map R_i (paper III-A) as planes over one window.
+
+    Where obstacles were not measured (:class:`mapvote.core.reference.LocalMap`), ``counts``, ``bottom_z`` and ``top_z``
+    say that there are none.
+    """
 
     grid: Grid
     ground_z: F32
