@@ -23,10 +23,9 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
 from mapvote.matching.global_search import Bound, GlobalSearch
 from mapvote.matching.matcher import map_around
-from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.odometry import Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
-from mapvote.matching.prepare import Sample, deskew, motion_at, solid_of, thin_for_levels, twist_between
+from mapvote.matching.prepare import Sample, deskew, motion_at, thin_for_levels, twist_between
 from mapvote.matching.prior_frame import PriorFrame, distance_to
 
 
@@ -363,7 +362,7 @@ class Localiser:
         fix = self._waiting[of].fix
         T_map_lidar = fix.registration.T_map_lidar
         around = self.map_around(T_map_lidar[:3, 3])
-        few = solid_of(fix.scan, fix.twist, LEVELS[-1].points_m)
+        few = (fix.sample or Sample(fix.scan)).solid(fix.twist)
         if self._confirmed:  # a track that held is held again at less cost; where it is doubted, nothing is saved
             verdict = self.judge.judge(around, few, T_map_lidar, quick=True)
             if self.judge.holds(verdict):

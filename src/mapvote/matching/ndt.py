@@ -17,8 +17,8 @@ import numpy as np
 
 from mapvote.core.kernel import fast_math, inlined, kernel
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, I32, I64
-from mapvote.matching.ndt_voxels import SEVEN, Window
+from mapvote.core.types import F32, F64, I32, I64, Bool
+from mapvote.matching.ndt_voxels import SEVEN, Voxels, Window, holds, voxel_of
 
 
 @record(votes=True)
@@ -431,6 +431,55 @@ def likelihoods(points: F32, T: F64, window: Window, cells: F32, room: Room, out
                     nearest = min(nearest, e if there else np.float32(1e9))
                 total += _likelihood(nearest)
         out[pose] = total / max(1, n)
+
+
+@kernel
+def expect(
+    points: F64, noise_m: float, window: Window, voxels: Voxels, coarse: Window, likelihood: F64, near: Bool
+) -> None:
+    """Into ``likelihood`` (n,) the one to be expected of each of the points (n, 3), map metres, if it were drawn from
+    its voxel's own distribution, with the sensor's noise; -1 where the voxel has none. Into ``near`` (n,) whether its
+    voxel in a ``coarse`` window, or one beside that, holds anything.
+
+    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2.
+    """
+    sums = voxels.sums
+    cells = voxels.cells
+    noise = noise_m * noise_m
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ax, ay, az = voxel_of(coarse.size, x, y, z)
+        ix, iy, iz = ax - coarse.lowest[0], ay - coarse.lowest[1], az - coarse.lowest[2]
+        near[i] = False
+        if holds(coarse.rows, ix, iy, iz, 1):
+            at = (ix * coarse.rows.shape[1] + iy) * coarse.rows.shape[2] + iz
+            for j in range(7):
+                near[i] |= coarse.flat[at + coarse.beside[j]] >= 0
+        likelihood[i] = -1.0
+        ax, ay, az = voxel_of(window.size, x, y, z)
+        ix, iy, iz = ax - window.lowest[0], ay - window.lowest[1], az - window.lowest[2]
+        if not holds(window.rows, ix, iy, iz, 0):
+            continue
+        k = window.rows[ix, iy, iz]
+        if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+            continue
+        m = sums[k, 0]
+        a, b, c = np.float64(cells[k, 0]), np.float64(cells[k, 1]), np.float64(cells[k, 2])
+        s00, s01, s02 = sums[k, 4] / m - a * a + noise, sums[k, 5] / m - a * b, sums[k, 6] / m - a * c
+        s11, s12, s22 = sums[k, 7] / m - b * b + noise, sums[k, 8] / m - b * c, sums[k, 9] / m - c * c + noise
+        c00, c01, c02 = np.float64(cells[k, 3]), np.float64(cells[k, 4]), np.float64(cells[k, 5])
+        c11, c12, c22 = np.float64(cells[k, 6]), np.float64(cells[k, 7]), np.float64(cells[k, 8])
+        a00 = 1.0 + s00 * c00 + s01 * c01 + s02 * c02
+        a01 = s00 * c01 + s01 * c11 + s02 * c12
+        a02 = s00 * c02 + s01 * c12 + s02 * c22
+        a10 = s01 * c00 + s11 * c01 + s12 * c02
+        a11 = 1.0 + s01 * c01 + s11 * c11 + s12 * c12
+        a12 = s01 * c02 + s11 * c12 + s12 * c22
+        a20 = s02 * c00 + s12 * c01 + s22 * c02
+        a21 = s02 * c01 + s12 * c11 + s22 * c12
+        a22 = 1.0 + s02 * c02 + s12 * c12 + s22 * c22
+        determinant = a00 * (a11 * a22 - a12 * a21) - a01 * (a10 * a22 - a12 * a20) + a02 * (a10 * a21 - a11 * a20)
+        likelihood[i] = 1.0 / np.sqrt(max(determinant, 1.0))
 
 
 @kernel

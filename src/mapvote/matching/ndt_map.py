@@ -18,8 +18,8 @@ from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, PosePrior, Registration
 from mapvote.matching.matcher import CONVERGENCE
-from mapvote.matching.ndt import Room, align, likelihoods, room_for
-from mapvote.matching.ndt_voxels import LEVELS, SEVEN, Level, NdtGrid, Voxels, window_of
+from mapvote.matching.ndt import Room, align, expect, likelihoods, room_for
+from mapvote.matching.ndt_voxels import LEVELS, Level, NdtGrid, Voxels, window_of
 
 
 @record(votes=True)
@@ -138,7 +138,11 @@ class NdtMap:
 
     def expected(self, points_map: F64, noise_m: float) -> tuple[F64, Bool]:
         """See :class:`mapvote.matching.matcher.LocalMatcher`."""
-        return _self_likelihood(points_map, self.levels[-1], noise_m), _is_near_map(points_map, self.levels[0])
+        finest = self.levels[-1]
+        likelihood = np.empty(len(points_map))
+        near = np.empty(len(points_map), dtype=np.bool_)
+        expect(points_map, noise_m, finest.window, finest.voxels, self.levels[0].window, likelihood, near)
+        return likelihood[likelihood >= 0.0], near
 
 
 def build_ndt(points_map: NDArray[np.floating], centre: F64 | None = None) -> NdtMap:
@@ -239,48 +243,3 @@ def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
         place, sums, cells = grid.voxels
         pieces.append(Voxels(place[: grid.n].copy(), sums[: grid.n].copy(), cells[: grid.n].copy()))
     return pieces
-
-
-def _is_near_map(points: F64, grid: NdtGrid) -> Bool:
-    """(n,) whether the point's voxel, or one beside it, holds anything."""
-    rows = grid.window.rows
-    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
-    here = np.flatnonzero(((at >= 1) & (at < np.array(rows.shape) - 1)).all(axis=1))
-    out = np.zeros(len(points), dtype=np.bool_)
-    beside = at[here, None] + SEVEN
-    out[here] = (rows[beside[..., 0], beside[..., 1], beside[..., 2]] >= 0).any(axis=1)
-    return out
-
-
-def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
-    """Expected likelihood of each point (n, 3) drawn, with the sensor's noise, from its voxel's own distribution; (k,)
-    of those whose voxel has one.
-
-    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2.
-    """
-    rows = grid.window.rows
-    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
-    at = at[((at >= 0) & (at < rows.shape)).all(axis=1)]
-    k = rows[at[:, 0], at[:, 1], at[:, 2]]
-    k = k[k >= 0]
-    cells = grid.voxels.cells[k].astype(np.float64)
-    k, cells = (kept[cells[:, 3] + cells[:, 6] + cells[:, 8] != 0.0] for kept in (k, cells))
-    sums = grid.voxels.sums[k]
-    m, (a, b, c) = sums[:, 0], cells[:, :3].T
-    moments = sums[:, 4:10].T / m - np.stack([a * a, a * b, a * c, b * b, b * c, c * c])
-    moments[[0, 3, 5]] += noise_m * noise_m
-    S = _symmetric(moments)
-    C = _symmetric(cells[:, 3:9].T)
-    A = [[(r == s) + S[r][0] * C[0][s] + S[r][1] * C[1][s] + S[r][2] * C[2][s] for s in range(3)] for r in range(3)]
-    determinant = (
-        A[0][0] * (A[1][1] * A[2][2] - A[1][2] * A[2][1])
-        - A[0][1] * (A[1][0] * A[2][2] - A[1][2] * A[2][0])
-        + A[0][2] * (A[1][0] * A[2][1] - A[1][1] * A[2][0])
-    )
-    return np.asarray(1.0 / np.sqrt(np.maximum(determinant, 1.0)))
-
-
-def _symmetric(upper: F64) -> list[list[F64]]:
-    """(3, 3) of numbers (n,) from the upper triangle (6, n)."""
-    xx, xy, xz, yy, yz, zz = upper
-    return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]

@@ -77,6 +77,8 @@ class Fix:
     """The prior in the map's frame, where its own frame had to be learnt."""
     standing: Standing = field(default_factory=Standing)
     """Changes until a second after the scan at most."""
+    sample: Sample | None = field(default=None, compare=False)
+    """The points by which it was registered, if they are at hand."""
 
     @property
     def points(self) -> F32:
@@ -145,7 +147,7 @@ class Tracker:
             self._accept(result.T_map_lidar, scan.stamp_ns, moved, twist)
             rate = self.numbers.memory if self._usual_score else 1.0
             self._usual_score += rate * (result.score - self._usual_score)
-        return Fix(scan, result, twist, trusted)
+        return Fix(scan, result, twist, trusted, sample=sample)
 
     def _first_level(self, reach: float) -> int:
         """The coarsest level that a guess needs which may be off by ``reach`` metres."""

@@ -182,6 +182,8 @@ def height_above_lowest(points: F64, check: PoseCheck = POSE_CHECK) -> F64:
     z = points[here, 2]
     low = np.full((2 * half + 2, 2 * half + 2), np.inf)
     np.minimum.at(low, (rows, cols), z)
+    three = np.minimum(np.minimum(low[:-2], low[1:-1]), low[2:])
+    nine = np.minimum(np.minimum(three[:, :-2], three[:, 1:-1]), three[:, 2:])
     out = np.full(len(points), -np.inf)
-    out[here] = z - np.min([low[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
+    out[here] = z - nine[rows - 1, cols - 1]
     return out

@@ -15,7 +15,7 @@ from mapvote.core.geometry import inverse, log
 from mapvote.core.kernel import kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Scan, read_only
-from mapvote.core.voxels import slot_of, thin, voxel_key
+from mapvote.core.voxels import packed_key, slot_of, thin
 from mapvote.matching.ndt_voxels import LEVELS
 
 
@@ -152,34 +152,29 @@ def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
     ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
     """
     points = np.ascontiguousarray(points_lidar, dtype=np.float32)
-    return points.take(solid(points, size), axis=0).astype(np.float64)
+    return points.take(solid_of(points, thin(points, size)), axis=0).astype(np.float64)
 
 
-def solid_of(scan: Scan, twist: F64, size: float) -> F64:
-    """:func:`solid_sample` of a scan, de-skewed once it is thinned."""
-    chosen = solid(scan.points, size)
-    time_s = None if scan.time_s is None else scan.time_s.take(chosen)
-    return deskewed_rows(scan.points.take(chosen, axis=0), time_s, twist).T.astype(np.float64, order="C")
-
-
-def solid(points: F32, size: float, numbers: ScanPreparation = SCAN_PREPARATION) -> I64:
-    """(m,) which of the points (n, 3) are a :func:`solid_sample`, ascending."""
-    chosen = thin(points, size)
-    few = points.take(chosen, axis=0).astype(np.float64)
+def solid_of(points: F32, chosen: I64, numbers: ScanPreparation = SCAN_PREPARATION) -> I64:
+    """Those of the ``chosen`` (m,) of a scan's points (n, 3) that are no drops in the air."""
+    few = points.take(chosen, axis=0)
     every = -(-len(points) // numbers.rays) or 1
-    range2 = (few**2).sum(axis=1)
+    range2 = np.einsum("ij,ij->i", few, few)
+    near = np.flatnonzero(range2 <= numbers.reach_m**2)
     rays = -(-len(points) // every)
-    expected = rays / numbers.solid_angle_sr * numbers.voxel_m**2 / np.maximum(range2, numbers.voxel_m**2)
-    table = np.zeros((2, max(1024, 1 << (4 * len(few) - 1).bit_length())), dtype=np.int64)
-    hits = np.empty(len(few), dtype=np.int64)
+    expected = rays / numbers.solid_angle_sr * numbers.voxel_m**2 / np.maximum(range2[near], numbers.voxel_m**2)
+    table = np.zeros((2, max(1024, 1 << (4 * len(near) - 1).bit_length())), dtype=np.int64)
+    hits = np.empty(len(near), dtype=np.int64)
     far2 = (numbers.reach_m + 2.0 * numbers.voxel_m) ** 2
-    _hits_around(read_only(points), every, few, numbers.voxel_m, far2, table[0], table[1], hits)
-    return chosen[(range2 > numbers.reach_m**2) | (hits > numbers.share * expected)]
+    _hits_around(read_only(points), every, few.take(near, axis=0), numbers.voxel_m, far2, table[0], table[1], hits)
+    left = np.ones(len(chosen), dtype=np.bool_)
+    left[near] = hits > numbers.share * expected
+    return chosen[left]
 
 
 @kernel
 def _hits_around(
-    points: F32, every: int, few: F64, voxel_m: float, far2: float, keys: I64, counts: I64, at: I64
+    points: F32, every: int, few: F32, voxel_m: float, far2: float, keys: I64, counts: I64, at: I64
 ) -> None:
     """Enter into ``at`` (m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel, of side ``voxel_m``,
     of each of ``few``. Points whose squared distance exceeds ``far2`` are left out.
@@ -187,14 +182,21 @@ def _hits_around(
     The table (``keys``, ``counts``; zeros) holds these voxels alone, and at most a quarter of it: rays that end
     elsewhere leave it as it is.
     """
+    each = 1.0 / voxel_m
+    middle = float(1 << 20)  # added first: cutting off is then rounding down, and quicker than floor
     for i in range(len(few)):
-        key = voxel_key(few[i, 0], few[i, 1], few[i, 2], voxel_m)
+        ix = np.int64(few[i, 0] * each + middle)
+        iy = np.int64(few[i, 1] * each + middle)
+        key = packed_key(ix, iy, np.int64(few[i, 2] * each + middle))
         at[i] = slot_of(key, keys)
         keys[at[i]] = key
     for i in range(0, len(points), every):
-        if points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2 > far2:
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
+        if x * x + y * y + z * z > far2:
             continue
-        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], voxel_m)
+        key = packed_key(np.int64(x * each + middle), np.int64(y * each + middle), np.int64(z * each + middle))
         slot = slot_of(key, keys)
         counts[slot] += 1 if keys[slot] == key else 0
     for i in range(len(few)):
@@ -219,7 +221,14 @@ class Sample:
         """The clouds of the fewest points at every level: to try many guesses."""
         return [self._cloud(SIZES_M[-1], twist)] * len(LEVELS)
 
+    def solid(self, twist: F64) -> F64:
+        """(m, 3) the finest cloud without drops in the air."""
+        chosen = solid_of(self._scan.points, self._thinned.by(SIZES_M[0]))
+        return self._moved(chosen, twist).T.astype(np.float64, order="C")
+
     def _cloud(self, size_m: float, twist: F64) -> F32:
-        chosen = self._thinned.by(size_m)
+        return self._moved(self._thinned.by(size_m), twist)
+
+    def _moved(self, chosen: I64, twist: F64) -> F32:
         time_s = None if self._scan.time_s is None else self._scan.time_s.take(chosen)
         return deskewed_rows(self._scan.points.take(chosen, axis=0), time_s, twist)
