@@ -7,6 +7,7 @@ resampling.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -155,8 +156,9 @@ class Grid:
 def window_around(lattice: Lattice, x: float, y: float, side_m: float) -> Grid:
     """The square window of about ``side_m`` metres centred on the cell of (x, y) (paper III-A: 80 m)."""
     half = round(0.5 * side_m / CELL_SIZE)
-    rows, cols = lattice.cells_of(np.array([[x, y]]))
-    return Grid(lattice, int(rows[0]) - half, int(cols[0]) - half, 2 * half + 1, 2 * half + 1)
+    row = math.floor((float(y) - lattice.y0) / CELL_SIZE)
+    col = math.floor((float(x) - lattice.x0) / CELL_SIZE)
+    return Grid(lattice, row - half, col - half, 2 * half + 1, 2 * half + 1)
 
 
 CELLS = TILE_CELLS * TILE_CELLS

@@ -263,8 +263,10 @@ class Localiser:
 
     def _catch_leap(self, scan: Scan, prior: PosePrior) -> None:
         """A prior of its own frame that leaps away from a track that holds has begun anew: so does its frame."""
+        if not self.prior_frame.is_own or not self._confirmed or self.tracker.last_pose is None:
+            return
         age = 1e-9 * (scan.stamp_ns - self.tracker.last_stamp_ns)
-        if not self._confirmed or self.tracker.last_pose is None or age > self.tracker.numbers.twist_age_s:
+        if age > self.tracker.numbers.twist_age_s:
             return
         predicted = self.tracker.last_pose @ exp(age * self.tracker.twist)
         if self.prior_frame.leapt(prior, predicted):
