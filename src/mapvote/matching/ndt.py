@@ -394,17 +394,15 @@ def linearise(n: int, room: Room, H: F64, M: F64, g: F64) -> tuple[float, float]
 
 
 @kernel
-def likelihoods(points: F32, T: F64, window: Window, cells: F32, room: Room, out: F64) -> None:
-    """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4), all near the
-    first: what :func:`linearise` says, for a single look without pairs.
+def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64) -> None:
+    """Into ``out`` (m,) the mean likelihood, in [0, 1], of the n points at each of the poses T (m, 4, 4), all near the
+    one for which they were arranged: what :func:`linearise` says, for a single look without pairs.
 
     Without a branch: which voxels have points cannot be guessed, and a wrong guess costs as much as the rest.
     """
     side = np.float32(window.size)
     each = np.float32(1.0 / window.size)
-    n = points.shape[1]
     home = room.here
-    arrange(points, T[0], window, room)
     for pose in range(len(T)):
         total = np.float32(0.0)
         for block in range(-(-n // BLOCK)):
@@ -586,10 +584,10 @@ def _to_prior(T: F64, T_prior: F64, R: F64, step: F64) -> None:
 
 @kernel
 def align(
-    points: F32, T: F64, window: Window, cells: F32, most: int, tolerance_m: float, map_variance: F64, T_prior: F64,
+    n: int, T: F64, window: Window, cells: F32, most: int, tolerance_m: float, map_variance: F64, T_prior: F64,
     prior: F64, room: Room, covariance: F64,
 ) -> tuple[float, float, int, bool]:  # fmt: skip
-    """Move T (4, 4), in place, to where the points (3, n) of the lidar frame fit the level best.
+    """Move T (4, 4), in place, to where the n points fit the level best, which :func:`arrange` has laid out for it.
 
     Returns (mean likelihood, share of inliers, iterations, has it converged), and fills ``covariance`` (6, 6). A
     direction that nothing fixes gets a small curvature, hence a large variance and no step, instead of a singular
@@ -609,8 +607,6 @@ def align(
     to_prior = room.columns[2]
     size = window.size
     has_prior = prior[0, 0] > 0.0
-    n = points.shape[1]
-    arrange(points, T, window, room)
     for r in range(6):
         for c in range(6):
             covariance[r, c] = 1.0 if r == c else 0.0

@@ -18,7 +18,7 @@ from mapvote.core.record import record
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, PosePrior, Registration
 from mapvote.matching.matcher import CONVERGENCE
-from mapvote.matching.ndt import Room, align, expect, likelihoods, room_for
+from mapvote.matching.ndt import Room, align, arrange, expect, likelihoods, room_for
 from mapvote.matching.ndt_voxels import LEVELS, Level, NdtGrid, Voxels, window_of
 
 
@@ -118,8 +118,8 @@ class NdtMap:
                 believed = np.ascontiguousarray(prior.T_map_lidar), prior.information
             where = grid.window, grid.voxels.cells, grid.level.iterations, tolerance_m, self._map_variance
             cloud = clouds[i - len(self.levels)]
-            room = self._room_for(cloud)
-            score, inlier_share, more, converged = align(cloud, T, *where, *believed, room, covariance)
+            room = self._arranged(cloud, T, grid)
+            score, inlier_share, more, converged = align(cloud.shape[1], T, *where, *believed, room, covariance)
             iterations += more
         return Registration(T, covariance, score, inlier_share, iterations, converged)
 
@@ -127,13 +127,16 @@ class NdtMap:
         """See :class:`mapvote.matching.matcher.LocalMatcher`."""
         grid = self.levels[level]
         out = np.empty(len(T_map_lidar))
-        room = self._room_for(cloud)
-        likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.voxels.cells, room, out)
+        poses = np.ascontiguousarray(T_map_lidar)
+        room = self._arranged(cloud, poses[0], grid)
+        likelihoods(cloud.shape[1], poses, grid.window, grid.voxels.cells, room, out)
         return out
 
-    def _room_for(self, cloud: F32) -> Room:
+    def _arranged(self, cloud: F32, T_map_lidar: F64, grid: NdtGrid) -> Room:
+        """The room, with a cloud for poses near this one."""
         if cloud.shape[1] > len(self._room.home):
             self._room = room_for(cloud.shape[1] * 5 // 4)
+        arrange(cloud, T_map_lidar, grid.window, self._room)
         return self._room
 
     def expected(self, points_map: F64, noise_m: float) -> tuple[F64, Bool]:
