@@ -81,7 +81,7 @@ class Vehicle:
         self._frontend = Frontend(
             self._localise,
             MovingFilter(sensor, self.settings.moving),
-            LocalMap(point_map, self.settings.voting.window_m, measured=self._rule.needs_sight),
+            LocalMap(point_map, self.settings.voting.window_m, measured=self._rule.needs_heights),
             with_sight=self._rule.needs_sight,
             sensor=sensor,
         )

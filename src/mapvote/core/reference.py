@@ -142,6 +142,10 @@ class LocalMap:
         self._place = 0, 0
         """Row and column of the last call."""
 
+    def on(self, point_map: PointMap) -> LocalMap:
+        """The same on another map."""
+        return LocalMap(point_map, self.window_m, self.steps, measured=self.measured)
+
     def at(self, origin_map: F64) -> tuple[Reference, Reference]:
         """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
         lattice = self.point_map.lattice

@@ -29,6 +29,9 @@ class Rule:
     """Vehicles that a change needs unless the settings say otherwise; None: ``fuse.min_votes``."""
     needs_sight: bool = False
     """The voter asks for the hits of each scan, and how far it could see each cell (perception/raycast.py)."""
+    needs_heights: bool = True
+    """The voter reads how many obstacle points the map has in each cell and between which heights. False: these planes
+    of :class:`mapvote.core.types.Reference` say none, and a drive takes 15 MB less."""
     takes_points_beyond: bool = True
     """New points are also taken outside the local grid; the voter then requires more of a new voxel than one hit."""
     takes_clouds: bool = False
@@ -54,7 +57,7 @@ PAPER = Rule(
     version="2",
 )
 """Paper III and IV."""
-SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", takes_clouds=True, version="2")
+SURFACES = Rule(voter="mapvote.rules.surfaces:surface_voter", needs_heights=False, takes_clouds=True, version="2")
 """Height at the cost of a 2D grid: a word of 0.3 m voxels a cell (docs/method.md)."""
 RULES: dict[str, Rule] = {"paper": PAPER, "surfaces": SURFACES}
 """The rules of this package. :func:`rule_names` and :func:`rule_named` know those of other distributions too."""

@@ -51,8 +51,6 @@ class Tracking:
 
 
 TRACKING = Tracking()
-FINEST = len(LEVELS) - 1
-"""The last level."""
 
 
 @dataclass(slots=True)
@@ -135,12 +133,13 @@ class Tracker:
             result = self._search(around, sample.clouds(twist), centre, reach, prior)
             trusted = self.is_sound(result)
         # De-skewed anew while the motion to the new pose changes.
+        finest = len(LEVELS) - 1
         moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         for _ in range(self.numbers.rounds):
             if scan.time_s is None or moved is None or not _differ(twist, moved):
                 break
             twist = moved
-            result = around.refine(sample.clouds(twist, FINEST), result.T_map_lidar, prior, FINEST)
+            result = around.refine(sample.clouds(twist, finest), result.T_map_lidar, prior, finest)
             trusted = self.is_sound(result)
             moved = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         if trusted:
@@ -153,7 +152,7 @@ class Tracker:
         """The coarsest level that a guess needs which may be off by ``reach`` metres."""
         if self.last_pose is None or reach > 0.5 * self.numbers.step_m:
             return 0
-        return FINEST if reach <= LEVELS[-1].floor_m else 1
+        return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
 
     @property
     def has_motion(self) -> bool:

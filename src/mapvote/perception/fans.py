@@ -276,10 +276,6 @@ def _cross_cells(
     return np.int64(n)
 
 
-_GENTLE = np.float32(0.999 / (np.sqrt(2.0) * CELL_SIZE))
-"""Voxels of height per metre, 35 deg, up to which a ray passes two voxels of a column at most."""
-
-
 @inlined
 def _pass(
     slope: np.float32, stop: np.float32, height: np.float32, up: int, n: np.int64, crossed: Crossed, words: U32
@@ -291,7 +287,8 @@ def _pass(
     bottom = crossed.bottom
     one = np.uint64(1)  # unsigned: an index that cannot be negative vectorises
     lanes = np.uint64((n + _LANES - 1) // _LANES * _LANES)
-    if abs(slope) <= _GENTLE:
+    gentle = np.float32(0.999 / (np.sqrt(2.0) * CELL_SIZE))  # 35 deg: up to here a ray passes two voxels at most
+    if abs(slope) <= gentle:
         for j in range(np.uint64(0), lanes):
             lowest = np.int32(bottom[j] + up)
             enter = np.int32(np.int32(np.floor(height + slope * t[j])) - lowest)

@@ -265,9 +265,9 @@ class Frontend:
 
     def go_on_in(self, point_map: PointMap) -> None:
         """From here on the map is another version: scans that wait are compared with it, too."""
-        self._ground = LocalMap(point_map, self._ground.window_m)
+        self._ground = self._ground.on(point_map)
         if self._compared is not None:
-            self._compared = LocalMap(point_map, self._compared.window_m)
+            self._compared = self._compared.on(point_map)
         for i, scan in enumerate(self._waiting):
             reference, outer = self._ground.at(scan.origin_map)
             cell, obstacle = cells_and_obstacles(scan.rows, scan.origin_map, reference)

@@ -78,7 +78,6 @@ class SurfaceRule:
 SURFACE_RULE = SurfaceRule()
 
 NO_VOXELS = np.uint64(0)
-Origin = tuple[float, float, float]
 
 
 def count_scan(counts: VoxelCounts, seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> U64:
@@ -115,8 +114,8 @@ def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64,
 
 @kernel
 def _mark_near(
-    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: Origin, reach: float, shape: tuple[int, int],
-    mapped: tuple[I32, U64], marked: tuple[U64, U64, U64, U64], spans: I32, chosen: I32,
+    points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: tuple[float, float, float], reach: float,
+    shape: tuple[int, int], mapped: tuple[I32, U64], marked: tuple[U64, U64, U64, U64], spans: I32, chosen: I32,
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of planes of this
     ``shape``, all flat: ``mapped`` are base and occupied, ``marked`` passed, near, hit, apart. ``reach``: cells, below

@@ -61,10 +61,6 @@ class Camera:
         return pixels, depth
 
 
-MOST_PIXELS = 9
-"""Side of the largest square that a point is drawn as."""
-
-
 def shades(height: F64) -> F32:
     """(n, 3) grey-blue by height above ground (n,), metres: pale ground, darker walls."""
     share = np.clip((height[:, None] - 0.2) / 9.0, 0.0, 1.0)
@@ -79,10 +75,11 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
     """(height, width, 4) opaque image of points (n, 3) in their ``colours`` (n, 3), each a square of ``size_m``.
 
     Bytes with a fourth channel: matplotlib resamples them as float32, an image without one as float64."""
+    most = 9  # pixels of the side of a square
     # The nearest point of each pixel, in an image with a margin: the squares of the others lie behind its square.
     pixels, depth = camera.project(points)
-    rows, cols = camera.height + 2 * MOST_PIXELS, camera.width + 2 * MOST_PIXELS
-    x, y = np.floor(pixels.T).astype(np.int64) + MOST_PIXELS
+    rows, cols = camera.height + 2 * most, camera.width + 2 * most
+    x, y = np.floor(pixels.T).astype(np.int64) + most
     order = np.argsort(-depth, kind="stable")
     order = order[((depth > 1.0) & (x >= 0) & (x < cols) & (y >= 0) & (y < rows))[order]]
     nearest = np.full(rows * cols, -1)
@@ -90,9 +87,9 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
     nearest = nearest[nearest >= 0]
     depth = depth[nearest].astype(np.float32)
     # Sizes fall into few groups; far ones first, so that nearer points overwrite.
-    sizes = np.clip(np.ceil(size_m * camera.focal / depth), 2, MOST_PIXELS).astype(np.int64)
+    sizes = np.clip(np.ceil(size_m * camera.focal / depth), 2, most).astype(np.int64)
     corner = (y * cols + x)[nearest] - (sizes // 2) * (cols + 1)
-    drawn = np.full((rows + MOST_PIXELS) * cols, -1)
+    drawn = np.full((rows + most) * cols, -1)
     depths = np.full(len(drawn), np.inf, dtype=np.float32)
     for size in np.unique(sizes):
         chosen = np.flatnonzero(sizes == size)
@@ -102,7 +99,7 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8
             drawn[at[nearer]] = chosen[nearer]
             depths[at[nearer]] = depth[chosen][nearer]
     # Without the margin, in colour.
-    inside = np.s_[MOST_PIXELS : MOST_PIXELS + camera.height, MOST_PIXELS : MOST_PIXELS + camera.width]
+    inside = np.s_[most : most + camera.height, most : most + camera.width]
     drawn = drawn.reshape(-1, cols)[inside]
     image = np.where((drawn >= 0)[..., None], colours[nearest[drawn]], np.float32(1.0))
     image *= _eye_dome(depths.reshape(-1, cols)[inside])[..., None]
