@@ -123,7 +123,7 @@ def _place(block: int, T: F64, window: Window, room: Room, home: I32) -> None:
     each = np.float32(1.0 / size)
     from_lowest = room.from_lowest
     for r in range(3):  # how far beyond the window does not matter
-        between = np.int64(np.round(room.origin[r] / size)) - lowest[r]
+        between = np.int64(np.floor(room.origin[r] / size + 0.5)) - lowest[r]
         from_lowest[r] = min(max(between, -(1 << 20)), 1 << 20)
     nx = np.int32(rows.shape[0] - 2)
     ny = np.int32(rows.shape[1] - 2)
