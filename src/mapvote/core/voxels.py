@@ -86,9 +86,10 @@ def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
 
 
 @kernel
-def _first(keys: I64, table: I64, first: I64) -> np.int64:
-    """Half of :func:`_group`, in half of its time: how many different keys (n,) > 0 there are, and into ``first`` the
-    index of the first of each; -1 if they would fill more than half of ``table`` (2^k,), which holds zeros."""
+def enter_first(keys: I64, table: I64, first: I64) -> np.int64:
+    """Half of :func:`_group`, in half of its time: how many different keys (n,) > 0 there are that ``table`` (2^k,)
+    does not hold, and into ``first`` the index of the first of each. They are entered into it, 0 is a free slot; -1 if
+    they are more than half of it."""
     m = np.uint64(0)
     most = np.uint64(len(table) // 2)
     for i in range(np.uint64(0), np.uint64(len(keys))):
@@ -106,7 +107,7 @@ def first_of_each(keys: I64, slots: int = 1 << 14) -> I64:
     """(m,) the index of the first of each of the keys (n,) > 0, ascending; as :func:`grouped` has it."""
     while True:
         first = np.empty(slots // 2, dtype=np.int64)
-        m = _first(keys, np.zeros(slots, dtype=np.int64), first)
+        m = enter_first(keys, np.zeros(slots, dtype=np.int64), first)
         if m >= 0:
             return first[:m].copy()
         slots *= 4

@@ -24,7 +24,7 @@ from mapvote.core.rule import Rule
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, N_STATES, U8, U64, Bool
 from mapvote.core.voting import cast
-from mapvote.core.voxels import first_of_each, voxel_keys
+from mapvote.core.voxels import enter_first, first_of_each, voxel_keys
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.rules.packed_tiles import Shelf, Slot
 
@@ -85,7 +85,7 @@ class NewPointsRule:
     """Points of possible new objects."""
 
     sorted_together: int = 50_000
-    """Points sorted together: so many take a few milliseconds, so that no scan waits longer."""
+    """Points sorted by tile together: so many take a few milliseconds, so that no scan waits longer."""
     reach_m: float = 70.0
     """Range up to which new points are taken, metres, farther than votes are cast: the map is at hand for a tile's
     width around the vehicle."""
@@ -175,11 +175,14 @@ class NewPoints:
         self._numbers = numbers
         self._shelf = Shelf()
         self._runs = defaultdict[TileIndex, list[Slot]](list)
-        """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
-        self._last: F64 | None = None
-        """The last run, if it is still small."""
+        """The runs of each tile: points in the order in which they were offered, one point per voxel."""
         self._waiting: list[F64] = []
+        """The points since the last run, ..."""
         self._count = 0
+        """... how many there are, ..."""
+        self._seen = np.zeros(1 << (4 * numbers.sorted_together).bit_length(), np.int64)
+        """... and the table of their voxels' keys (core/voxels.py). It is half full at most: with twice
+        ``sorted_together``."""
 
     def gather(self, seen: Observation, may_be_new: U64) -> None:
         """Offer the points of one scan that lie in ``may_be_new`` (rows, cols) of its view, or outside the view."""
@@ -188,11 +191,8 @@ class NewPoints:
         base = np.ascontiguousarray(scan.reference.base).ravel()
         up = scan.rows[2]
         chosen = select(up, float(scan.origin_map[2]), scan.cell, scan.obstacle, seen.moving, words, base)
-        self._offer_of(scan, chosen)
         if self.beyond:
-            self._offer_of(scan, self._strange_beyond(scan))
-
-    def _offer_of(self, scan: PlacedScan, chosen: I64) -> None:
+            chosen = np.concatenate([chosen, self._strange_beyond(scan)])
         fields = {name: scan.fields[name][chosen] for name in self.names if name in scan.fields}
         self.offer(scan.points_at(chosen), fields)
 
@@ -214,34 +214,45 @@ class NewPoints:
 
     def offer(self, points_map: F64, fields: Fields | None = None) -> None:
         """Points (n, 3), map metres, and those of their attributes (n,) that a scan has."""
-        if len(points_map):
-            n = len(points_map)
-            scanned = fields or {}
-            rows = {name: point_field(name) for name in self.names}
-            sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
-            self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
-            self._count += len(points_map)
-            if self._count > self._numbers.sorted_together:
-                self._compact()
+        scanned = fields or {}
+        for first in self._unseen(voxel_keys(points_map, self.lattice.x0, self.lattice.y0)):
+            self._keep(points_map.take(first, axis=0), {name: values[first] for name, values in scanned.items()})
 
-    def _compact(self) -> None:
-        """Sort the points since the last run into a new run, together with the last run if that is still small."""
-        run = self._one_a_voxel([*self._short(), *self._waiting])
-        self._last = run if len(run) < self._numbers.sorted_together else None
-        if self._last is None:
-            for tile, points in self._of_tiles(run).items():
+    def _unseen(self, keys: I64) -> Iterator[I64]:
+        """The indices of the keys (n,) that have not come since the last run, part by part: each must be kept before
+        the next is asked for."""
+        most = self._numbers.sorted_together
+        for begin in range(0, len(keys), most):
+            part = keys[begin : begin + most]
+            first = np.empty(len(part), np.int64)
+            yield first[: enter_first(part, self._seen, first)] + begin
+
+    def _keep(self, points_map: F64, scanned: Fields) -> None:
+        """Points (n, 3) in voxels that have not come since the last run."""
+        n = len(points_map)
+        rows = {name: point_field(name) for name in self.names}
+        sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
+        self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
+        self._count += n
+        if self._count > self._numbers.sorted_together:
+            for tile, points in self._of_tiles(self._last()).items():
                 self._runs[tile].append(self._shelf.put(points.tobytes()))
-        self._waiting = []
-        self._count = 0
+            self._waiting = []
+            self._count = 0
+            self._seen.fill(0)
 
-    def _short(self) -> list[F64]:
-        return [] if self._last is None else [self._last]
+    def _last(self) -> F64:
+        """The points since the last run."""
+        return np.concatenate([self._none(), *self._waiting])
+
+    def _none(self) -> F64:
+        return np.zeros((0, 3 + len(self.names)))
 
     def _run(self, place: Slot) -> F64:
         return np.frombuffer(self._shelf.read(place)).reshape(-1, 3 + len(self.names))
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
-        every = np.concatenate([np.zeros((0, 3 + len(self.names))), *clouds])
+        every = np.concatenate([self._none(), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
         first = first_of_each(keys, 1 << len(keys).bit_length())  # half of the points have a voxel of their own
         return every.take(first[np.argsort(keys[first])], axis=0)
@@ -249,7 +260,7 @@ class NewPoints:
     def by_tile(self) -> Callable[[TileIndex], F64]:
         """Reader of the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 3 + k) with the k attributes of
         ``names`` as in ballots. The points of all tiles of a long drive are never held together."""
-        rest = self._of_tiles(self._one_a_voxel([*self._short(), *self._waiting]))
+        rest = self._of_tiles(self._last())
 
         def of_tile(tile: TileIndex) -> F64:
             last = [rest[tile]] if tile in rest else []
