@@ -14,7 +14,7 @@ from mapvote.core.groups import widened
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, U64, Reference, read_only
+from mapvote.core.types import F32, F64, U64, Reference, read_only
 
 Layout = Iterator[Reference | None]
 """The planes of a window on their way: each step takes a few milliseconds at most, the last one gives them."""
@@ -30,6 +30,8 @@ class LayoutSteps:
     cells: int = 2
     """Cells that the vehicle drives for each step after the first of a scan. A layout has 30 to 100 steps, more where
     more tiles lie around."""
+    points: int = 4096
+    """Points of a tile that are entered at once: what is worked out of them stays in the processor's cache."""
 
 
 LAYOUT_STEPS = LayoutSteps()
@@ -86,20 +88,31 @@ def _laid_out(point_map: PointMap, grid: Grid, band_rows: int, measured: bool = 
 
 def _enter_obstacles(tile: Tile, planes: Reference, measured: bool) -> None:
     """Enter the points of a tile that are obstacles; ``measured``: how many they are and how high, too."""
+    ahead = LAYOUT_STEPS.points
+    for first in range(0, len(tile.points), ahead):
+        _enter_points(tile.points[first : first + ahead], tile.window, planes, measured)
+
+
+def _enter_points(points: F32, window: Grid, planes: Reference, measured: bool) -> None:
+    """Enter points (n, 3) of a tile's ``window`` that are obstacles."""
     grid = planes.grid
-    cells = flat_cells(tile.window, tile.points)
-    rows = cells // TILE_CELLS + (tile.window.row0 - grid.row0)
-    cols = cells % TILE_CELLS + (tile.window.col0 - grid.col0)
+    cells = flat_cells(window, points)
+    rows = cells >> (TILE_CELLS.bit_length() - 1)  # numpy takes longer to divide
+    cols = cells & (TILE_CELLS - 1)
+    rows += window.row0 - grid.row0
+    cols += window.col0 - grid.col0
     if measured:
         measures = planes.counts, planes.bottom_z, planes.top_z
-        z = tile.points[:, 2].astype(np.float64)
+        z = points[:, 2].astype(np.float64)
         fill_columns(rows, cols, z, planes.ground_z, planes.base, planes.occupied, *measures)
         return
-    inside = np.flatnonzero((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols))
-    points = read_only(tile.points.take(inside, axis=0))
-    at = read_only(rows.take(inside) * grid.cols + cols.take(inside))
+    if window.intersection(grid) != window:
+        inside = np.flatnonzero((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols))
+        points, rows, cols = points.take(inside, axis=0), rows.take(inside), cols.take(inside)
+    rows *= grid.cols
+    rows += cols
     ground_z, base = (read_only(plane.reshape(-1)) for plane in (planes.ground_z, planes.base))
-    mark_obstacles(planes.occupied.reshape(-1), points, at, ground_z, base)
+    mark_obstacles(planes.occupied.reshape(-1), read_only(points), read_only(rows), ground_z, base)
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
