@@ -153,30 +153,28 @@ def _enter_cells(
 def base_layers(ground_z: F32) -> I32:
     """(rows, cols) lattice layer of bit 0: floor(ground_z / 0.3), unknown cells filled from the nearest known one."""
     base = np.zeros(ground_z.shape, dtype=np.int32)
-    for _ in fill_base(ground_z, base, len(base)):
+    for _ in fill_base(ground_z, base, len(base), np.empty(ground_z.shape)):
         pass
     return base
 
 
-def fill_base(ground_z: F32, base: I32, band_rows: int) -> Iterator[None]:
-    """Enter :func:`base_layers` into ``base`` (rows, cols), which come as zeros, in steps of ``band_rows`` rows."""
+def fill_base(ground_z: F32, base: I32, band_rows: int, low: F64) -> Iterator[None]:
+    """Enter :func:`base_layers` into ``base`` (rows, cols), which come as zeros, in steps of ``band_rows`` rows.
+    ``low`` (rows, cols): scratch."""
     if not np.isfinite(ground_z).any():
         return
     rows = len(ground_z)
-    low = np.empty(ground_z.shape, dtype=np.float64)
     slope = 0.02 * CELL_SIZE
     bands = [(first, min(first + band_rows, rows)) for first in range(0, rows, band_rows)]
     for first, end in bands:
         np.fmin(ground_z[first:end], np.inf, out=low[first:end])
         lower_rows(low, first, end, 1, slope, slope * np.sqrt(2.0))
         yield
-    layer = np.empty((band_rows, ground_z.shape[1]))
     for first, end in reversed(bands):
         lower_rows(low, end - 1, first - 1, -1, slope, slope * np.sqrt(2.0))
         own = ground_z[first:end]
-        layers = layer[: end - first]
-        np.divide(low[first:end], CELL_SIZE, out=layers)
-        np.divide(own, CELL_SIZE, out=layers, where=np.isfinite(own), dtype=np.float64)
+        layers = np.where(np.isfinite(own), own, low[first:end])
+        layers /= CELL_SIZE
         base[first:end] = np.floor(layers, out=layers)
         yield
 
@@ -203,9 +201,9 @@ def lower_rows(z: F64, first: int, end: int, step: int, straight: float, diagona
             for c in range(cols - 1):
                 row[c] = min(row[c], beside[c + 1] + diagonal)
                 row[c + 1] = min(row[c + 1], beside[c] + diagonal)
-        if step > 0:
-            for c in range(1, cols):
-                z[r, c] = min(z[r, c], z[r, c - 1] + straight)
-        else:
-            for c in range(cols - 2, -1, -1):
-                z[r, c] = min(z[r, c], z[r, c + 1] + straight)
+        row = z[r]
+        lowest = np.inf
+        for k in range(cols):
+            at = np.uint64(k if step > 0 else cols - 1 - k)
+            lowest = min(row[at], lowest + straight)
+            row[at] = lowest

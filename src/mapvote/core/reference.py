@@ -64,15 +64,17 @@ def _laid_out(point_map: PointMap, grid: Grid, band_rows: int, measured: bool = 
     # The start of each column: by the tile alone where it has ground, so that every editor of the tile reads the words
     # as they were written.
     base = np.zeros(grid.shape, dtype=np.int32)
-    for _ in fill_base(ground_z, base, band_rows):
+    occupied = np.zeros(grid.shape, dtype=np.uint64)
+    scratch = occupied.view(np.float64)  # pages of another plane would take longer than to clear this one
+    for _ in fill_base(ground_z, base, band_rows, scratch):
         yield None
     for tile in tiles:
         if tile.has_ground:
             common = tile.window.intersection(grid)
             base[common.slices_in(grid)] = tile.base[common.slices_in(tile.window)]
             yield None
-    # The obstacles in each column. Each plane is a step of its own: the system gives its pages in milliseconds.
-    occupied = np.zeros(grid.shape, dtype=np.uint64)
+    # The obstacles in each column.
+    occupied.fill(0)
     yield None
     free_words = free if any(t.free is not None for t in tiles) else None
     none = np.broadcast_to(np.int32(0), grid.shape)  # planes of one value take no memory
