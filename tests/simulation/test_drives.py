@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import inverse, log, transform
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats import open_drive
+from mapvote.formats.drives.trajectory import read_poses
 from mapvote_lab.simulation import simulate
 
 FEW = {"length_m": 30.0, "speed_kmh": 90.0, "vehicles": 2, "changes": [], "sensor": "vlp16"}
@@ -90,6 +92,20 @@ def test_truth_names_what_was_built_and_demolished(corner: Path) -> None:
         assert truth[name].shape == (200, 120)
         assert set(np.unique(truth[name])) == {0, 1, 2, 255}
     assert (float(truth["x0"]), float(truth["y0"]), float(truth["cell_size"])) == (0.0, 0.0, 0.3)
+
+
+@pytest.mark.slow
+def test_a_survey_and_a_vehicle_are_whole_before_the_others(tmp_path: Path) -> None:
+    """The demo draws its first picture of them."""
+    told: list[tuple[str, str, list[str]]] = []
+
+    def begun(folder: Path, survey: str, vehicle: str) -> None:
+        for name in (survey, vehicle):
+            assert 0 < len(open_drive(folder / name)) == len(read_poses(folder / "truth" / name / "poses.txt"))
+        told.append((survey, vehicle, sorted(path.parent.name for path in folder.glob("*/drive.toml"))))
+
+    simulate("corner", tmp_path / "out", seed=5, overrides=FEW, workers=1, begun=begun)
+    assert told == [("survey_1", "v1", ["survey_1", "v1"])]
 
 
 @pytest.mark.slow
