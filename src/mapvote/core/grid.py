@@ -37,6 +37,10 @@ class Lattice:
         row = np.floor((xy[:, 1].astype(np.float64) - self.y0) / CELL_SIZE).astype(np.int64)
         return row, col
 
+    def cell_of(self, x: float, y: float) -> tuple[int, int]:
+        """(row, col) of one place, map metres: :meth:`cells_of` without arrays."""
+        return math.floor((float(y) - self.y0) / CELL_SIZE), math.floor((float(x) - self.x0) / CELL_SIZE)
+
     def tile(self, index: TileIndex) -> Grid:
         """The window of one tile."""
         return Grid(self, index[0] * TILE_CELLS, index[1] * TILE_CELLS, TILE_CELLS, TILE_CELLS)
@@ -156,8 +160,7 @@ class Grid:
 def window_around(lattice: Lattice, x: float, y: float, side_m: float) -> Grid:
     """The square window of about ``side_m`` metres centred on the cell of (x, y) (paper III-A: 80 m)."""
     half = round(0.5 * side_m / CELL_SIZE)
-    row = math.floor((float(y) - lattice.y0) / CELL_SIZE)
-    col = math.floor((float(x) - lattice.x0) / CELL_SIZE)
+    row, col = lattice.cell_of(x, y)
     return Grid(lattice, row - half, col - half, 2 * half + 1, 2 * half + 1)
 
 

@@ -196,8 +196,7 @@ class MapWindow:
             return
         ahead = [tile for tile in tiles if tile in self.point_map.tiles and not self._is_ready(tile)]
         if ahead:
-            rows, cols = self.point_map.lattice.cells_of(position[None, :2])
-            here = np.array([rows[0], cols[0]]) / TILE_CELLS - 0.5
+            here = np.array(self.point_map.lattice.cell_of(x, y)) / TILE_CELLS - 0.5
             self._step(min(ahead, key=lambda tile: float(np.hypot(*(tile - here)))))
         else:
             self._all_ready = tiles

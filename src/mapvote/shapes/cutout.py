@@ -49,8 +49,8 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
 
     At most 76.8 m of it, and 60,000 points evenly.
     """
-    rows, cols = lattice.cells_of(np.array([[box[0] - CUTOUT_SIZES.around_m, box[1] - CUTOUT_SIZES.around_m]]))
-    window = Grid(lattice, int(rows[0]), int(cols[0]), TILE_CELLS, TILE_CELLS)
+    corner = lattice.cell_of(box[0] - CUTOUT_SIZES.around_m, box[1] - CUTOUT_SIZES.around_m)
+    window = Grid(lattice, *corner, TILE_CELLS, TILE_CELLS)
     far = np.array([box[2] + CUTOUT_SIZES.around_m, box[3] + CUTOUT_SIZES.around_m]) - [window.x0, window.y0]
     ground = np.full(window.shape, np.nan, dtype=np.float32)
     points_of: dict[str, list[F32]] = {"kept": [], "removed": [], "added": []}

@@ -283,9 +283,9 @@ def _by_distance(court: Court, shown: list[CloudChange], rule: CourtRule) -> Cou
     reference = all_points(court.reference)
     x = before[:, 0]
     y = before[:, 1]
-    rows, cols = court.reference.lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]]))
+    corner = court.reference.lattice.cell_of(x.min() - 60, y.min() - 60)
     size = int((np.ptp(y) + 120) / CELL_SIZE), int((np.ptp(x) + 120) / CELL_SIZE)
-    grid = Grid(court.reference.lattice, int(rows[0]), int(cols[0]), *size)
+    grid = Grid(court.reference.lattice, *corner, *size)
     gone, new = np.zeros((2, *grid.shape), dtype=np.int64)
     offered = []
 

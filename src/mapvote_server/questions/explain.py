@@ -188,9 +188,7 @@ def explain_cell(
     exact times, else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
     if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M):
         raise MapvoteError(f"({x}, {y}): give map metres, within {FARTHEST_M / 1e3:,.0f} km of the map's origin")
-    rows, cols = store.lattice.cells_of(np.array([[x, y]]))
-    row = int(rows[0])
-    col = int(cols[0])
+    row, col = store.lattice.cell_of(x, y)
     index = (row // TILE_CELLS, col // TILE_CELLS)
     cell = (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
