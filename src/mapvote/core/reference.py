@@ -13,7 +13,6 @@ from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.groups import widened
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
-from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, U64, Reference, read_only
 
 Layout = Iterator[Reference | None]
@@ -39,14 +38,14 @@ LAYOUT_STEPS = LayoutSteps()
 
 def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
-    return _finished(_laid_out(point_map, grid, grid.rows))
+    return _finished(_laid_out(point_map, grid, replace(LAYOUT_STEPS, band_rows=grid.rows)))
 
 
 def _finished(layout: Layout) -> Reference:
     return next(filter(None, layout))
 
 
-def _laid_out(point_map: PointMap, grid: Grid, band_rows: int, measured: bool = True) -> Layout:
+def _laid_out(point_map: PointMap, grid: Grid, steps: LayoutSteps, measured: bool = True) -> Layout:
     # Ground and free space, tile by tile: reading a tile may unpack it.
     ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
     free = np.zeros(grid.shape, dtype=np.uint64)
@@ -66,7 +65,7 @@ def _laid_out(point_map: PointMap, grid: Grid, band_rows: int, measured: bool = 
     base = np.zeros(grid.shape, dtype=np.int32)
     occupied = np.zeros(grid.shape, dtype=np.uint64)
     scratch = occupied.view(np.float64)  # pages of another plane would take longer than to clear this one
-    for _ in fill_base(ground_z, base, band_rows, scratch):
+    for _ in fill_base(ground_z, base, steps.band_rows, scratch):
         yield None
     for tile in tiles:
         if tile.has_ground:
@@ -84,19 +83,13 @@ def _laid_out(point_map: PointMap, grid: Grid, band_rows: int, measured: bool = 
         planes = replace(planes, counts=none.copy(), bottom_z=low.copy(), top_z=high.copy())
     for tile in tiles:
         yield None
-        _enter_obstacles(tile, planes, measured)
+        for first in range(0, len(tile.points), steps.points):
+            _enter_points(tile.points[first : first + steps.points], tile.window, planes, measured)
     yield planes
 
 
-def _enter_obstacles(tile: Tile, planes: Reference, measured: bool) -> None:
-    """Enter the points of a tile that are obstacles; ``measured``: how many they are and how high, too."""
-    ahead = LAYOUT_STEPS.points
-    for first in range(0, len(tile.points), ahead):
-        _enter_points(tile.points[first : first + ahead], tile.window, planes, measured)
-
-
 def _enter_points(points: F32, window: Grid, planes: Reference, measured: bool) -> None:
-    """Enter points (n, 3) of a tile's ``window`` that are obstacles."""
+    """Enter points (n, 3) of a tile's ``window`` that are obstacles; ``measured``: how many and how high, too."""
     grid = planes.grid
     cells = flat_cells(window, points)
     rows = cells >> (TILE_CELLS.bit_length() - 1)  # numpy takes longer to divide
@@ -184,7 +177,7 @@ class LocalMap:
         if self._next is not None and self._next[0] == middle:
             return self._next[1]
         around = self.point_map.lattice.tile(middle).padded(max(TILE_CELLS, window.rows))
-        return _laid_out(self.point_map, around, self.steps.band_rows, self.measured)
+        return _laid_out(self.point_map, around, self.steps, self.measured)
 
 
 def _cut(outer: Reference, window: Grid) -> Reference:
