@@ -118,8 +118,8 @@ def leave_mark() -> None:
 
 
 def compile_for_maps() -> None:
-    """Compile what a map that is built by SLAM and a vehicle that localises in it need. What falls comes first: beside
-    :func:`compile_for_votes` in another process the voters, which both need, are in the cache after that."""
+    """Compile what a map that is built by SLAM and a vehicle that localises in it need. Falling bodies come first:
+    beside :func:`compile_for_votes` in another process the voters, which both need, are in the cache after that."""
     with seldom_collecting():
         _let_fall()
         point_map = build_map([_drive(_street(demolished=False), turning=True)], Settings())[0]

@@ -272,7 +272,7 @@ def _likelihood(e: np.float32) -> np.float32:
 
 @fast_math
 def _pull_together(of: F32, placed: F32, partners: int, pull: F32) -> None:
-    """What all partners of a block say, into ``pull`` (10, BLOCK) flat: the smallest e, and the sums of w C and of
+    """Sum over all partners of a block into ``pull`` (10, BLOCK) flat: the smallest e, and the sums of w C and of
     w C u, with u the point from the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq.
     (6.9) with d1 = d2 = 1. ``of`` (7, 9, BLOCK) and ``placed`` (3, BLOCK), flat: of the block."""
     n = np.uint64(BLOCK)

@@ -282,7 +282,7 @@ def _pass(
 ) -> None:
     """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
     and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above the
-    columns. What lies behind ``stop`` is masked."""
+    columns. Cells behind ``stop`` are masked."""
     t = crossed.entered
     bottom = crossed.bottom
     one = np.uint64(1)  # unsigned: an index that cannot be negative vectorises

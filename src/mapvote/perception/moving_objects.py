@@ -149,7 +149,7 @@ class Sought(NamedTuple):
     below: U16
     above: U16
     observed: I32
-    """What scans saw at the sample, and whether it waits (1) or is settled (0)."""
+    """Counts of what scans saw at the sample, and whether it waits (1) or is settled (0)."""
     waits: I32
 
 
@@ -235,7 +235,7 @@ def look(
     """Ask some scans, one after the other, about the first ``n`` samples: by the range ``images`` (m, size), flat, in
     the ``slots`` (k,). A call for each would take a tenth longer.
 
-    What they saw goes into ``seen`` (m,), by ``samples.of``: see HIT. Returns how many samples still wait.
+    Their observations go into ``seen`` (m,), by ``samples.of``: see HIT. Returns how many samples still wait.
 
     ``sensors`` (k, 3) where the scans were taken, from the samples' common point. ``rule``: (metres behind a place that
     a ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
