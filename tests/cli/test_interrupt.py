@@ -245,6 +245,22 @@ def test_an_autoware_service_ends_on_ctrl_c_with_how_much_it_answered(tmp_path: 
 def test_a_server_started_as_the_help_says_ends_on_ctrl_c(desk: Desk) -> None:
     here = desk("my_map")
     code, said = end_by_ctrl_c(["serve", "fleet.db", "--map", "my_map", "--port", "0"], here, "serving ")
-    assert code == 130
+    assert code == 130, said
     assert "Traceback" not in said
     assert (here / "fleet.db").exists()
+
+
+@pytest.mark.parametrize("first", [1, 2, 3])
+def test_ctrl_c_while_a_server_takes_the_signals_over_is_no_traceback(first: int, desk: Desk) -> None:
+    """asyncio and uvicorn both install handlers, one after the other."""
+    here = desk("my_map")
+    patch = (
+        "import os, signal, mapvote.cli\nreal, calls = signal.signal, []\n"
+        "def install(*handler):\n"
+        f"    calls.append(handler)\n    os.kill(os.getpid(), signal.SIGINT) if len(calls) == {first} else None\n"
+        "    return real(*handler)\n"
+        "signal.signal = install"
+    )
+    command = slowed(["serve", "fleet.db", "--map", "my_map", "--port", "0"], patch)
+    done = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=120, check=False)
+    assert stopped_by_a_line(done)

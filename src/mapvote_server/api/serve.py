@@ -112,8 +112,6 @@ def serve(
         listener.close()
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
     settle()
-    shown = f"[{host}]" if ":" in host else host
-    ready(f"http://{shown}:{listener.getsockname()[1]}")
     most = settings.server
     patience = Patience(most.header_timeout_s, most.body_timeout_s, most.answer_timeout_s, _room_for(most.connections))
     config = uvicorn.Config(
@@ -129,8 +127,12 @@ def serve(
         headers=list(HEADERS),
     )
     sys.setswitchinterval(SERVER_TIMES.switch_s)
-    with listener:
-        _Server(config, app.state.services.stop_fusing).run(sockets=[listener])
+    server = _Server(config, app.state.services.stop_fusing)
+    shown = f"[{host}]" if ":" in host else host
+    # asyncio and uvicorn install handlers one after the other: a Ctrl-C between them would end in a traceback.
+    with listener, server.capture_signals():
+        ready(f"http://{shown}:{listener.getsockname()[1]}")
+        server.run(sockets=[listener])
 
 
 def settle() -> None:
