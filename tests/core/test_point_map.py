@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import mapvote
 from hand_made import make_map, make_tile, two_walls
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.point_map import all_points, cut_tiles, map_from_points
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.point_map import MAP_SIZES, LazyTiles, all_points, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, Drive, MapvoteError, PosePrior, Scan
@@ -149,3 +149,20 @@ def test_nothing_of_a_tile_can_be_written_to_and_what_it_was_made_of_still_can()
             with pytest.raises(ValueError, match="read-only"):
                 plane[:] = 1.0
     points[:] = 1.0
+
+
+def test_tiles_of_hardly_any_points_are_not_all_held() -> None:
+    """Their planes take 1 MB each: a map that is long and thin would fill the memory of a vehicle."""
+    lattice = Lattice(0.0, 0.0)
+    made: list[TileIndex] = []
+
+    def load(index: TileIndex) -> Tile:
+        made.append(index)
+        return Tile.empty(lattice.tile(index))
+
+    long = [(0, col) for col in range(9)]
+    tiles = LazyTiles(load, dict.fromkeys(long, 0), kept_points=3 * MAP_SIZES.tile_points)
+    for index in (*long, *long[-3:]):
+        assert tiles[index].index == index
+    assert made == long
+    assert tiles[0, 0].index == made[-1] == (0, 0)

@@ -36,9 +36,18 @@ class MapSizes:
     kept_points: int = 10_000_000
     """Points of the largest map that is held in memory whole. A larger map holds its tiles last used, up to so many
     points together."""
+    tile_points: int = 50_000
+    """Points that a tile counts for beside its own: its planes take 1 MB, a point 20 bytes."""
 
 
 MAP_SIZES = MapSizes()
+
+
+def held_points(points: Iterable[int], sizes: MapSizes = MAP_SIZES) -> int:
+    """What tiles with so many ``points`` each take of ``kept_points``, empty ones too."""
+    return sum(n + sizes.tile_points for n in points)
+
+
 SOURCES = "sources"
 """The field of a merged map's points: bit k of each is set where the k-th map has a point in its voxel."""
 SCANS = "scans"
@@ -73,8 +82,7 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         """Let go of all other tiles, and of what they have worked out: they are made again when they are asked for."""
         with self._lock:
             for index in self._kept.keys() - set(indices):
-                del self._kept[index]
-                self._held -= self._points[index]
+                self._let_go(index)
 
     @property
     def points_of(self) -> dict[TileIndex, int]:
@@ -98,12 +106,16 @@ class LazyTiles(Mapping[TileIndex, Tile]):
             if tile is None:
                 tile = self._alive[index] = self._load(index)
             if index not in self._kept:
-                self._held += self._points[index]
+                self._held += held_points([self._points[index]])
                 self._kept[index] = tile
             self._kept.move_to_end(index)
             while self._held > self.kept_points and len(self._kept) > 1:
-                self._held -= self._points[self._kept.popitem(last=False)[0]]
+                self._let_go(next(iter(self._kept)))
         return tile
+
+    def _let_go(self, index: TileIndex) -> None:
+        del self._kept[index]
+        self._held -= held_points([self._points[index]])
 
     def __contains__(self, index: object) -> bool:
         return index in self._points
@@ -125,7 +137,7 @@ def made_in_turn(
     for index in indices:
         tile = load(index)
         points[index] = len(tile.points)
-        total += len(tile.points)
+        total += held_points([len(tile.points)])
         if total <= kept_points:
             made[index] = tile
         else:

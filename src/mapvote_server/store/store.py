@@ -24,7 +24,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import DIGESTS, Manifest, TileHashes, digests_of, shown
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Lattice, TileIndex
-from mapvote.core.point_map import MAP_SIZES, LazyTiles, PointMap
+from mapvote.core.point_map import MAP_SIZES, LazyTiles, PointMap, held_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote_server.errors import Unavailable
@@ -260,7 +260,7 @@ class Store:
             hashes = tiles_of(connection, number)
             points = points_of(connection, hashes)
             tiles: Mapping[TileIndex, Tile]
-            if sum(points.values()) <= kept_points:
+            if held_points(points.values()) <= kept_points:
                 tiles = {index: load_tile(connection, self.lattice.tile(index), h) for index, h in hashes.items()}
             else:
                 tiles = LazyTiles(lambda index: self._load(index, hashes[index]), points, kept_points)

@@ -18,7 +18,7 @@ from mapvote.codec.manifest import Manifest, TileHashes, digests_of, shown
 from mapvote.codec.planes import FRAME_HEAD, pack_plane, unpack_bytes
 from mapvote.codec.tile_planes import check_plane, pack_tile, points_in_plane, unpack_tile
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.point_map import LazyTiles, PointMap
+from mapvote.core.point_map import LazyTiles, PointMap, held_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
@@ -127,7 +127,7 @@ def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
         with _whole(path, index):
             n_points[index] = points_in_plane(first_bytes(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
     # A small map is read at once. Of a large one only the planes' frames are checked.
-    small = sum(n_points.values()) <= sizes.kept_points
+    small = held_points(n_points.values()) <= sizes.kept_points
     tiles: Mapping[TileIndex, Tile] = LazyTiles(load, n_points, sizes.kept_points)
     if small:
         tiles = {index: load(index) for index in named}

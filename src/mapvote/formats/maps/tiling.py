@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
-from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, lattice_of
+from mapvote.core.point_map import LazyTiles, PointMap, check_extent, cut_tiles, held_points, lattice_of
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, MapvoteError
 from mapvote.formats.drives.point_fields import POINT_RULE
@@ -159,7 +159,7 @@ def map_of(
     taken.spill.close()
     ground = lay_ground(parts.heights(), parts.heights(of_ground=True), parts.points)
     tiles: Mapping[TileIndex, Tile] = LazyTiles(lambda i: parts.tile(i, ground[i]), parts.points, sizes.kept_points)
-    if sum(parts.points.values()) <= sizes.kept_points:
+    if held_points(parts.points.values()) <= sizes.kept_points:
         tiles = {index: parts.tile(index, ground[index]) for index in parts.points}
     return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.georeference())
 
