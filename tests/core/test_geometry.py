@@ -5,6 +5,7 @@ from itertools import product
 import numba
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,19 @@ def test_interpolation_meets_both_ends_and_moves_at_constant_twist(a: np.ndarray
     np.testing.assert_allclose(geometry.interpolate(T_0, T_1, 1.0), T_1, atol=1e-6)
     half = geometry.interpolate(T_0, T_1, 0.5)
     np.testing.assert_allclose(geometry.interpolate(T_0, half, 2.0), T_1, atol=1e-6)
+
+
+numbers = st.floats(-2.0, 2.0)
+
+
+@given(st.lists(st.tuples(numbers, numbers, numbers, numbers).filter(lambda q: np.linalg.norm(q) > 0.01), max_size=4))
+def test_quaternions_of_any_length_are_the_rotations_that_scipy_gives(rows: list[tuple[float, ...]]) -> None:
+    quaternions = np.array(rows).reshape(-1, 4)
+    R = geometry.rotations_of(quaternions)
+    assert R.shape == (len(rows), 3, 3)
+    if rows:
+        expected = scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix()
+        np.testing.assert_allclose(R, expected, atol=1e-14)
 
 
 def test_half_a_turn_has_a_logarithm() -> None:

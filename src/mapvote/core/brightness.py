@@ -86,12 +86,15 @@ class Brightness:
     def _note(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """Count a piece (n,) of reals, but for their bins; returns the finite ones."""
         self.real = True
-        is_finite = np.isfinite(values)
-        finite = values if is_finite.all() else values[is_finite]
+        finite = values
+        lowest, highest = float(values.min(initial=0.0)), float(values.max(initial=0.0))
+        if not np.isfinite([lowest, highest]).all():
+            finite = values[np.isfinite(values)]
+            lowest, highest = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
         self.n += len(finite)
         self.undefined += len(values) - len(finite)
-        self.negative += int(np.count_nonzero(finite < 0))
-        self.highest = max(self.highest, float(finite.max(initial=0.0)))
+        self.negative += int(np.count_nonzero(finite < 0)) if lowest < 0.0 else 0
+        self.highest = max(self.highest, highest)
         self.whole = self.whole and bool((finite == np.floor(finite)).all())
         return finite
 
@@ -142,9 +145,9 @@ def shares(values: NDArray[Any], full: float | None = None) -> NDArray[np.floati
     negative is 0. ``full``: the value that means 1.0, where it is known."""
     scale = max(full_scale(values) if full is None else full, 1e-9)
     out = values / np.asarray(scale, np.float32 if values.dtype == np.float32 else np.float64)
-    is_finite = np.isfinite(out)
-    if not is_finite.all():
-        out[~is_finite] = 0.0
+    if out.min(initial=0.0) >= 0.0 and out.max(initial=0.0) <= 1.0:  # nearly always; False where one is NaN
+        return out
+    out[~np.isfinite(out)] = 0.0
     return np.clip(out, 0.0, 1.0, out=out)
 
 

@@ -16,7 +16,6 @@ from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
@@ -237,8 +236,7 @@ def _nuscenes_poses(file: Path, tokens: list[str]) -> F64:
     norms = np.linalg.norm(quaternions, axis=1)
     if not (np.isfinite(translations).all() and np.isfinite(norms).all() and (norms > 1e-6).all()):
         raise MapvoteError(f"{file}: holds a pose that is no rigid motion; unpack the metadata again")
-    rotations = scipy.spatial.transform.Rotation.from_quat(quaternions, scalar_first=True)
-    return geometry.poses_at(translations, rotations.as_matrix())
+    return geometry.poses_at(translations, geometry.rotations_of(quaternions[:, [1, 2, 3, 0]]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy
 
-from mapvote.core.geometry import from_xyz_rpy, wrapped
+from mapvote.core.geometry import from_xyz_rpy, rotations_of, wrapped
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, MapvoteError, PosePrior
 from mapvote.formats.geo.frame import MapFrame
@@ -271,7 +270,7 @@ def heading_of_imu(orientation: Sequence[float], covariance: Sequence[float], T_
     length = float(np.linalg.norm(q))
     if covariance[0] == -1.0 or not 0.5 < length < 2.0:
         return float("nan"), float("inf")
-    R_enu_base = scipy.spatial.transform.Rotation.from_quat(q).as_matrix() @ T_base_imu[:3, :3].T
+    R_enu_base = rotations_of([q])[0] @ T_base_imu[:3, :3].T
     variance = float(covariance[8])
     sigma_rad = float(np.sqrt(variance)) if np.isfinite(variance) and variance > 0.0 else float("inf")
     return float(np.arctan2(R_enu_base[1, 0], R_enu_base[0, 0])), sigma_rad

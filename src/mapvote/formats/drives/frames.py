@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 
-from mapvote.core.geometry import inverse, poses_at
+from mapvote.core.geometry import inverse, poses_at, rotations_of
 from mapvote.core.types import F64, MapvoteError
 
 Edges = dict[str, list[tuple[str, F64]]]
@@ -46,8 +45,7 @@ def pose_of_message(position: Any, orientation: Any) -> F64:
     """T (4, 4) of a message's position, metres, and quaternion, which must not be zero."""
     p = position
     q = orientation
-    rotation = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w])
-    return poses_at([[p.x, p.y, p.z]], rotation.as_matrix())[0]
+    return poses_at([[p.x, p.y, p.z]], rotations_of([[q.x, q.y, q.z, q.w]]))[0]
 
 
 def matrix_of(position: Any, orientation: Any) -> F64:

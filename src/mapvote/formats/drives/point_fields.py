@@ -242,7 +242,7 @@ def _attributes(source: str, table: NDArray[np.void], keep: slice | I32) -> dict
         if column is None:
             continue
         try:
-            attributes[name] = row.in_scan(table[column][keep])
+            attributes[name] = row.in_scan(np.ascontiguousarray(table[column][keep]))
         except MapvoteError as error:
             raise MapvoteError(f"{source}: field {column}: {error}") from error
     return attributes

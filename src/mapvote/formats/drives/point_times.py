@@ -187,15 +187,21 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
     """The values (n,) of a field, or why they hold nothing about single points."""
     if raw.ndim != 1 or raw.dtype.kind not in "iuf":
         return Refusal("holds no numbers", varies=False)
+    raw = np.ascontiguousarray(raw)  # a column lies 20 bytes and more apart in the points of a message
     # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
     is_number = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
     numbers = int(np.count_nonzero(is_number))
     if numbers == 0:
         return Refusal("holds no number", varies=False)
-    places = np.arange(len(raw)) if numbers == len(raw) else np.flatnonzero(is_number)
-    reference = raw[places[numbers // 2]]
+    stride = max(1, numbers // JUDGEMENT.sample)
+    if numbers == len(raw):  # nearly always: no list of all of them
+        sample = np.arange(0, numbers, stride)
+        reference = raw[numbers // 2]
+    else:
+        places = np.flatnonzero(is_number)
+        sample = places[::stride]
+        reference = raw[places[numbers // 2]]
     steps = _minus(raw, reference)
-    sample = places[:: max(1, numbers // JUDGEMENT.sample)]
     distinct, counts = np.unique(steps[sample], return_counts=True)
     values = len(distinct)
     if values < JUDGEMENT.least_values and _is_lost(raw, reference, stamp_ns):
@@ -248,11 +254,14 @@ def read_times(
     to_s = UNITS_NS[chosen] * 1e-9
     # Outliers, by the longest duration of a scan.
     reach = JUDGEMENT.reach * max(1.0 / rate_hz / to_s if turn is None else turn, spread)
-    off = steps - median
-    good = values.is_number & (np.abs(off, out=off) <= reach)
-    kept = steps if good.all() else steps[good]  # nearly always all: no copy
-    first = float(kept.min())
-    length_s = (float(kept.max()) - first) * to_s
+    kept = steps
+    first, last = float(steps.min()), float(steps.max())
+    all_good = first >= median - reach and last <= median + reach and bool(values.is_number.all())  # nearly always
+    if not all_good:
+        good = values.is_number & (np.abs(steps - median) <= reach)
+        kept = steps[good]
+        first, last = float(kept.min()), float(kept.max())
+    length_s = (last - first) * to_s
     turns = (length_s if turn is None else turn * to_s) * rate_hz
     one_turn = abs(turns - 1.0) <= JUDGEMENT.off_rate and (turn is not None or chosen == "ms")
     if unit is None and not one_turn and _counts(kept, raw.dtype):
@@ -265,9 +274,9 @@ def read_times(
     middle_ns = round(median * UNITS_NS[chosen])
     value_ns, wraps_ns = _value_ns(reference, raw.dtype, chosen)
     off_ns, origin = _origin((value_ns, wraps_ns), middle_ns, starts_ns, stamp_ns, rate_hz)
-    after = steps * to_s
+    after = np.multiply(steps, to_s, out=steps)
     after += off_ns * 1e-9
-    if kept is not steps:
+    if not all_good:
         after[~good] = np.nan
     clock_off_ns = value_ns + starts_ns - stamp_ns if origin == TimeOrigin.ANOTHER else 0
     return FieldTimes(name, chosen, after, origin, clock_off_ns, wraps_ns, turn is not None, turns)
@@ -285,9 +294,9 @@ def _minus(raw: NDArray[Any], reference: Any) -> F64:
     """(n,) values less one of them; of integers of 32 bits and more across their wrap too."""
     native = raw.astype(raw.dtype.newbyteorder("="), copy=False)
     if raw.dtype.kind == "f":
-        return native.astype(np.float64) - float(reference)
+        return np.subtract(native, float(reference), dtype=np.float64)
     if raw.dtype.itemsize < 4:
-        return native.astype(np.float64) - float(reference)
+        return np.subtract(native, float(reference), dtype=np.float64)
     unsigned = np.dtype(f"u{raw.dtype.itemsize}")
     around = native.view(unsigned) - np.asarray(reference).astype(native.dtype).view(unsigned)
     return around.view(np.dtype(f"i{raw.dtype.itemsize}")).astype(np.float64)

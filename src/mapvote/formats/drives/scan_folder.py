@@ -18,7 +18,6 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-import scipy
 import tomli_w
 from numpy.typing import NDArray
 
@@ -352,8 +351,7 @@ def _viewpoints(files: list[Path]) -> F64 | None:
             row[:] = viewpoint if np.linalg.norm(viewpoint[3:]) > 0.5 else row
     if (rows == rows[0]).all():
         return None
-    rotations = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True)
-    T = geometry.poses_at(rows[:, :3], rotations.as_matrix())
+    T = geometry.poses_at(rows[:, :3], geometry.rotations_of(rows[:, [4, 5, 6, 3]]))
     check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
     return T
 

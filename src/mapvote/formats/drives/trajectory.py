@@ -317,9 +317,7 @@ def _motions_of_quaternions(file: Path, rows: F64) -> F64:
             f"{file}: row {int(np.argmax(~(off < 0.05))) + 1} has no unit quaternion; a header names the columns "
             "(timestamp,x,y,z,qx,qy,qz,qw)"
         )
-    if not len(rows):
-        return geometry.poses_at(rows[:, :3])
-    return geometry.poses_at(rows[:, :3], scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix())
+    return geometry.poses_at(rows[:, :3], geometry.rotations_of(rows[:, 3:]))
 
 
 def _in_tum_order(file: Path, rows: F64) -> F64:
@@ -338,8 +336,7 @@ def _of_quaternions(rows: F64) -> float:
     lengths = np.linalg.norm(rows[:, 3:], axis=1)
     if not (np.abs(lengths - 1.0) < 0.05).all():
         return 1.0
-    R = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix()
-    return _steadiness(geometry.poses_at(rows[:, :3], R))
+    return _steadiness(geometry.poses_at(rows[:, :3], geometry.rotations_of(rows[:, 3:])))
 
 
 def _steadiness(T: F64) -> float:
