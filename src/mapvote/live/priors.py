@@ -22,6 +22,8 @@ class PriorMemory:
 
     poses: int = 20_000
     """Poses that are kept at most."""
+    around: int = 8
+    """Poses before and after a scan that are looked at: one of each is needed where no two have the same time."""
     past_ns: int = 3 * 10**9
     """Poses so much older than the oldest scan that waits are dropped, nanoseconds."""
     back_ns: int = 10**9
@@ -55,7 +57,7 @@ class Priors:
         """Whether no later message changes the pose of this time."""
         if len(self.fixes.times_ns):
             return bool(self.fixes.times_ns[-1] >= stamp_ns)
-        return len(self._poses) >= 2 and max(time_ns for time_ns, _ in self._poses) >= stamp_ns
+        return len(self._poses) >= 2 and any(time_ns >= stamp_ns for time_ns, _ in reversed(self._poses))
 
     def forget_before(self, stamp_ns: int) -> None:
         """No scan before this time will ask."""
@@ -76,8 +78,13 @@ class Priors:
             return prior_at(self.fixes, stamp_ns, T_base_lidar)
         if len(self._poses) < 2:
             return None
-        times, T = zip(*self._poses, strict=True)
-        trajectory = sorted_trajectory(np.array(times), np.stack(T), of_vehicle=True, frame=MapFrame())
+        # Only the poses around this time: odometry may come 200 times a second.
+        times_ns = np.array([time_ns for time_ns, _ in self._poses])
+        in_order = np.argsort(times_ns, kind="stable")
+        after = int(np.searchsorted(times_ns, stamp_ns, sorter=in_order))
+        near = in_order[max(0, after - self._memory.around) : after + self._memory.around]
+        T = np.stack([self._poses[place][1] for place in near])
+        trajectory = sorted_trajectory(times_ns[near], T, of_vehicle=True, frame=MapFrame())
         try:
             return np.asarray(trajectory.at(np.array([stamp_ns]), "odometry")[0] @ T_base_lidar)
         except MapvoteError:
