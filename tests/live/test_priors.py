@@ -1,4 +1,4 @@
-"""The pose of a scan by the odometry of a live vehicle: the last poses, however often and in whatever order they come."""
+"""The pose of a scan by the odometry of a live vehicle, however often and in whatever order its poses come."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mapvote.core.types import F64
-from mapvote.formats import MapFrame
 from mapvote.formats.drives.trajectory import sorted_trajectory
-from mapvote.live.priors import Priors
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.live.priors import Priors, pose_in
 
 
 def pose_at(x_m: float) -> F64:
@@ -35,7 +35,7 @@ def test_a_pose_by_the_poses_around_a_scan_is_that_of_the_whole_trajectory(rate_
         int(times_ns.max()) + 10**8,
     ):
         expected = whole.at(np.array([stamp_ns]), "odometry")[0]
-        np.testing.assert_allclose(priors.at(stamp_ns, np.eye(4)), expected, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(pose_in(priors.at(stamp_ns, np.eye(4)))), expected, atol=1e-12)
         assert priors.covers(stamp_ns) == (stamp_ns <= times_ns.max())
 
 
