@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from long_street import blocks_say_the_same, long_street
@@ -74,6 +74,23 @@ def test_a_tile_that_is_left_comes_back_as_it_was() -> None:
     for seed, (tile, share) in enumerate(shares.items()):
         np.testing.assert_array_equal(tiles[tile], some_planes(seed, share))
     assert not tiles.near((5, 5)).planes.any(), "whatever another tile left behind"
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@given(row=st.integers(-90, 300), col=st.integers(-90, 300), side=st.integers(1, 300))
+@settings(max_examples=20)
+def test_a_part_of_a_tile_is_the_same_whether_the_tile_is_packed_or_not(
+    packed: bool, row: int, col: int, side: int
+) -> None:
+    tiles = PackedTiles(LATTICE, 16)
+    planes = some_planes(3, 0.05)
+    fill(tiles.near((0, 0)), planes)
+    if packed:
+        for _ in range(TILE_PACKING.bands):
+            tiles.leave(Grid(LATTICE, 5000, 5000, 100, 100))
+    within = tiles.within((0, 0), Grid(LATTICE, row, col, side, side))
+    cut = slice(max(row, 0), max(row + side, 0)), slice(max(col, 0), max(col + side, 0))
+    np.testing.assert_array_equal(within[cut], planes[cut])
 
 
 def test_a_tile_is_left_only_when_the_view_is_far_from_it() -> None:

@@ -23,7 +23,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.process_memory import give_back_free_pages, zero_pages
 from mapvote.core.record import record
-from mapvote.core.types import I32, U64, MapvoteError
+from mapvote.core.types import I32, I64, U64, Bool, MapvoteError
 
 COUNT_PLANES = 7
 """Bit planes of a counter: counts up to 127 scans."""
@@ -108,7 +108,8 @@ class OpenTile(NamedTuple):
 
 
 class PackedTiles(Mapping[TileIndex, U64]):
-    """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it."""
+    """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it, and
+    :meth:`within` unpacks a part."""
 
     def __init__(self, lattice: Lattice, words: int, packing: TilePacking = TILE_PACKING) -> None:
         self.lattice = lattice
@@ -125,6 +126,19 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def __getitem__(self, tile: TileIndex) -> U64:
         opened = self._open[tile] if tile in self._open else self._unpacked(self._packed[tile])
         return opened.planes
+
+    def within(self, tile: TileIndex, view: Grid) -> U64:
+        """The planes of a tile, right where it overlaps ``view``: of a packed one nothing else is unpacked."""
+        if tile in self._open:
+            return self._open[tile].planes
+        planes = self._new().planes
+        part = self.overlap(tile, view)
+        tile_rows = slice(part.row + part.down, part.end_row + part.down)
+        tile_cols = slice(part.col + part.right, part.end_col + part.right)
+        for rows, cols, words in self._cells(self._packed[tile], tile_rows):
+            inside = np.flatnonzero(_lie_in(rows, tile_rows) & _lie_in(cols, tile_cols))
+            planes[rows.take(inside), cols.take(inside)] = words.take(inside, axis=1).T
+        return planes
 
     def __iter__(self) -> Iterator[TileIndex]:
         yield from self._open
@@ -180,16 +194,25 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def _unpacked(self, bands: list[Slot]) -> OpenTile:
         """The tile of these bands."""
         planes, spans = opened = self._new()
-        cells_of_band = CELLS // self.packing.bands
-        for k, place in enumerate(bands):
-            data = self._shelf.read(place)
-            raw = np.frombuffer(unpack_bytes(data, cells_of_band * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
-            numbers, *words = raw.reshape(self.words + 1, -1)
-            rows, cols = np.divmod(numbers.astype(np.int64) + k * cells_of_band, TILE_CELLS)
-            planes[rows, cols] = np.stack(words, axis=1)
+        for rows, cols, words in self._cells(bands, slice(0, TILE_CELLS)):
+            planes[rows, cols] = words.T
             np.minimum.at(spans[:, 0], rows, cols)
             np.maximum.at(spans[:, 1], rows, cols + 1)
         return opened
+
+    def _cells(self, bands: list[Slot], wanted: slice) -> Iterator[tuple[I64, I64, U64]]:
+        """(rows (n,), columns (n,), words (words, n)) of the cells of each band that has any of the ``wanted`` rows."""
+        height = TILE_CELLS // self.packing.bands
+        for k, place in enumerate(bands):
+            if k * height < wanted.stop and (k + 1) * height > wanted.start:
+                data = unpack_bytes(self._shelf.read(place), height * TILE_CELLS * 8 * (self.words + 1), "evidence")
+                numbers, *words = np.frombuffer(data, dtype=np.uint64).reshape(self.words + 1, -1)
+                rows, cols = np.divmod(numbers.astype(np.int64) + k * height * TILE_CELLS, TILE_CELLS)
+                yield rows, cols, np.array(words)
+
+
+def _lie_in(places: I64, part: slice) -> Bool:
+    return (places >= part.start) & (places < part.stop)
 
 
 def _packed(planes: U64, spans: I32, zstd_level: int) -> bytes:

@@ -124,7 +124,7 @@ class SurfaceVoter:
         free = {}
         for tile in window.tiles():
             if tile in counted:
-                planes = counted[tile]
+                planes = counted.within(tile, window)
                 weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known_free, weighed, self.rule)
                 if tile in tiles:
                     free[tile] = free_words(planes)
