@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -165,7 +165,7 @@ class PointReader:
         if self.rules.motion_compensated:
             return None, TimesTold("compensated", "stated: points are motion-compensated")
         axes = {name for axis, name in known_fields(names).items() if axis in "xyz"}
-        columns = {name: table[name][keep] for name in names if name not in axes and table.dtype[name].shape == ()}
+        columns = _Columns(table, [n for n in names if n not in axes and table.dtype[n].shape == ()], keep)
         try:
             field_times = find_times(columns, points, stamp_ns, self._rate_hz(sensor), self.rules)
         except MapvoteError as error:
@@ -228,6 +228,29 @@ class PointReader:
                 f"the sensor turns (rate_hz in drive.toml), for scans may have been left out"
             )
         return rate_hz
+
+
+class _Columns(Mapping[str, Values]):
+    """Columns (n,) of the kept points by name. Each is copied when it is asked for: messages have up to ten."""
+
+    def __init__(self, table: NDArray[np.void], names: list[str], keep: slice | I32) -> None:
+        self._table = table
+        self._names = names
+        self._keep = keep
+
+    def __getitem__(self, name: str) -> Values:
+        if name not in self._names:
+            raise KeyError(name)
+        return np.ascontiguousarray(self._table[name][self._keep])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names  # Mapping's would copy the column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def _attributes(source: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:

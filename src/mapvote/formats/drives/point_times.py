@@ -187,7 +187,6 @@ def _values(raw: NDArray[Any], stamp_ns: int) -> _Values | Refusal:
     """The values (n,) of a field, or why they hold nothing about single points."""
     if raw.ndim != 1 or raw.dtype.kind not in "iuf":
         return Refusal("holds no numbers", varies=False)
-    raw = np.ascontiguousarray(raw)  # a column lies 20 bytes and more apart in the points of a message
     # The values from one of them on: exact before anything becomes a float, and right across a wrap of uint32.
     is_number = np.isfinite(raw) if raw.dtype.kind == "f" else np.ones(len(raw), dtype=bool)
     numbers = int(np.count_nonzero(is_number))
@@ -405,19 +404,19 @@ def find_times(
     if rules.time_field is not None:
         return FoundTimes(_stated(columns, points, stamp_ns, rate_hz, rules))
     joined = _joined(columns)
-    whole = {**joined, **columns}
     named, alike = _named_like_times(columns)
     refused = {}
     for name in (*joined, *named, *alike):
-        read = read_times(name, whole[name], points, stamp_ns, rate_hz, rules.time_unit)
+        values = columns[name] if name in columns else joined[name]
+        read = read_times(name, values, points, stamp_ns, rate_hz, rules.time_unit)
         if isinstance(read, FieldTimes):
             return FoundTimes(read, surprising=name in alike)
         refused[name] = read
     candidates = []
-    for name in whole:
+    for name in columns:
         if name in refused or _OTHER_FIELDS.match(_lower(name)):
             continue
-        read = read_times(name, whole[name], points, stamp_ns, rate_hz)
+        read = read_times(name, columns[name], points, stamp_ns, rate_hz)
         if isinstance(read, Refusal) or abs(read.turns - 1.0) > JUDGEMENT.off_rate:
             continue
         if read.spins or _goes_forward(read.after_stamp):
@@ -433,10 +432,11 @@ def _stated(
     name = rules.time_field or "none"
     if name == "none":
         return None
-    whole = {**_joined(columns), **columns}
-    if name not in whole:
-        raise MapvoteError(f"time_field = {name!r}: no such field; the fields are {', '.join(whole)}")
-    read = read_times(name, whole[name], points, stamp_ns, rate_hz, rules.time_unit)
+    joined = _joined(columns)
+    if name not in columns and name not in joined:
+        raise MapvoteError(f"time_field = {name!r}: no such field; the fields are {', '.join((*joined, *columns))}")
+    values = columns[name] if name in columns else joined[name]
+    read = read_times(name, values, points, stamp_ns, rate_hz, rules.time_unit)
     if isinstance(read, Refusal):
         raise MapvoteError(f"time_field = {name!r}: the field {read.why}; state time_unit too, or another field")
     return read
