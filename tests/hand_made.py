@@ -57,7 +57,8 @@ def one_scan(point_map: PointMap, points: F64) -> Observation:
     for k, z in zip(cell, points[:, 2], strict=True):
         hit.ravel()[k] |= np.uint64(1 << int(z // CELL_SIZE - here.base.ravel()[k]))
     still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
-    scan = PlacedScan(0, rows_from(points, origin), origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
+    up, covariance = np.array([0.0, 0.0, 1.0]), 1e-4 * np.eye(3)
+    scan = PlacedScan(0, rows_from(points, origin), origin, up, covariance, here, here, obstacle, cell)
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit, np.zeros((0, 0), np.uint8))
     return Observation(scan, still, view, here)
 

@@ -250,7 +250,7 @@ def write_ballot(
     new_points: NewPoints,
 ) -> Ballot:
     """The ballot of one voter, counted under ``settings``. Raises MapvoteError if no scan has voted."""
-    voted = len(report.sigmas_m)
+    voted = len(report.observed)
     if voted == 0:
         if len(report.lost) < report.scans:
             raise MapvoteError(f"{vehicle}: no scan has voted yet; finish() ends a drive this short")
@@ -275,7 +275,7 @@ def write_ballot(
         settings_hash=settings.digest(),
         scans=report.scans,
         scans_localised=voted,
-        median_sigma_m=float(np.median(report.sigmas_m)),
+        median_sigma_m=float(np.median(report.sigmas_m())),
         length_m=report.length_m(),
         prior_misfit_m=report.prior_misfit_m(),
         prior_sigma_m=report.prior_sigma_m(),

@@ -126,7 +126,7 @@ def test_an_observation_tells_obstacles_from_the_road_and_how_sure_the_pose_was(
     assert seen.scan.obstacle.tolist() == [True, True, False, False]
     assert (seen.scan.cell >= 0).tolist() == [True, True, True, False]
     assert not seen.moving.any()
-    assert seen.scan.sigma_m == pytest.approx(0.2), "the worst direction"
+    assert one.report.sigmas_m().tolist() == [pytest.approx(0.2)], "the worst direction"
     np.testing.assert_allclose(seen.scan.points_map[0], [35.0, 30.1, 1.5], atol=1e-5)
     assert seen.view.counts.sum() == 2
     assert seen.reference is seen.scan.reference
@@ -190,7 +190,7 @@ def test_a_sweep_of_two_lidars_is_one_observation_and_each_one_s_rays_begin_wher
     whole = frontend()
     assert whole.observe(Scan.sweep(0, [Scan(0, points), Scan(0, points, origin=rear)])) == []
     (seen,) = whole.finish()
-    assert (whole.report.scans, len(whole.report.sigmas_m)) == (1, 1)
+    assert (whole.report.scans, len(whole.report.sigmas_m())) == (1, 1)
     np.testing.assert_allclose(seen.scan.origin_map, SENSOR[:3, 3])
     first, second = seen.scan.lidars
     np.testing.assert_allclose(first.origin_map(seen.scan.origin_map), SENSOR[:3, 3])

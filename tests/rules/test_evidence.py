@@ -172,8 +172,8 @@ def bare_scan(points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied
     ground_z = (base * CELL_SIZE).astype(np.float32)
     reference = Reference(grid, ground_z, base, occupied, counts, none, -none, None)
     obstacle, cell = find_obstacles(points, reference)
-    up = np.array([0.0, 0.0, 1.0])
-    scan = PlacedScan(0, rows_from(points, np.zeros(3)), np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
+    up, covariance, origin = np.array([0.0, 0.0, 1.0]), 4e-4 * np.eye(3), np.zeros(3)
+    scan = PlacedScan(0, rows_from(points, origin), origin, up, covariance, reference, reference, obstacle, cell)
     view = ScanView(grid, counts, words, words, np.zeros((0, 0), np.uint8))
     return Observation(scan, moving, view, reference)
 

@@ -217,8 +217,8 @@ def observed() -> tuple[PointMap, Observation]:
     obstacle, cell = find_obstacles(points, reference)
     moving = np.zeros(len(points), dtype=np.bool_)
     view = cast_rays(rows_from(points, origin), origin, obstacle, moving, reference)
-    up = np.array([0.0, 0.0, 1.0])
-    placed = PlacedScan(0, rows_from(points, origin), origin, up, 0.01, reference, reference, obstacle, cell)
+    up, covariance = np.array([0.0, 0.0, 1.0]), 1e-4 * np.eye(3)
+    placed = PlacedScan(0, rows_from(points, origin), origin, up, covariance, reference, reference, obstacle, cell)
     return point_map, Observation(placed, moving, view, reference)
 
 

@@ -90,8 +90,8 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
     if driven is not None:
         poses = poses_at(driven)
         lost = []
-    sigmas_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
-    return DriveReport([end_ns] * len(poses), lost, sigmas_m, list(poses), priors=[None] * len(poses))
+    observed = [registered.fit.covariance[:3, :3]] * (len(poses) - len(lost))
+    return DriveReport([end_ns] * len(poses), lost, observed, list(poses), priors=[None] * len(poses))
 
 
 def _votes(

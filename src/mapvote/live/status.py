@@ -200,7 +200,7 @@ class StatusBoard:
         then, scans, localised, lost = self._past[0]
         localised = counts.localised - localised
         lost = counts.lost - lost
-        sigmas = [] if live.vehicle is None else live.vehicle.report.sigmas_m[-STATUS_TIMES.recent :]
+        sigmas = () if live.vehicle is None else live.vehicle.report.sigmas_m(STATUS_TIMES.recent)
         recent = list(live.latencies_s)[-STATUS_TIMES.recent :]
         if isinstance(self._maps, RoadMap):
             version = self._maps.version
@@ -216,7 +216,7 @@ class StatusBoard:
             replace(self._outbox.report),
             scans_hz=(counts.scans - scans) / (now_s - then) if now_s > then else 0.0,
             localised_share=localised / (localised + lost) if localised + lost else float("nan"),
-            sigma_m=float(np.median(sigmas)) if sigmas else float("nan"),
+            sigma_m=float(np.median(sigmas)) if len(sigmas) else float("nan"),
             latency_s=float(np.median(recent)) if recent else float("nan"),
             waiting_scans=live.waiting,
             silent_s=now_s - self._last_cloud_s,

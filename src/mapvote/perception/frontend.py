@@ -65,8 +65,9 @@ class DriveReport:
     """Each scan's stamp."""
     lost: list[int] = field(default_factory=list)
     """Indices of scans that abstained because the vehicle was not sure where it was."""
-    sigmas_m: list[float] = field(default_factory=list)
-    """Position sigma of each scan that was observed: one that still waits for the filter is not in it yet."""
+    observed: list[F64] = field(default_factory=list)
+    """(3, 3) covariance of the position of each scan that was observed: one that still waits for the filter is not in
+    it yet."""
     T_map_lidar: list[F64] = field(default_factory=list)
     """Pose of every scan that is decided; the best guess for a lost one."""
     covariances: list[F32] = field(default_factory=list)
@@ -80,6 +81,12 @@ class DriveReport:
     def scans(self) -> int:
         """How many scans were observed."""
         return len(self.stamps_ns)
+
+    def sigmas_m(self, newest: int = 0) -> F64:
+        """(n,) position sigma of each scan that was observed, the largest over all directions; of the ``newest`` ones,
+        unless that is 0. All at once, for whoever asks: an eigenvalue for each scan would take a 200th of its time."""
+        covariances = np.array(self.observed[-newest:]).reshape(-1, 3, 3)
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(covariances)[:, -1]))
 
     def length_m(self) -> float:
         """Road driven between scans in turn that were both localised."""
@@ -146,8 +153,8 @@ class PlacedScan:
     """(3,) the sensor, map metres; of a sweep the first LiDAR."""
     up_map: F64
     """(3,) the sensor's own upward axis, in the map's frame."""
-    sigma_m: float
-    """Standard deviation of the position, metres: the largest over all directions."""
+    position_covariance: F64
+    """(3, 3) of the position, square metres."""
     reference: Reference
     """The map that separated its points from the ground."""
     outer: Reference
@@ -296,7 +303,6 @@ class Frontend:
         scan = fix.scan
         T_map_lidar = fix.registration.T_map_lidar
         origin_map = scan.origin_map(T_map_lidar)
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         rows, cell, obstacle = place_points(scan, fix.twist, T_map_lidar, origin_map, reference)
         forward_map, _, up_map = T_map_lidar[:3, :3].T
@@ -306,7 +312,7 @@ class Frontend:
             rows,
             origin_map,
             up_map,
-            sigma_m,
+            fix.registration.covariance[:3, :3],
             reference,
             outer,
             obstacle,
@@ -330,7 +336,7 @@ class Frontend:
         out = []
         for moving in decided:
             scan = self._waiting.popleft()
-            self.report.sigmas_m.append(scan.sigma_m)
+            self.report.observed.append(scan.position_covariance)
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 views = [self._view_of(scan, lidar, moving, reference) for lidar in scan.lidars]
