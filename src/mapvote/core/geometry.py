@@ -64,10 +64,15 @@ def corners(points: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def inverse(T_a_b: F64) -> F64:
     """T_b_a of T_a_b, by the transpose of the rotation (exact for rigid motions)."""
-    T = np.eye(4)
-    T[:3, :3] = T_a_b[:3, :3].T
-    T[:3, 3] = -T[:3, :3] @ T_a_b[:3, 3]
-    return T
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = np.asarray(T_a_b, dtype=np.float64).tolist()
+    return np.array(
+        (
+            (r00, r10, r20, -(r00 * x + r10 * y + r20 * z)),
+            (r01, r11, r21, -(r01 * x + r11 * y + r21 * z)),
+            (r02, r12, r22, -(r02 * x + r12 * y + r22 * z)),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
 
 
 def hat(v: ArrayLike) -> F64:
@@ -85,16 +90,17 @@ def exp(xi: ArrayLike) -> F64:
     s = 1.0 if small else math.sin(angle) / angle
     half_chord = 0.5 if small else 2.0 * (math.sin(0.5 * angle) / angle) ** 2  # 1 - cos cancels at small angles
     rest = 0.0 if small else (1.0 - s) / angle2
-    T = np.eye(4)
+    x, y, z = _by_turn(rho, phi, half_chord, rest)
     # The square of the cross-product matrix of v is v v^T - v^2.
     (a, b, c), m = phi, 1.0 - half_chord * angle2
-    T[:3, :3] = (
-        (m + half_chord * a * a, half_chord * a * b - s * c, half_chord * a * c + s * b),
-        (half_chord * a * b + s * c, m + half_chord * b * b, half_chord * b * c - s * a),
-        (half_chord * a * c - s * b, half_chord * b * c + s * a, m + half_chord * c * c),
+    return np.array(
+        (
+            (m + half_chord * a * a, half_chord * a * b - s * c, half_chord * a * c + s * b, x),
+            (half_chord * a * b + s * c, m + half_chord * b * b, half_chord * b * c - s * a, y),
+            (half_chord * a * c - s * b, half_chord * b * c + s * a, m + half_chord * c * c, z),
+            (0.0, 0.0, 0.0, 1.0),
+        )
     )
-    T[:3, 3] = _by_turn(rho, phi, half_chord, rest)
-    return T
 
 
 def _by_turn(v: list[float], phi: list[float], first: float, second: float) -> tuple[float, float, float]:

@@ -272,7 +272,9 @@ class PosePrior:
         level = 0.0 if self.is_planar else 1.0
         position = self.sigma_m**-2
         rotation = self.sigma_rad**-2
-        return np.diag([position, position, level * position, level * rotation, level * rotation, rotation])
+        out = np.zeros((6, 6))
+        out.flat[::7] = position, position, level * position, level * rotation, level * rotation, rotation
+        return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ that they never vote. Memory is bounded by the scans that may wait.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -278,7 +279,8 @@ class Localiser:
             return self.prior_frame.in_map(prior)
         T_map_lidar = prior.T_map_lidar.copy()
         T_map_lidar[:3, 3] += self.misfit
-        return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.linalg.norm(self.misfit))))
+        sigma_m = max(prior.sigma_m, math.hypot(*self.misfit))
+        return PosePrior(T_map_lidar, sigma_m, prior.sigma_rad, prior.is_planar)
 
     def _predicted(self, scan: Scan) -> tuple[F64, float] | None:
         """Where the motion of the track leads by now (4, 4), and the seconds since; None where that says little."""
@@ -293,15 +295,15 @@ class Localiser:
         if not self._confirmed or predicted is None or not fix.trusted:
             return False
         T_map_lidar, age_s = predicted
-        off_m = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]))
+        off_m = math.dist(fix.registration.T_map_lidar[:3, 3], T_map_lidar[:3, 3])
         return off_m > self.numbers.leap_m + 0.5 * self.numbers.leap_mps2 * age_s**2
 
     def _is_due(self, fix: Fix) -> bool:
         last = self._looked_at
         if last is None or not self._confirmed or not fix.trusted:
             return True
-        way = np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - last.registration.T_map_lidar[:3, 3])
-        return bool(way >= self.numbers.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self._every_s)
+        way_m = math.dist(fix.registration.T_map_lidar[:3, 3], last.registration.T_map_lidar[:3, 3])
+        return way_m >= self.numbers.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self._every_s
 
     def _look(self) -> None:
         """Judge the newest fix; move the track while another place fits better."""

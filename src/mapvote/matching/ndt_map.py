@@ -83,7 +83,8 @@ class NdtMap:
 
     def is_central(self, position: F64) -> bool:
         """Whether ``position`` (3,) is near enough to the middle for the window to hold what a scan reaches."""
-        return bool(np.abs(np.asarray(position) - self.centre).max() <= self.numbers.central_m)
+        off_m = [abs(a - b) for a, b in zip(position.tolist(), self.centre.tolist(), strict=True)]
+        return max(off_m) <= self.numbers.central_m
 
     def around(self, position: F64) -> NdtMap:
         """Itself, with a window that holds what a scan from ``position`` (3,) reaches."""

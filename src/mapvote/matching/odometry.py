@@ -265,5 +265,5 @@ class Tracker:
 
 def _differ(twist: F64, other: F64) -> bool:
     """Whether two motions bend a scan differently: by more than 2 cm, at its ends and 20 m away."""
-    change = np.abs(twist - other)
-    return bool(change[:3].max() * 0.05 > 0.02 or change[3:].max() * 0.05 * 20.0 > 0.02)
+    change = [abs(a - b) for a, b in zip(twist.tolist(), other.tolist(), strict=True)]
+    return max(change[:3]) * 0.05 > 0.02 or max(change[3:]) * 0.05 * 20.0 > 0.02
