@@ -123,8 +123,15 @@ def _flat_cells(points, x0, y0, lattice_x0, lattice_y0, row0, col0, rows, cols, 
     flat[:] = np.clip(row, 0, rows - 1) * cols + np.clip(col, 0, cols - 1)
 
 
-def _obstacles(words: Any, points: Any, cells: Any, ground_z: Any, base: Any) -> None:
-    z = points[:, 2].astype(np.float64)
+def _obstacles(words: Any, points: Any, corner: Any, place: Any, ground_z: Any, base: Any) -> None:
+    flat = np.empty(len(points), dtype=np.int64)
+    _flat_cells(points, *corner, *place[:4], flat)
+    row, col = np.divmod(flat, place[3])
+    row, col = row + place[4], col + place[5]
+    here = (row >= 0) & (col >= 0) & (row < words.shape[0]) & (col < words.shape[1])
+    cells = row[here] * words.shape[1] + col[here]
+    words, ground_z, base = words.reshape(-1), ground_z.reshape(-1), base.reshape(-1)
+    z = points[here, 2].astype(np.float64)
     tall = z - np.where(np.isnan(ground_z[cells]), base[cells] * CELL, ground_z[cells]) >= CELL
     bits = np.clip(np.floor(z[tall] / CELL).astype(np.int64) - base[cells[tall]], 0, 63).astype(np.uint64)
     np.bitwise_or.at(words, cells[tall], np.uint64(1) << bits)
@@ -214,7 +221,7 @@ NUMPY: dict[str, Callable[..., object]] = {
     "codec.ballot._placed": _points_out,
     "codec.planes._ascending": _words_out,
     "core.columns._enter_cells": _flat_cells,
-    "core.columns.mark_obstacles": _obstacles,
+    "core.columns._mark_obstacles": _obstacles,
     "core.geometry._transform": _transformed,
     "core.geometry._rows_from": lambda points, origin, rows: np.copyto(rows, (points - origin).T, casting="same_kind"),
     "core.voting.cast": _cast,

@@ -62,15 +62,35 @@ def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
     return bit, z - np.where(np.isnan(ground_z), base * CELL_SIZE, ground_z) >= GROUND_MARGIN_M
 
 
+def mark_obstacles(words: U64, points: F32, window: Grid, outer: Grid, ground_z: F32, base: I32) -> None:
+    """Enter the points (n, 3), metres from the corner of ``window``, that are obstacles into the column ``words`` of
+    ``outer``, by the rule of :func:`column_bits`; ``ground_z``, ``base``, both of ``outer``. Points outside it are left
+    out; those inside lie in the cells of :func:`flat_cells`."""
+    corner = window.x0, window.y0, float(window.lattice.x0), float(window.lattice.y0)
+    place = window.row0, window.col0, window.rows, window.cols, window.row0 - outer.row0, window.col0 - outer.col0
+    _mark_obstacles(words, read_only(points), corner, place, read_only(ground_z), read_only(base))
+
+
 @kernel
-def mark_obstacles(words: U64, points: F32, cells: I64, ground_z: F32, base: I32) -> None:
-    """Enter the points (n, 3) that are obstacles into the column ``words`` (cells,), by their flat ``cells`` (n,) and
-    the rule of :func:`column_bits`; ``ground_z``, ``base`` (cells,)."""
-    for i in range(len(cells)):
-        cell = cells[i]
+def _mark_obstacles(
+    words: U64, points: F32, corner: tuple[float, float, float, float], place: tuple[int, int, int, int, int, int],
+    ground_z: F32, base: I32,
+) -> None:  # fmt: skip
+    """``corner``: x and y of the window's and of the lattice's. ``place``: the window's first row and column, how many
+    it has, and how far up and to the right it begins in the planes (rows, cols)."""
+    x0, y0, lattice_x0, lattice_y0 = corner
+    row0, col0, height, width, up, right = place
+    rows, cols = words.shape
+    for i in range(len(points)):
+        row = int(np.floor((np.float64(points[i, 1]) + y0 - lattice_y0) / CELL_SIZE)) - row0
+        col = int(np.floor((np.float64(points[i, 0]) + x0 - lattice_x0) / CELL_SIZE)) - col0
+        r = min(max(row, 0), height - 1) + up
+        c = min(max(col, 0), width - 1) + right
+        if r < 0 or c < 0 or r >= rows or c >= cols:
+            continue
         z = np.float64(points[i, 2])
-        if height_above(z, ground_z[cell], base[cell]) >= GROUND_MARGIN_M:
-            words[cell] |= np.uint64(1) << np.uint64(column_bit(z, base[cell]))
+        if height_above(z, ground_z[r, c], base[r, c]) >= GROUND_MARGIN_M:
+            words[r, c] |= np.uint64(1) << np.uint64(column_bit(z, base[r, c]))
 
 
 @kernel

@@ -13,7 +13,7 @@ from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.groups import widened
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, U64, Reference, read_only
+from mapvote.core.types import F32, F64, U64, Reference
 
 Layout = Iterator[Reference | None]
 """The planes of a window on their way: each step takes a few milliseconds at most, the last one gives them."""
@@ -91,23 +91,17 @@ def _laid_out(point_map: PointMap, grid: Grid, steps: LayoutSteps, measured: boo
 def _enter_points(points: F32, window: Grid, planes: Reference, measured: bool) -> None:
     """Enter points (n, 3) of a tile's ``window`` that are obstacles; ``measured``: how many and how high, too."""
     grid = planes.grid
+    if not measured:
+        mark_obstacles(planes.occupied, points, window, grid, planes.ground_z, planes.base)
+        return
     cells = flat_cells(window, points)
     rows = cells >> (TILE_CELLS.bit_length() - 1)  # numpy takes longer to divide
     cols = cells & (TILE_CELLS - 1)
     rows += window.row0 - grid.row0
     cols += window.col0 - grid.col0
-    if measured:
-        measures = planes.counts, planes.bottom_z, planes.top_z
-        z = points[:, 2].astype(np.float64)
-        fill_columns(rows, cols, z, planes.ground_z, planes.base, planes.occupied, *measures)
-        return
-    if window.intersection(grid) != window:
-        inside = np.flatnonzero((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols))
-        points, rows, cols = points.take(inside, axis=0), rows.take(inside), cols.take(inside)
-    rows *= grid.cols
-    rows += cols
-    ground_z, base = (read_only(plane.reshape(-1)) for plane in (planes.ground_z, planes.base))
-    mark_obstacles(planes.occupied.reshape(-1), read_only(points), read_only(rows), ground_z, base)
+    measures = planes.counts, planes.bottom_z, planes.top_z
+    z = points[:, 2].astype(np.float64)
+    fill_columns(rows, cols, z, planes.ground_z, planes.base, planes.occupied, *measures)
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:

@@ -156,6 +156,7 @@ class Tile:
         sources = {
             "cells": {"points"},
             "base": {"ground_z"},
+            "has_ground": {"ground_z"},
             "columns": {"points", "ground_z"},
             "obstacle_words": {"points", "ground_z"},
         }
@@ -207,7 +208,7 @@ class Tile:
         """(256, 256) lattice layer of bit 0 of each column, see :func:`mapvote.core.columns.base_layers`."""
         return base_layers(self.ground_z)
 
-    @property
+    @cached_property
     def has_ground(self) -> bool:
         """Whether the ground is known anywhere in it; if not, the start of its columns is unknown."""
         return bool(np.isfinite(self.ground_z).any())
@@ -226,8 +227,6 @@ class Tile:
     @cached_property
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
-        words = np.zeros(CELLS, dtype=np.uint64)
-        ground_z = self.ground_z.reshape(-1)
-        base = self.base.reshape(-1)
-        mark_obstacles(words, read_only(self.points), read_only(self.cells), read_only(ground_z), read_only(base))
-        return words.reshape(self.window.shape)
+        words = np.zeros(self.window.shape, dtype=np.uint64)
+        mark_obstacles(words, self.points, self.window, self.window, self.ground_z, self.base)
+        return words
