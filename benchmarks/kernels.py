@@ -123,18 +123,22 @@ def _flat_cells(points, x0, y0, lattice_x0, lattice_y0, row0, col0, rows, cols, 
     flat[:] = np.clip(row, 0, rows - 1) * cols + np.clip(col, 0, cols - 1)
 
 
-def _obstacles(words: Any, points: Any, corner: Any, place: Any, ground_z: Any, base: Any) -> None:
+def _obstacles(words, points, corner, place, ground_z, base, counts, bottom_z, top_z):  # type: ignore[no-untyped-def]
     flat = np.empty(len(points), dtype=np.int64)
     _flat_cells(points, *corner, *place[:4], flat)
     row, col = np.divmod(flat, place[3])
     row, col = row + place[4], col + place[5]
-    here = (row >= 0) & (col >= 0) & (row < words.shape[0]) & (col < words.shape[1])
-    cells = row[here] * words.shape[1] + col[here]
-    words, ground_z, base = words.reshape(-1), ground_z.reshape(-1), base.reshape(-1)
+    here = np.flatnonzero((row >= 0) & (col >= 0) & (row < words.shape[0]) & (col < words.shape[1]))
+    cells = row[here], col[here]
     z = points[here, 2].astype(np.float64)
     tall = z - np.where(np.isnan(ground_z[cells]), base[cells] * CELL, ground_z[cells]) >= CELL
-    bits = np.clip(np.floor(z[tall] / CELL).astype(np.int64) - base[cells[tall]], 0, 63).astype(np.uint64)
-    np.bitwise_or.at(words, cells[tall], np.uint64(1) << bits)
+    z, cells = z[tall], (cells[0][tall], cells[1][tall])
+    bits = np.clip(np.floor(z / CELL).astype(np.int64) - base[cells], 0, 63).astype(np.uint64)
+    np.bitwise_or.at(words, cells, np.uint64(1) << bits)
+    if len(counts):
+        np.add.at(counts, cells, 1)
+        np.minimum.at(bottom_z, cells, z.astype(np.float32))
+        np.maximum.at(top_z, cells, z.astype(np.float32))
 
 
 def _transformed(T: Any, points: Any, out: Any) -> None:

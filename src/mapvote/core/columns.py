@@ -62,25 +62,32 @@ def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
     return bit, z - np.where(np.isnan(ground_z), base * CELL_SIZE, ground_z) >= GROUND_MARGIN_M
 
 
-def mark_obstacles(words: U64, points: F32, window: Grid, outer: Grid, ground_z: F32, base: I32) -> None:
+def mark_obstacles(
+    words: U64, points: F32, window: Grid, outer: Grid, ground_z: F32, base: I32,
+    measures: tuple[I32, F32, F32] | None = None,
+) -> None:  # fmt: skip
     """Enter the points (n, 3), metres from the corner of ``window``, that are obstacles into the column ``words`` of
-    ``outer``, by the rule of :func:`column_bits`; ``ground_z``, ``base``, both of ``outer``. Points outside it are left
-    out; those inside lie in the cells of :func:`flat_cells`."""
+    ``outer``, by the rule of :func:`column_bits`; ``ground_z``, ``base``: of ``outer``. Points outside it are left out;
+    those inside lie in the cells of :func:`flat_cells`. ``measures``: of the obstacles of each cell how many there are,
+    the height of the lowest and of the highest; they are kept up, too."""
+    counts, bottom_z, top_z = measures or (np.empty((0, 0), np.int32), *np.empty((2, 0, 0), np.float32))
     corner = window.x0, window.y0, float(window.lattice.x0), float(window.lattice.y0)
     place = window.row0, window.col0, window.rows, window.cols, window.row0 - outer.row0, window.col0 - outer.col0
-    _mark_obstacles(words, read_only(points), corner, place, read_only(ground_z), read_only(base))
+    cloud = read_only(np.ascontiguousarray(points))
+    _mark_obstacles(words, cloud, corner, place, read_only(ground_z), read_only(base), counts, bottom_z, top_z)
 
 
 @kernel
 def _mark_obstacles(
     words: U64, points: F32, corner: tuple[float, float, float, float], place: tuple[int, int, int, int, int, int],
-    ground_z: F32, base: I32,
+    ground_z: F32, base: I32, counts: I32, bottom_z: F32, top_z: F32,
 ) -> None:  # fmt: skip
     """``corner``: x and y of the window's and of the lattice's. ``place``: the window's first row and column, how many
     it has, and how far up and to the right it begins in the planes (rows, cols)."""
     x0, y0, lattice_x0, lattice_y0 = corner
     row0, col0, height, width, up, right = place
     rows, cols = words.shape
+    measured = len(counts) > 0
     for i in range(len(points)):
         row = int(np.floor((np.float64(points[i, 1]) + y0 - lattice_y0) / CELL_SIZE)) - row0
         col = int(np.floor((np.float64(points[i, 0]) + x0 - lattice_x0) / CELL_SIZE)) - col0
@@ -89,26 +96,13 @@ def _mark_obstacles(
         if r < 0 or c < 0 or r >= rows or c >= cols:
             continue
         z = np.float64(points[i, 2])
-        if height_above(z, ground_z[r, c], base[r, c]) >= GROUND_MARGIN_M:
-            words[r, c] |= np.uint64(1) << np.uint64(column_bit(z, base[r, c]))
-
-
-@kernel
-def fill_columns(
-    rows: I64, cols: I64, z: F64, ground_z: F32, base: I32, words: U64, counts: I32, bottom_z: F32, top_z: F32
-) -> None:
-    """Enter points (cell indices inside the window, z in map metres) that are obstacles into the planes, in place."""
-    for i in range(len(z)):
-        r = rows[i]
-        c = cols[i]
-        if r < 0 or c < 0 or r >= words.shape[0] or c >= words.shape[1]:
+        if height_above(z, ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
             continue
-        if height_above(z[i], ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
-            continue
-        words[r, c] |= np.uint64(1) << np.uint64(column_bit(z[i], base[r, c]))
-        counts[r, c] += 1
-        bottom_z[r, c] = min(bottom_z[r, c], z[i])
-        top_z[r, c] = max(top_z[r, c], z[i])
+        words[r, c] |= np.uint64(1) << np.uint64(column_bit(z, base[r, c]))
+        if measured:
+            counts[r, c] += 1
+            bottom_z[r, c] = min(bottom_z[r, c], z)
+            top_z[r, c] = max(top_z[r, c], z)
 
 
 def rebased(words: U64, layers: I32) -> U64:
@@ -187,16 +181,28 @@ def fill_base(ground_z: F32, base: I32, band_rows: int, low: F64) -> Iterator[No
     slope = 0.02 * CELL_SIZE
     bands = [(first, min(first + band_rows, rows)) for first in range(0, rows, band_rows)]
     for first, end in bands:
-        np.fmin(ground_z[first:end], np.inf, out=low[first:end])
-        lower_rows(low, first, end, 1, slope, slope * np.sqrt(2.0))
+        _fill_rows(read_only(ground_z), first, end, 1, slope, low, base)
         yield
     for first, end in reversed(bands):
-        lower_rows(low, end - 1, first - 1, -1, slope, slope * np.sqrt(2.0))
-        own = ground_z[first:end]
-        layers = np.where(np.isfinite(own), own, low[first:end])
-        layers /= CELL_SIZE
-        base[first:end] = np.floor(layers, out=layers)
+        _fill_rows(read_only(ground_z), end - 1, first - 1, -1, slope, low, base)
         yield
+
+
+@kernel
+def _fill_rows(ground_z: F32, first: int, end: int, step: int, slope: float, low: F64, base: I32) -> None:
+    """The rows of a band, see :func:`lower_rows`: downwards into ``low`` alone, upwards into ``base`` too."""
+    cols = ground_z.shape[1]
+    for r in range(first, end, step):
+        own = ground_z[r]
+        row = low[r]
+        if step > 0:
+            for c in range(np.uint64(0), np.uint64(cols)):
+                row[c] = np.inf if np.isnan(own[c]) else np.float64(own[c])
+        lower_rows(low, r, r + step, step, slope, slope * np.sqrt(2.0))
+        if step < 0:
+            layers = base[r]
+            for c in range(np.uint64(0), np.uint64(cols)):
+                layers[c] = np.int32(np.floor((np.float64(own[c]) if np.isfinite(own[c]) else row[c]) / CELL_SIZE))
 
 
 def lower_envelope(z: F64, straight: float, diagonal: float) -> None:
@@ -211,19 +217,16 @@ def lower_rows(z: F64, first: int, end: int, step: int, straight: float, diagona
     """One pass of :func:`lower_envelope` over the rows from ``first`` to before ``end``: downwards with ``step`` 1,
     upwards with -1. Each row is lowered by the row that the pass came from, then from cell to cell."""
     rows, cols = z.shape
+    last = np.uint64(cols - 1)
     for r in range(first, end, step):
-        if 0 <= r - step < rows:
-            # No cell depends on another here, so that the loops vectorise.
-            row = z[r]
-            beside = z[r - step]
-            for c in range(cols):
-                row[c] = min(row[c], beside[c] + straight)
-            for c in range(cols - 1):
-                row[c] = min(row[c], beside[c + 1] + diagonal)
-                row[c + 1] = min(row[c + 1], beside[c] + diagonal)
         row = z[r]
+        beside = z[r - step] if 0 <= r - step < rows else row  # a row beside itself lowers nothing
         lowest = np.inf
         for k in range(cols):
             at = np.uint64(k if step > 0 else cols - 1 - k)
-            lowest = min(row[at], lowest + straight)
+            left = at - np.uint64(at > np.uint64(0))
+            right = at + np.uint64(at < last)
+            low = min(row[at], beside[at] + straight)
+            low = min(low, min(beside[left], beside[right]) + diagonal)
+            lowest = min(low, lowest + straight)
             row[at] = lowest

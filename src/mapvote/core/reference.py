@@ -8,12 +8,12 @@ from itertools import islice, repeat
 
 import numpy as np
 
-from mapvote.core.columns import fill_base, fill_columns, flat_cells, mark_obstacles
+from mapvote.core.columns import fill_base, mark_obstacles
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.groups import widened
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, U64, Reference
+from mapvote.core.types import F64, U64, Reference
 
 Layout = Iterator[Reference | None]
 """The planes of a window on their way: each step takes a few milliseconds at most, the last one gives them."""
@@ -29,8 +29,6 @@ class LayoutSteps:
     cells: int = 2
     """Cells that the vehicle drives for each step after the first of a scan. A layout has 30 to 100 steps, more where
     more tiles lie around."""
-    points: int = 4096
-    """Points of a tile that are entered at once: what is worked out of them stays in the processor's cache."""
 
 
 LAYOUT_STEPS = LayoutSteps()
@@ -81,27 +79,11 @@ def _laid_out(point_map: PointMap, grid: Grid, steps: LayoutSteps, measured: boo
     planes = Reference(grid, ground_z, base, occupied, none, low, high, free_words)
     if measured:
         planes = replace(planes, counts=none.copy(), bottom_z=low.copy(), top_z=high.copy())
+    measures = (planes.counts, planes.bottom_z, planes.top_z) if measured else None
     for tile in tiles:
         yield None
-        for first in range(0, len(tile.points), steps.points):
-            _enter_points(tile.points[first : first + steps.points], tile.window, planes, measured)
+        mark_obstacles(occupied, tile.points, tile.window, grid, ground_z, base, measures)
     yield planes
-
-
-def _enter_points(points: F32, window: Grid, planes: Reference, measured: bool) -> None:
-    """Enter points (n, 3) of a tile's ``window`` that are obstacles; ``measured``: how many and how high, too."""
-    grid = planes.grid
-    if not measured:
-        mark_obstacles(planes.occupied, points, window, grid, planes.ground_z, planes.base)
-        return
-    cells = flat_cells(window, points)
-    rows = cells >> (TILE_CELLS.bit_length() - 1)  # numpy takes longer to divide
-    cols = cells & (TILE_CELLS - 1)
-    rows += window.row0 - grid.row0
-    cols += window.col0 - grid.col0
-    measures = planes.counts, planes.bottom_z, planes.top_z
-    z = points[:, 2].astype(np.float64)
-    fill_columns(rows, cols, z, planes.ground_z, planes.base, planes.occupied, *measures)
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
