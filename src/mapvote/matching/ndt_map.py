@@ -235,14 +235,19 @@ def tiles_within(point_map: PointMap, position: F64, half_m: float = NDT_WINDOW.
 
 def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
     """The voxels of all points of a tile, in one piece for each slab of height."""
-    points = tile.points_map
     pieces = []
-    slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
-    for height in np.unique(slab):
-        piece = points.compress(slab == height, axis=0)
+    for piece in _slabs(tile.points_map):
         low, high = np.floor(corners(piece) / level.voxel_m).astype(np.int64)
         grid = NdtGrid(level, window_of(high - low + 1, low, level.voxel_m))
         grid.enter(piece)
         place, sums, cells = grid.voxels
         pieces.append(Voxels(place[: grid.n].copy(), sums[: grid.n].copy(), cells[: grid.n].copy()))
     return pieces
+
+
+def _slabs(points: F64) -> list[F64]:
+    """Points (n, 3), one slab of height after the other. Most tiles have one: to sort and copy it would be a waste."""
+    slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
+    if len(slab) and slab.min() == slab.max():
+        return [points]
+    return [points.compress(slab == height, axis=0) for height in np.unique(slab)]

@@ -382,10 +382,12 @@ class NdtGrid:
                 np.concatenate([sums[: self.n], more.sums]),
                 np.concatenate([cells[: self.n], more.cells]),
             )
+        shared = np.empty(room - self.n, dtype=np.int64)
+        n_shared = 0
         for part in others:
-            shared = np.empty(len(part.place), dtype=np.int64)
-            self.n, n_shared = join_voxels(part, self.window, self._voxels, self.n, shared)
-            self._refresh(shared[:n_shared])
+            self.n, more_shared = join_voxels(part, self.window, self._voxels, self.n, shared[n_shared:])
+            n_shared += more_shared
+        self._refresh(shared[:n_shared])
 
 
 def _room_for(n: int) -> Voxels:
