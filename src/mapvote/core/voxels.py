@@ -49,28 +49,34 @@ def slot_of(key: np.int64, table: I64) -> np.uint64:
 
 
 @kernel
-def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> np.int64:
+def _group(keys: I64, table: I32, of: I32, first: I64) -> np.int64:
     """Number equal keys (n,) > 0 in the order in which they come; a key of 0 belongs to none.
 
     Returns how many there are, with ``of`` (n,) the number of each key, -1 for 0, and in ``first`` (n,) the index of
-    the first of each; or -1 if they would fill more than half of ``table`` (2^k,), which holds zeros. ``place`` (2^k,):
-    scratch.
+    the first of each; or -1 if they would fill more than half of ``table`` (2^k,), which holds zeros. A slot of it that
+    is taken holds 1 + the index of the first key that belongs there: half as much memory as the key itself.
     """
     m = np.uint64(0)
     most = np.uint64(len(table) // 2)
+    mask = np.uint64(len(table) - 1)
     for i in range(np.uint64(0), np.uint64(len(keys))):
+        key = keys[i]
         of[i] = -1
-        if keys[i] == 0:
+        if key == 0:
             continue
-        slot = slot_of(keys[i], table)
+        h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)  # as slot_of
+        slot = (h ^ (h >> np.uint64(32))) & mask
+        while table[slot] != 0 and keys[np.uint64(table[slot] - 1)] != key:
+            slot = (slot + np.uint64(1)) & mask
         if table[slot] == 0:
             if m >= most:
                 return np.int64(-1)
-            table[slot] = keys[i]
-            place[slot] = np.int32(m)
+            table[slot] = np.int32(i + np.uint64(1))
+            of[i] = np.int32(m)
             first[m] = i
             m += np.uint64(1)
-        of[i] = place[slot]
+        else:
+            of[i] = of[np.uint64(table[slot] - 1)]
     return np.int64(m)
 
 
@@ -79,7 +85,7 @@ def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
     of = np.empty(len(keys), dtype=np.int32)
     first = np.empty(len(keys), dtype=np.int64)
     while True:
-        m = _group(keys, np.zeros(slots, dtype=np.int64), np.empty(slots, dtype=np.int32), of, first)
+        m = _group(keys, np.zeros(slots, dtype=np.int32), of, first)
         if m >= 0:
             return of, first[:m]
         slots *= 4
