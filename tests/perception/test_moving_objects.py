@@ -24,7 +24,7 @@ from mapvote.perception.moving_objects import (
     Pixels,
     Samples,
     look,
-    moving_components,
+    mark_components,
     range_image,
     room_to_look,
     voxels,
@@ -206,7 +206,11 @@ def test_cells_move_by_components_as_scipy_labels_them(seed: int) -> None:
         moves |= ((moving >= 4) & (moving >= share * total))[label] & (label > 0)
         wanted = ~moves & (2 * n_brief >= n_seen)
     plane = np.full((SIDE, SIDE), -1, np.int32)
-    np.testing.assert_array_equal(moving_components(place, plane, seen, brief, 4, 0.5, 0.6), moves[of])
+    voxel_of, chosen = rng.integers(0, len(place), 200).astype(np.int32), rng.permutation(300)[:200].astype(np.int32)
+    expected, out = np.zeros(300, np.bool_), np.zeros(300, np.bool_)
+    expected[chosen] = moves[of][voxel_of]
+    mark_components(place.astype(np.int32), plane, seen, brief, (4, 0.5, 0.6), (voxel_of, chosen), out)
+    np.testing.assert_array_equal(out, expected)
     assert (plane == -1).all()
     assert 0 < moves.sum() < len(moves)
 

@@ -449,16 +449,15 @@ class MovingFilter:
             rule = movers.margin_m, movers.height_m, movers.enough
             look(waiting, m, self._images, slots, sensors, self._pixels, rule, observed, room_to_look(m))
         # Which voxels were brief, and the cell of each in a square around the sensor.
-        place = np.empty(m, np.int64)
+        place = np.empty(m, np.int32)
         seen_often = np.empty(m, np.bool_)
         brief = np.empty(m, np.bool_)
         bounds = movers.min_free, movers.free_share
         _weigh(scan.samples, scan.origin_map, self._half, observed, bounds, place, seen_often, brief)
         # Connected cells move together.
-        shares = movers.share_whole, movers.share_part
-        moves = moving_components(place, self._plane, seen_often, brief, movers.min_voxels, *shares)
         moving = np.zeros(scan.points, np.bool_)
-        moving[scan.chosen.take(np.flatnonzero(moves.take(scan.voxel_of)))] = True
+        shares = movers.min_voxels, movers.share_whole, movers.share_part
+        mark_components(place, self._plane, seen_often, brief, shares, (scan.voxel_of, scan.chosen), moving)
         return moving
 
     def _witnesses(self, at: int) -> list[_Scan]:
@@ -481,7 +480,7 @@ def _spread(scans: list[_Scan], count: int) -> list[_Scan]:
 
 @kernel
 def _weigh(
-    samples: F32, origin: F64, half: int, observed: I32, bounds: tuple[int, float], place: I64, seen: Bool,
+    samples: F32, origin: F64, half: int, observed: I32, bounds: tuple[int, float], place: I32, seen: Bool,
     brief: Bool,
 ) -> None:  # fmt: skip
     """For each of ``samples`` (3, m) from ``origin``: its cell in the square of ``half`` cells to each side, whether
@@ -541,16 +540,16 @@ def voxels(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float) ->
 
 
 @inlined
-def _flood(cells: I64, n: int, wanted: I64, seeds: I64, side: int, plane: I32, label: I64, stack: I64) -> None:
-    """Label of each of n cells by 8-connected component of the wanted ones, from 0; negative for the unwanted, and
-    where no cell of a component is among the ``seeds``.
+def _flood(cells: I32, n: int, state: I32, seeds: I32, side: int, plane: I32, label: I32, stack: I32) -> None:
+    """Label of each of n cells by 8-connected component of those whose ``state`` is 1, from 0; negative for others,
+    and where no cell of a component is among the ``seeds``.
 
     ``cells`` (n,) are distinct indices row * side + col with 0 < row, col < side - 1; ``plane`` (side * side,) the
     place of each cell in them, -1 elsewhere. ``stack`` (n,): scratch.
     """
     open_, shut = -1, -2
     for k in range(np.uint64(0), np.uint64(n)):
-        label[k] = open_ if wanted[k] != 0 else shut
+        label[k] = open_ if state[k] == 1 else shut
     count = 0
     for seed in range(np.uint64(0), np.uint64(n)):
         if seeds[seed] == 0 or label[seed] != open_:
@@ -574,11 +573,12 @@ def _flood(cells: I64, n: int, wanted: I64, seeds: I64, side: int, plane: I32, l
 
 @kernel
 def _components(
-    place: I64, side: int, seen: Bool, brief: Bool, min_voxels: int, share_whole: float, share_part: float, plane: I32,
-    work: I64, out: Bool,
+    place: I32, side: int, seen: Bool, brief: Bool, shares: tuple[int, float, float], plane: I32, work: I32,
+    points: tuple[I32, I32], out: Bool,
 ) -> None:  # fmt: skip
-    """Into ``out`` (m,) which voxels move, see :func:`moving_components`; ``work`` (9, m): scratch, ``plane``
-    (side * side,): scratch that holds -1, and does so again afterwards."""
+    """:func:`mark_components`; ``work`` (9, m): scratch, ``plane`` flat."""
+    min_voxels, share_whole, share_part = shares
+    static, open_, moves = 0, 1, 2
     cells = work[0]
     cell_of = work[1]
     n_seen = work[2]
@@ -587,57 +587,56 @@ def _components(
     moving = work[5]
     label = work[6]
     stack = work[7]
-    wanted = work[8]
+    state = work[8]
     n = 0
-    for i in range(len(place)):
-        at = place[i]
+    for i in range(np.uint64(0), np.uint64(len(place))):
+        at = np.uint64(place[i])
         if plane[at] < 0:
             plane[at] = n
-            cells[n] = at
+            cells[n] = place[i]
             n_seen[n] = 0
             n_brief[n] = 0
-            wanted[n] = 1
+            state[n] = open_
             n += 1
-        k = plane[at]
-        cell_of[i] = k
-        n_seen[k] += seen[i]
-        n_brief[k] += brief[i]
-        out[i] = False
+        own = np.uint64(plane[at])
+        cell_of[i] = plane[at]
+        n_seen[own] += seen[i]
+        n_brief[own] += brief[i]
     for pass_ in range(2):
         share = share_whole if pass_ == 0 else share_part
-        _flood(cells, n, wanted, n_brief, side, plane, label, stack)  # nothing moves without brief voxels
+        _flood(cells, n, state, n_brief, side, plane, label, stack)  # nothing moves without brief voxels
         for k in range(n):
             total[k] = moving[k] = 0
         for k in range(n):
             if label[k] >= 0:
                 total[label[k]] += n_seen[k]
                 moving[label[k]] += n_brief[k]
-        for k in range(n):  # 2: moves, and is flooded no more
+        for k in range(n):
             c = label[k]
             if c >= 0 and moving[c] >= min_voxels and moving[c] >= share * total[c]:
-                stack[k] = 2
-            else:
-                stack[k] = 0
-        for i in range(len(place)):
-            out[i] |= stack[cell_of[i]] == 2
-        for k in range(n):
-            wanted[k] = 1 if stack[k] == 0 and 2 * n_brief[k] >= n_seen[k] else 0
+                state[k] = moves
+            elif state[k] != moves:
+                state[k] = open_ if 2 * n_brief[k] >= n_seen[k] else static
     for k in range(n):
-        plane[cells[k]] = -1
+        plane[np.uint64(cells[k])] = -1
+    voxel_of, chosen = points
+    for j in range(np.uint64(0), np.uint64(len(chosen))):
+        out[np.uint64(chosen[j])] = state[np.uint64(cell_of[np.uint64(voxel_of[j])])] == moves
 
 
-def moving_components(
-    place: I64, plane: I32, seen: Bool, brief: Bool, min_voxels: int, share_whole: float, share_part: float
-) -> Bool:
-    """Which voxels move (m,), from which were decidable (``seen``) and occupied only briefly (``brief``).
+def mark_components(
+    place: I32, plane: I32, seen: Bool, brief: Bool, shares: tuple[int, float, float], points: tuple[I32, I32],
+    out: Bool,
+) -> None:  # fmt: skip
+    """Enter into ``out`` (n,) which points move, from which of their voxels (m,) were decidable (``seen``) and occupied
+    only briefly (``brief``). ``points``: the voxel of each point (k,), and which of all points it is.
 
-    ``place`` (m,): the cell of each, row * side + col with 0 < row, col < side - 1. ``plane`` (side, side): scratch
-    that holds -1, and does so again afterwards. Connected cells move together: a
-    component of the plane moves as a whole if at least ``share_whole`` of its decidable voxels were brief, and
-    ``min_voxels`` of them. Where a mover touches something static, the component splits at the cells that are mostly
-    static, and each remaining part moves if at least ``share_part`` of it was brief.
+    ``place`` (m,): the cell of each voxel, row * side + col with 0 < row, col < side - 1. ``plane`` (side, side):
+    scratch that holds -1, and does so again afterwards. ``shares``: min_voxels, share_whole and share_part of
+    :class:`Movers`. Connected cells move together: a component of the plane moves as a whole if at least
+    ``share_whole`` of its decidable voxels were brief, and ``min_voxels`` of them. Where a mover touches something
+    static, the component splits at the cells that are mostly static, and each remaining part moves if at least
+    ``share_part`` of it was brief.
     """
-    out = np.empty(len(place), dtype=np.bool_)
-    work = np.empty((9, len(place)), dtype=np.int64)
-    _components(place, len(plane), seen, brief, min_voxels, share_whole, share_part, plane.reshape(-1), work, out)
-    return out
+    work = np.empty((9, len(place)), dtype=np.int32)
+    _components(place, len(plane), seen, brief, shares, plane.reshape(-1), work, points, out)
