@@ -10,6 +10,7 @@ Hardly any other ray passes above a house that was pulled down, or where one was
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -217,17 +218,23 @@ def _highest(rays: Rays, lean: F64, slopes: F32, top: F32, count: I32) -> None:
 
 @kernel
 def _rise(
-    top: F32, edge: F32, slopes: F32, lean: F64, casting: tuple[I32, F32, F32], out: tuple[F32, F32, F32, I32]
+    returned: tuple[F32, I32, float], edge: F32, slopes: F32, lean: F64, casting: tuple[I32, F32, F32],
+    out: tuple[F32, F32, F32, I32],
 ) -> int:  # fmt: skip
-    """Enter into the first of ``out`` (x, y, slope, fan) the rays of the beams, of ascending ``slopes``, between
-    ``top`` and ``edge`` (SKY_SECTORS,) of each fan that casts; returns how many. ``casting``: the numbers of these fans
-    and their directions x and y."""
+    """Enter into the first of ``out`` (x, y, slope, fan) the rays of the beams, of ascending ``slopes``, between the
+    highest returns and ``edge`` (SKY_SECTORS,) of each fan that casts; returns how many. ``returned``: the slope of the
+    highest return of each sector (SKY_SECTORS,), how many came, and how many must have come there and to both sides.
+    ``casting``: the numbers of these fans and their directions x and y."""
+    top, count, least = returned
     fans, along_x, along_y = casting
     x, y, slope, fan = out
     n = 0
     for f in range(len(fans)):
         s = fans[f] // (FANS // SKY_SECTORS)
-        most = max(top[s], max(top[s - 1], top[(s + 1) % SKY_SECTORS]))
+        left = (s + 1) % SKY_SECTORS
+        if min(count[s], min(count[s - 1], count[left])) < least:
+            continue
+        most = max(top[s], max(top[s - 1], top[left]))
         first = 0
         while first < len(slopes) and slopes[first] <= most:
             first += 1
@@ -263,22 +270,31 @@ class Sky:
         azimuth = (self._fan + 0.5) * 2.0 * np.pi / FANS
         self._x = np.cos(azimuth).astype(np.float32)
         self._y = np.sin(azimuth).astype(np.float32)
+        self._far = np.full(len(self._fan) * len(beams), np.float32(rule.follow_m))
+        """Where rays into the sky end: as many as there can be."""
 
     def rays(self, up_map: F64, forward_map: F64, rays: Rays) -> Rays:
         """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the axis that the
         sensor turns about, in their frame; it may point down, and lean by up to 30 deg. A sensor that leans by more
         gets no ray into the sky: its beams are no cones about the vertical. ``forward_map`` (3,): its x axis."""
-        if abs(up_map[2]) < self._rule.min_upright * np.linalg.norm(up_map):
-            nowhere = np.full(SKY_SECTORS, np.inf, np.float32)
-            return self._above_returns(nowhere, nowhere, np.zeros(0, np.float32), np.zeros(2))
-        lean = up_map[:2] / up_map[2]
+        x, y, z = up_map.tolist()
+        if abs(z) < self._rule.min_upright * math.sqrt(x * x + y * y + z * z):
+            none, no_fan = self._far[:0], self._fan[:0]
+            return Rays(none, none, none, none, none, no_fan)
+        lean = up_map[:2] / z
         top = np.full(SKY_SECTORS, -np.inf, np.float32)
         count = np.zeros(SKY_SECTORS, np.int32)
         _highest(rays, lean, np.empty(len(rays.reach), np.float32), top, count)
         edge = self._edge_seen(top, forward_map)
-        return self._above_returns(
-            np.where(count < self._least, np.inf, top), edge, self._slopes[up_map[2] > 0.0], lean
-        )
+        # Rays of the beams above the highest returns of their sector and its neighbours, and below the edge.
+        slopes = self._slopes[z > 0.0]
+        most = len(self._far)
+        along_x, along_y, slope = np.empty((3, most), np.float32)
+        fan = np.empty(most, np.int32)
+        casting = self._fan, self._x, self._y
+        n = _rise((top, count, self._least), edge, slopes, lean, casting, (along_x, along_y, slope, fan))
+        far = self._far[:n]
+        return Rays(far, along_x[:n], along_y[:n], slope[:n], far, fan[:n])
 
     def _edge_seen(self, top: F32, forward_map: F64) -> F32:
         """(SKY_SECTORS,) slope up to which the sensor fires in each sector of the map, after one more scan with its
@@ -289,14 +305,3 @@ class Sky:
         np.maximum(self._edge, np.roll(top, -turned), out=self._edge)
         edge = np.roll(self._edge, turned)
         return np.minimum(edge, np.minimum(np.roll(edge, 1), np.roll(edge, -1)))
-
-    def _above_returns(self, top: F32, edge: F32, slopes: F32, lean: F64) -> Rays:
-        """Rays of the beams, of ascending ``slopes`` (beams,), that lie above the highest returns ``top`` of their
-        sector and its neighbours and below the ``edge`` of the field of view, (SKY_SECTORS,) each."""
-        most = len(self._fan) * len(slopes)
-        x, y, slope = np.empty((3, most), np.float32)
-        fan = np.empty(most, np.int32)
-        casting = self._fan, self._x, self._y
-        n = _rise(top.astype(np.float32), edge, slopes, lean, casting, (x, y, slope, fan))
-        far = np.full(n, np.float32(self._rule.follow_m))
-        return Rays(far, x[:n], y[:n], slope[:n], far, fan[:n])
