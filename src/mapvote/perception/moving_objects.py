@@ -318,24 +318,14 @@ class ImageRoom:
 IMAGE_ROOM = ImageRoom()
 
 
-class _Image(NamedTuple):
-    """The ranges that one LiDAR measured."""
-
-    origin_map: F64
-    """(3,) where its rays begin, map metres."""
-    slot: int
-    """Its place among the filter's images: horizontal range of the nearest return around each direction, see
-    ``range_image``."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Scan:
     """One scan in the window."""
 
     stamp_ns: int
     origin_map: F64
-    images: tuple[_Image, ...]
-    """One for each LiDAR of a sweep."""
+    slots: list[int]
+    """The places of its images among the filter's: one for each LiDAR of a sweep."""
     points: int
     """How many points it has."""
     chosen: I32
@@ -365,8 +355,12 @@ class MovingFilter:
         """Cells from the sensor to the sides of the square in which voxels are grouped, which ``_plane`` is of."""
         self._plane = np.full((2 * self._half + 1,) * 2, -1, dtype=np.int32)
         self._images = np.empty((IMAGE_ROOM.first, turns * slopes), np.uint16)
-        """Those of the window, in any order: one kernel reads many."""
+        """Those of the window, in any order: one kernel reads many. Horizontal range of the nearest return around each
+        direction, see :func:`range_image`."""
+        self._origins_map = np.empty((IMAGE_ROOM.first, 3))
+        """Where the rays of each image begin, map metres."""
         self._free_slots = list(range(IMAGE_ROOM.first))
+        self._room = room_to_look(0)
         self._window: deque[_Scan] = deque()
         self._waiting = 0
         """How many of the window's youngest scans are undecided."""
@@ -385,9 +379,9 @@ class MovingFilter:
         if self._window and stamp_ns <= self._window[-1].stamp_ns:
             raise ValueError(f"stamps must increase: {stamp_ns} after {self._window[-1].stamp_ns}")
         origin = np.asarray(origin_map, dtype=np.float64)
-        images = tuple(_Image(one.origin_map(origin), self._drawn(one.own_rows(rows))) for one in lidars)
+        slots = [self._drawn(one.own_rows(rows), one.origin_map(origin)) for one in lidars]
         chosen, voxel_of, samples = voxels(rows, obstacle, origin, self.movers.reach_m, CELL_SIZE)
-        self._window.append(_Scan(stamp_ns, origin, images, len(obstacle), chosen, voxel_of, samples))
+        self._window.append(_Scan(stamp_ns, origin, slots, len(obstacle), chosen, voxel_of, samples))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
@@ -404,20 +398,21 @@ class MovingFilter:
             self._drop(self._window.pop())
         self._waiting -= count
 
-    def _drawn(self, rows: F32) -> int:
-        """The slot of a new image of returns (3, n)."""
+    def _drawn(self, rows: F32, origin_map: F64) -> int:
+        """The slot of a new image of returns (3, n), which were measured from ``origin_map`` (3,)."""
         if not self._free_slots:
-            before = self._images
-            self._images = np.empty((2 * len(before), before.shape[1]), np.uint16)
-            self._images[: len(before)] = before
-            self._free_slots += range(len(before), len(self._images))
+            before = len(self._images)
+            self._images = np.concatenate([self._images, np.empty_like(self._images)])
+            self._origins_map = np.concatenate([self._origins_map, np.empty_like(self._origins_map)])
+            self._free_slots += range(before, 2 * before)
         slot = self._free_slots.pop()
+        self._origins_map[slot] = origin_map
         range_image(rows, self._pixels, self._images[slot].reshape(self._pixels.turns, -1))
         return slot
 
     def _drop(self, scan: _Scan) -> None:
         """No later scan will ask this one."""
-        self._free_slots += [image.slot for image in scan.images]
+        self._free_slots += scan.slots
 
     def _decide(self, up_to_ns: int) -> list[Bool]:
         """Masks of all waiting scans not younger than ``up_to_ns``; forgets what no later scan will ask for."""
@@ -442,12 +437,12 @@ class MovingFilter:
         x, y, z = scan.samples.copy()
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         # Each of the other scans counts what it saw at the samples.
-        others = [image for other in self._witnesses(at) for image in other.images]
-        if others:
-            sensors = (np.array([image.origin_map for image in others]) - scan.origin_map).astype(np.float32)
-            slots = np.array([image.slot for image in others])
-            rule = movers.margin_m, movers.height_m, movers.enough
-            look(waiting, m, self._images, slots, sensors, self._pixels, rule, observed, room_to_look(m))
+        slots = np.array([slot for other in self._witnesses(at) for slot in other.slots], np.int64)
+        sensors = (self._origins_map.take(slots, axis=0) - scan.origin_map).astype(np.float32)
+        rule = movers.margin_m, movers.height_m, movers.enough
+        if m > len(self._room.waits):
+            self._room = room_to_look(2 * m)
+        look(waiting, m, self._images, slots, sensors, self._pixels, rule, observed, self._room)
         # Which voxels were brief, and the cell of each in a square around the sensor.
         place = np.empty(m, np.int32)
         seen_often = np.empty(m, np.bool_)
