@@ -97,10 +97,16 @@ class VoxelCounts:
         words = tuple(one.words for one in scans)
         first = band * TILE_CELLS // self.AT_ONCE
         last = first + TILE_CELLS // self.AT_ONCE
-        for tile in dict.fromkeys(tile for one in scans for tile in one.parts):
-            parts = tuple(one.parts.get(tile, Overlap(0, 0, 0, 0, 0, 0)) for one in scans)
-            if any(part.row + part.down < last and part.end_row + part.down > first for part in parts):
-                _enter_scans(self._tiles.near(tile), first, last, parts, words, self._row)
+        nowhere = Overlap(0, 0, 0, 0, 0, 0)
+        reached = (
+            tile
+            for one in scans
+            for tile, part in one.parts.items()
+            if part.row + part.down < last and part.end_row + part.down > first
+        )
+        for tile in dict.fromkeys(reached):
+            parts = tuple(one.parts.get(tile, nowhere) for one in scans)
+            _enter_scans(self._tiles.near(tile), first, last, parts, words, self._row)
 
 
 @inlined
