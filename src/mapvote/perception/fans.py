@@ -8,6 +8,7 @@ The work for each ray is inlined: a call would pass five arrays, member by membe
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -321,9 +322,11 @@ def _enter(crossed: Crossed, n: np.int64, passed: U64) -> None:
         crossed.low[j] = crossed.high[j] = 0
 
 
-def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
-    """Take every fan from where it marks to the end of its rays, and enter what they pass into ``passed`` (flat)."""
-    _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, _room_for(sum(base.shape) + 1))
+def mark_passed(every: Iterable[Fans], origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
+    """Take each fan from where it marks to the end of its rays, and enter what they pass into ``passed`` (flat)."""
+    room = _room_for(sum(base.shape) + 1)
+    for fans in every:
+        _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, room)
 
 
 @kernel
