@@ -15,7 +15,6 @@ from mapvote.core.geometry import corners
 from mapvote.core.grid import TILE_CELLS, TileIndex, window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.record import record
-from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Bool, PosePrior, Registration
 from mapvote.matching.matcher import CONVERGENCE
 from mapvote.matching.ndt import Room, align, arrange, expect, likelihoods, room_for
@@ -173,6 +172,8 @@ class MapWindow:
         """By tile, by level."""
         self._all_ready: list[TileIndex] | None = None
         """Tiles of a square around the vehicle, of which every one in the map is ready."""
+        self._begun: tuple[TileIndex, list[F64]] | None = None
+        """A tile of which not every level is ready, and its points: they are read once for all levels."""
 
     def __call__(self, position: F64) -> NdtMap:
         if self.ndt_map is None or not self.ndt_map.is_central(position):
@@ -187,6 +188,7 @@ class MapWindow:
         same = {tile for tile in self._ready if old.tiles.get(tile) is point_map.tiles.get(tile)}
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in same}
         self._all_ready = None
+        self._begun = None
 
     def prepare(self, position: F64) -> None:
         """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
@@ -207,8 +209,12 @@ class MapWindow:
 
     def _step(self, tile: TileIndex) -> None:
         """One more level of a tile."""
+        if self._begun is None or self._begun[0] != tile:
+            self._begun = tile, _slabs(self.point_map.tiles[tile].points_map)
         ready = self._ready.setdefault(tile, [])
-        ready.append(_voxels_of(self.point_map.tiles[tile], self.levels[len(ready)]))
+        ready.append([_voxels_of(slab, self.levels[len(ready)]) for slab in self._begun[1]])
+        if self._is_ready(tile):
+            self._begun = None
 
     def _laid_out(self, position: F64) -> NdtMap:
         kept = set(tiles_within(self.point_map, position, NDT_WINDOW.kept_m))
@@ -233,21 +239,19 @@ def tiles_within(point_map: PointMap, position: F64, half_m: float = NDT_WINDOW.
     return [tile for tile in window.tiles() if tile in point_map.tiles]
 
 
-def _voxels_of(tile: Tile, level: Level) -> list[Voxels]:
-    """The voxels of all points of a tile, in one piece for each slab of height."""
-    pieces = []
-    for piece in _slabs(tile.points_map):
-        low, high = np.floor(corners(piece) / level.voxel_m).astype(np.int64)
-        grid = NdtGrid(level, window_of(high - low + 1, low, level.voxel_m))
-        grid.enter(piece)
-        place, sums, cells = grid.voxels
-        pieces.append(Voxels(place[: grid.n].copy(), sums[: grid.n].copy(), cells[: grid.n].copy()))
-    return pieces
-
-
 def _slabs(points: F64) -> list[F64]:
-    """Points (n, 3), one slab of height after the other. Most tiles have one: to sort and copy it would be a waste."""
+    """The points (n, 3) of a tile, slab of height by slab. Most have one: to sort and copy it would be a waste."""
     slab = np.floor(points[:, 2] / NDT_WINDOW.slab_m)
     if len(slab) and slab.min() == slab.max():
         return [points]
     return [points.compress(slab == height, axis=0) for height in np.unique(slab)]
+
+
+def _voxels_of(points: F64, level: Level) -> Voxels:
+    """The voxels of points (n, 3)."""
+    low, high = np.floor(corners(points) / level.voxel_m).astype(np.int64)
+    room = 1024 + len(points) // 8  # more than a street has in voxels of a metre
+    grid = NdtGrid(level, window_of(high - low + 1, low, level.voxel_m), room)
+    grid.enter(points)
+    place, sums, cells = grid.voxels
+    return Voxels(place[: grid.n].copy(), sums[: grid.n].copy(), cells[: grid.n].copy())

@@ -327,11 +327,12 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
 class NdtGrid:
     """One level of the map: voxels of one size. All are kept; those inside the window can be found."""
 
-    def __init__(self, level: Level, window: Window) -> None:
+    def __init__(self, level: Level, window: Window, room: int = 1024) -> None:
+        """``room``: voxels that it has memory for at first."""
         self.level = level
         self.window = window
         self.n = 0
-        self._voxels = _room_for(1024)
+        self._voxels = _room_for(room)
         self._stale = list[I64]()
 
     @property
