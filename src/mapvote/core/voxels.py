@@ -95,16 +95,17 @@ def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
 def enter_first(keys: I64, table: I64, first: I64) -> np.int64:
     """Half of :func:`_group`, in half of its time: how many different keys (n,) > 0 there are that ``table`` (2^k,)
     does not hold, and into ``first`` the index of the first of each. They are entered into it, 0 is a free slot; -1 if
-    they are half of it or more and keys are left."""
+    they are more than half of it."""
     m = np.uint64(0)
     most = np.uint64(len(table) // 2)
     for i in range(np.uint64(0), np.uint64(len(keys))):
-        if m >= most:
-            return np.int64(-1)
         slot = slot_of(keys[i], table)
-        first[m] = i  # in any case: nobody can guess whether the key is new
-        m += np.uint64(table[slot] == 0)
-        table[slot] = keys[i]
+        if table[slot] == 0:
+            if m >= most:
+                return np.int64(-1)
+            table[slot] = keys[i]
+            first[m] = i
+            m += np.uint64(1)
     return np.int64(m)
 
 
