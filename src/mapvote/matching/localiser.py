@@ -160,14 +160,16 @@ class Localiser:
             believed = self._corrected(prior) if self._is_pose(prior) and not self._reverses(prior) else None
         predicted = self._predicted(scan)
         fix = self.tracker.localise(scan, believed)
-        self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
         self._waiting.append(_Waiting(fix, misfit, prior))
         self._place_prior(self._waiting[-1])
         if self._leapt(fix, predicted) and not self._doubt():
             for waiting in list(self._waiting)[:-1]:
                 waiting.fix = replace(waiting.fix, trusted=False)
-        if self._is_due(fix):
+        due = self._is_due(fix)
+        if not (due and self._confirmed):  # a look costs as much as a step of the map ahead: not both in one scan
+            self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
+        if due:
             self._look()
             if self._confirmed and self._held:
                 return self._decide(len(self._waiting), True)

@@ -74,7 +74,7 @@ class MapAround(Protocol):
         ...
 
     def prepare(self, position: F64) -> None:
-        """A little of the work for places ahead: called for every scan."""
+        """A little of the work for places ahead: called for every scan but those at which a track is checked."""
         ...
 
     def go_on_in(self, point_map: PointMap) -> None:

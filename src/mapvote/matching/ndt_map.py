@@ -191,7 +191,7 @@ class MapWindow:
         self._begun = None
 
     def prepare(self, position: F64) -> None:
-        """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
+        """One step ahead: one level of the nearest tile that is not ready. For most scans, so that none has it all."""
         x, y = position[:2].tolist()
         square = window_around(self.point_map.lattice, x, y, 2 * NDT_WINDOW.ahead_m)
         tiles = list(square.tiles())
