@@ -88,7 +88,7 @@ def test_a_part_of_a_tile_is_the_same_whether_the_tile_is_packed_or_not(
     if packed:
         for _ in range(TILE_PACKING.bands):
             tiles.leave(Grid(LATTICE, 5000, 5000, 100, 100))
-    within = tiles.within((0, 0), Grid(LATTICE, row, col, side, side))
+    within = tiles.within((0, 0), tiles.overlap((0, 0), Grid(LATTICE, row, col, side, side)))
     cut = slice(max(row, 0), max(row + side, 0)), slice(max(col, 0), max(col + side, 0))
     np.testing.assert_array_equal(within[cut], planes[cut])
 

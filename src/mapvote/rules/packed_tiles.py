@@ -127,12 +127,11 @@ class PackedTiles(Mapping[TileIndex, U64]):
         opened = self._open[tile] if tile in self._open else self._unpacked(self._packed[tile])
         return opened.planes
 
-    def within(self, tile: TileIndex, view: Grid) -> U64:
-        """The planes of a tile, right where it overlaps ``view``: of a packed one nothing else is unpacked."""
+    def within(self, tile: TileIndex, part: Overlap) -> U64:
+        """The planes of a tile, right in its ``part``: of a packed one nothing else is unpacked."""
         if tile in self._open:
             return self._open[tile].planes
         planes = self._new().planes
-        part = self.overlap(tile, view)
         tile_rows = slice(part.row + part.down, part.end_row + part.down)
         tile_cols = slice(part.col + part.right, part.end_col + part.right)
         for rows, cols, words in self._cells(self._packed[tile], tile_rows):

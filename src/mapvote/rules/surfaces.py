@@ -124,8 +124,9 @@ class SurfaceVoter:
         free = {}
         for tile in window.tiles():
             if tile in counted:
-                planes = counted.within(tile, window)
-                weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known_free, weighed, self.rule)
+                part = counted.overlap(tile, window)
+                planes = counted.within(tile, part)
+                weigh_voxels(planes, part, here.occupied, known_free, weighed, self.rule)
                 if tile in tiles:
                     free[tile] = free_words(planes)
         states, gone, new = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m, self.rule)
