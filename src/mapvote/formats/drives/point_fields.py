@@ -241,7 +241,7 @@ class _Columns(Mapping[str, Values]):
     def __getitem__(self, name: str) -> Values:
         if name not in self._names:
             raise KeyError(name)
-        return np.ascontiguousarray(self._table[name][self._keep])
+        return _column(self._table, name, self._keep)
 
     def __contains__(self, name: object) -> bool:
         return name in self._names  # Mapping's would copy the column
@@ -251,6 +251,11 @@ class _Columns(Mapping[str, Values]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+
+def _column(table: NDArray[np.void], name: str, keep: slice | I32) -> Values:
+    """One column (n,) of the kept points, copied: in a message its values lie 20 bytes and more apart."""
+    return np.ascontiguousarray(table[name][keep])
 
 
 def _attributes(source: str, table: NDArray[np.void], keep: slice | I32) -> dict[str, Values]:
@@ -265,7 +270,7 @@ def _attributes(source: str, table: NDArray[np.void], keep: slice | I32) -> dict
         if column is None:
             continue
         try:
-            attributes[name] = row.in_scan(np.ascontiguousarray(table[column][keep]))
+            attributes[name] = row.in_scan(_column(table, column, keep))
         except MapvoteError as error:
             raise MapvoteError(f"{source}: field {column}: {error}") from error
     return attributes

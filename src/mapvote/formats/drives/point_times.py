@@ -292,9 +292,7 @@ def _is_lost(raw: NDArray[Any], reference: Any, stamp_ns: int) -> bool:
 def _minus(raw: NDArray[Any], reference: Any) -> F64:
     """(n,) values less one of them; of integers of 32 bits and more across their wrap too."""
     native = raw.astype(raw.dtype.newbyteorder("="), copy=False)
-    if raw.dtype.kind == "f":
-        return np.subtract(native, float(reference), dtype=np.float64)
-    if raw.dtype.itemsize < 4:
+    if raw.dtype.kind == "f" or raw.dtype.itemsize < 4:
         return np.subtract(native, float(reference), dtype=np.float64)
     unsigned = np.dtype(f"u{raw.dtype.itemsize}")
     around = native.view(unsigned) - np.asarray(reference).astype(native.dtype).view(unsigned)
