@@ -43,9 +43,9 @@ class MapSizes:
 MAP_SIZES = MapSizes()
 
 
-def held_points(points: Iterable[int], sizes: MapSizes = MAP_SIZES) -> int:
-    """What tiles with so many ``points`` each take of ``kept_points``, empty ones too."""
-    return sum(n + sizes.tile_points for n in points)
+def held_points(points: int, sizes: MapSizes = MAP_SIZES) -> int:
+    """Share of ``kept_points`` that a tile with so many ``points`` takes, an empty one too."""
+    return points + sizes.tile_points
 
 
 SOURCES = "sources"
@@ -106,7 +106,7 @@ class LazyTiles(Mapping[TileIndex, Tile]):
             if tile is None:
                 tile = self._alive[index] = self._load(index)
             if index not in self._kept:
-                self._held += held_points([self._points[index]])
+                self._held += held_points(self._points[index])
                 self._kept[index] = tile
             self._kept.move_to_end(index)
             while self._held > self.kept_points and len(self._kept) > 1:
@@ -115,7 +115,7 @@ class LazyTiles(Mapping[TileIndex, Tile]):
 
     def _let_go(self, index: TileIndex) -> None:
         del self._kept[index]
-        self._held -= held_points([self._points[index]])
+        self._held -= held_points(self._points[index])
 
     def __contains__(self, index: object) -> bool:
         return index in self._points
@@ -137,7 +137,7 @@ def made_in_turn(
     for index in indices:
         tile = load(index)
         points[index] = len(tile.points)
-        total += held_points([len(tile.points)])
+        total += held_points(len(tile.points))
         if total <= kept_points:
             made[index] = tile
         else:

@@ -260,7 +260,7 @@ class Store:
             hashes = tiles_of(connection, number)
             points = points_of(connection, hashes)
             tiles: Mapping[TileIndex, Tile]
-            if held_points(points.values()) <= kept_points:
+            if sum(map(held_points, points.values())) <= kept_points:
                 tiles = {index: load_tile(connection, self.lattice.tile(index), h) for index, h in hashes.items()}
             else:
                 tiles = LazyTiles(lambda index: self._load(index, hashes[index]), points, kept_points)

@@ -127,7 +127,7 @@ def read_map_folder(path: Path, sizes: ReadSizes = READ_SIZES) -> PointMap:
         with _whole(path, index):
             n_points[index] = points_in_plane(first_bytes(path / "planes" / hashes.points, FRAME_HEAD), hashes.points)
     # A small map is read at once. Of a large one only the planes' frames are checked.
-    small = held_points(n_points.values()) <= sizes.kept_points
+    small = sum(map(held_points, n_points.values())) <= sizes.kept_points
     tiles: Mapping[TileIndex, Tile] = LazyTiles(load, n_points, sizes.kept_points)
     if small:
         tiles = {index: load(index) for index in named}

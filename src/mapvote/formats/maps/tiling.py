@@ -159,7 +159,7 @@ def map_of(
     taken.spill.close()
     ground = lay_ground(parts.heights(), parts.heights(of_ground=True), parts.points)
     tiles: Mapping[TileIndex, Tile] = LazyTiles(lambda i: parts.tile(i, ground[i]), parts.points, sizes.kept_points)
-    if held_points(parts.points.values()) <= sizes.kept_points:
+    if sum(map(held_points, parts.points.values())) <= sizes.kept_points:
         tiles = {index: parts.tile(index, ground[index]) for index in parts.points}
     return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.georeference())
 
