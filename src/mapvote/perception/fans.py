@@ -230,7 +230,7 @@ def _cross_cells(
     way: Way, ahead: tuple[int, int], end: float, base: I32, shape: tuple[int, int], layer: int, out: Crossed
 ) -> np.int64:
     """Fill ``out`` with the cells of a way that steps ``ahead`` rows and columns, up to ``end`` metres or the window's
-    edge. Returns how many there are. Of rows and columns, lines are those of which the way crosses more: between two of
+    edge. Returns how many there are. Lines are rows or columns, whichever the way crosses more of: between two of
     their borders it takes one step to the side or none. Where it takes them needs no branch, which nothing could
     predict: the cell beside is always written, and overwritten if the way does not come there."""
     rows, cols = shape
