@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from mapvote.config import NdtSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.groups import widened
-from mapvote.core.kernel import allocating, kernel
+from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError, Scan
@@ -123,8 +122,13 @@ def laid_out(point_map: PointMap, numbers: GlobalSearchNumbers = GLOBAL_SEARCH) 
         at = ((points[tall, 1] - y0) / cell_m).astype(np.int64), ((points[tall, 0] - x0) / cell_m).astype(np.int64)
         np.bitwise_or.at(words, at, bit)
     # Cells on which a vehicle can stand: known ground, with no low obstacle in the cell or the four beside it.
-    low = scipy.ndimage.binary_dilation((words & np.uint32(0b11)) != 0)
-    r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
+    low = (words & np.uint32(0b11)) != 0
+    blocked = low.copy()
+    blocked[1:] |= low[:-1]
+    blocked[:-1] |= low[1:]
+    blocked[:, 1:] |= low[:, :-1]
+    blocked[:, :-1] |= low[:, 1:]
+    r, c = np.nonzero((np.isfinite(ground_z) & ~blocked)[::2, ::2])
     return CoarseMap(x0, y0, ground_z, words, _by_parity(_dilated(words)), 2 * r, 2 * c, _spans_of(r, c))
 
 
@@ -183,21 +187,30 @@ def _dilated(words: U32) -> U32:
     return widened(words | (words << np.uint32(1)) | (words >> np.uint32(1)), 1)
 
 
-@allocating
 def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
     """(places, headings) how many of the points (n <= 255) match the map at their height there; 0 where hopeless.
 
     ``cols`` (places,) in ``wide``. Span by span, point by point: the words of the cells of a span lie side by side, so
     that all of them are looked up sooner than the places among them.
     """
+    out = np.zeros((len(cols), len(yaws)), np.uint8)
+    hits, early = np.empty((2, _SPAN), np.uint32)
+    memory = np.empty(len(xy), np.int64), hits, early
+    _correlate(wide.reshape(-1), wide.shape[2:], spans, cols, (xy, bits), yaws, (hopeless, first), *memory, out)
+    return out
+
+
+@kernel
+def _correlate(
+    flat: U32, shape: tuple[int, int], spans: I64, cols: I64, points: tuple[F64, U32], yaws: F64,
+    least: tuple[int, int], way: I64, hits: U32, early: U32, out: U8,
+) -> None:  # fmt: skip
+    """:func:`correlate` into ``out``, zeros. ``flat``: ``wide``, each of whose four planes has ``shape``. ``least``: as
+    many matches among so many points are hopeless. ``way`` (n,), ``hits`` and ``early`` (_SPAN,): memory."""
+    rows, width = shape
+    xy, bits = points
+    hopeless, first = least
     n = len(xy)
-    rows = wide.shape[2]
-    width = wide.shape[3]
-    flat = wide.reshape(-1)
-    out = np.zeros((len(cols), len(yaws)), dtype=np.uint8)
-    way = np.empty(n, dtype=np.int64)
-    hits = np.empty(_SPAN, dtype=np.uint32)
-    early = np.empty(_SPAN, dtype=np.uint32)
     for a in range(len(yaws)):
         c = np.cos(yaws[a])
         s = np.sin(yaws[a])
@@ -210,7 +223,8 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
             col = spans[k, 1]
             place = spans[k, 2]
             beyond = spans[k + 1, 2] if k + 1 < len(spans) else len(cols)
-            hits[:] = 0
+            for j in range(_SPAN):
+                hits[j] = 0
             _look_up(flat, row * width + col, way, bits, 0, first, hits)
             hopeful = False
             for p in range(place, beyond):
@@ -222,7 +236,6 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
                 for p in range(place, beyond):
                     j = cols[p] - col
                     out[p, a] = hits[j] if early[j] > hopeless else 0
-    return out
 
 
 @kernel
@@ -235,10 +248,10 @@ def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits
             hits[j] += (flat[start + j] >> bit) & np.uint32(1)
 
 
-@allocating
-def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: float) -> I64:
-    """Indices of the first ``most`` that lie apart from all chosen before."""
-    chosen = np.empty(most, dtype=np.int64)
+@kernel
+def apart(x: F64, y: F64, yaw: F64, spread_m: float, spread_rad: float, chosen: I64) -> int:
+    """Enter into ``chosen`` the indices of the first that lie apart from all chosen before, until it is full; returns
+    how many there are."""
     n = 0
     for i in range(len(x)):
         fresh = True
@@ -251,9 +264,9 @@ def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: floa
         if fresh:
             chosen[n] = i
             n += 1
-            if n == most:
+            if n == len(chosen):
                 break
-    return chosen[:n]
+    return n
 
 
 @kernel
@@ -312,8 +325,9 @@ class GlobalSearch:
         self.judge = Judge(range_sigma_m, check)
 
     def in_map(self, point_map: PointMap) -> GlobalSearch:
-        """The same search in another version of the map."""
+        """The same search in another version of the map, in which ``map_around`` must go on, too."""
         other = GlobalSearch(point_map, self.ndt, 0.0, self.numbers)
+        other.map_around = self.map_around
         other.judge = self.judge
         return other
 
@@ -384,7 +398,7 @@ class GlobalSearch:
     def _peaks(self, lay: CoarseMap, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
         numbers = self.numbers
-        yaws = np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws)
+        yaws: F64 = np.arange(numbers.yaws, dtype=np.float64) * (2.0 * np.pi / numbers.yaws)
         check = self.judge.check
         hopeless = int(0.5 * check.min_fit * check.min_known * numbers.first)
         scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, numbers.first)
@@ -393,9 +407,10 @@ class GlobalSearch:
         heading = likely % numbers.yaws
         x = lay.cols[place] + 0.5
         y = lay.rows[place] + 0.5
-        spread = numbers.peaks, numbers.spread_m, numbers.spread_rad
-        kept = apart(x * numbers.cell_m, y * numbers.cell_m, yaws[heading], *spread)
-        return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
+        chosen = np.empty(numbers.peaks, np.int64)
+        places = x * numbers.cell_m, y * numbers.cell_m, yaws[heading]
+        n = apart(*places, numbers.spread_m, numbers.spread_rad, chosen)
+        return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in chosen[:n]]
 
     def _pose(self, peak: tuple[float, float, float, float], sensor_m: float) -> F64:
         """(4, 4) on the map's ground at a peak, level with it."""

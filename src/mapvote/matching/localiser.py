@@ -23,7 +23,6 @@ from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, PosePrior, Registration, Scan
 from mapvote.matching.global_search import Bound, GlobalSearch
-from mapvote.matching.matcher import map_around
 from mapvote.matching.odometry import Fix, Tracker
 from mapvote.matching.pose_check import Judge, Verdict
 from mapvote.matching.prepare import Sample, deskew, motion_at, thin_for_levels, twist_between
@@ -127,7 +126,7 @@ class Localiser:
     ) -> None:
         self.numbers = numbers
         self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
-        self.map_around = map_around(settings.ndt.matcher, point_map)
+        self.map_around = self.search.map_around  # one window of the map: a search and a track never need it at once
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(sensor.range_sigma_m)
         self.prior_frame = PriorFrame()
