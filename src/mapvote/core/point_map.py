@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import flat_cells
+from mapvote.core.columns import base_layers, column_bits, flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.ground import lay_ground
 from mapvote.core.record import record
@@ -311,10 +311,12 @@ def has_open_ground(point_map: PointMap, min_share: float = 0.2) -> bool:
     tiles = point_map.tiles
     for tile in map(tiles.__getitem__, tiles.largest(9) if isinstance(tiles, LazyTiles) else tiles):
         held, stands = (np.zeros(tile.window.rows * tile.window.cols, dtype=np.bool_) for _ in range(2))
-        # Not tile.cells and tile.columns, which stay with the tile: a drive reaches few tiles of a large map.
+        # Not tile.cells, tile.base and tile.columns, which stay with it: a drive reaches few tiles of a large map.
         cells = flat_cells(tile.window, tile.points)
+        base = base_layers(tile.ground_z).reshape(-1)[cells]
         held[cells] = True
-        stands[cells[tile.columns_in(cells)[1]]] = True
+        heights = tile.points[:, 2].astype(np.float64)
+        stands[cells[column_bits(heights, tile.ground_z.reshape(-1)[cells], base)[1]]] = True
         any_point += int(held.sum())
         ground += int((held & ~stands & np.isfinite(tile.ground_z.reshape(-1))).sum())
     return ground > min_share * any_point

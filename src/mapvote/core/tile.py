@@ -216,12 +216,8 @@ class Tile:
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""
-        return self.columns_in(self.cells)
-
-    def columns_in(self, cells: I64) -> tuple[I64, Bool]:
-        """:attr:`columns` of the points by their flat ``cells`` (n,), which do not stay with the tile."""
-        ground = self.ground_z.reshape(-1)[cells]
-        base = self.base.reshape(-1)[cells]
+        ground = self.ground_z.reshape(-1)[self.cells]
+        base = self.base.reshape(-1)[self.cells]
         return column_bits(self.points[:, 2].astype(np.float64), ground, base)
 
     @cached_property
