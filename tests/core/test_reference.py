@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile, wall
-from mapvote.core.grid import TILE_CELLS, Grid
+from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.reference import LocalMap, above_ground_points, reference_window
+from mapvote.core.reference import LAYOUT_STEPS, LocalMap, above_ground_points, reference_window
 from mapvote.core.types import F64, Reference
+
+
+WINDOW_M = 20.0
+BESIDE = LAYOUT_STEPS.beyond_cells + int(np.ceil(0.5 * WINDOW_M / CELL_SIZE))
+"""Cells around a vehicle's middle tile: half a window, and the way for which the planes do without the next ones."""
 
 
 @pytest.fixture(scope="module")
@@ -32,21 +37,21 @@ def along(metres: F64) -> list[F64]:
 
 
 def test_a_reference_prepared_on_the_way_is_the_one_laid_out_at_once(point_map: PointMap) -> None:
-    local = LocalMap(point_map, 20.0)
+    local = LocalMap(point_map, WINDOW_M)
     laid_out: list[Reference] = []
-    for position in along(np.arange(20.0, 260.0, 4.0)):
+    for position in along(np.arange(20.0, 250.0, 4.0)):
         _, outer = local.at(position)
         if not laid_out or outer is not laid_out[-1]:
             laid_out.append(outer)
     assert len(laid_out) == 3
     for outer, tile in zip(laid_out, ((0, 0), (0, 1), (0, 2)), strict=True):
-        assert outer.grid == point_map.lattice.tile(tile).padded(TILE_CELLS)
+        assert outer.grid == point_map.lattice.tile(tile).padded(BESIDE)
         assert_same(outer, reference_window(point_map, outer.grid))
 
 
 def test_a_reference_without_measures_has_the_same_ground_and_obstacles(point_map: PointMap) -> None:
     for position in along(np.array([20.0, 100.0, 300.0])):
-        whole, light = (LocalMap(point_map, 20.0, measured=measured).at(position)[1] for measured in (True, False))
+        whole, light = (LocalMap(point_map, WINDOW_M, measured=measured).at(position)[1] for measured in (True, False))
         for name in ("grid", "ground_z", "base", "occupied", "free"):
             np.testing.assert_array_equal(getattr(light, name), getattr(whole, name))
         assert light.occupied.any()
@@ -54,12 +59,12 @@ def test_a_reference_without_measures_has_the_same_ground_and_obstacles(point_ma
 
 
 def test_an_unused_preparation_does_no_harm(point_map: PointMap) -> None:
-    local = LocalMap(point_map, 20.0)
+    local = LocalMap(point_map, WINDOW_M)
     there, back, elsewhere = along(np.array([70.0, 80.0])), along(np.array([60.0])), along(np.array([250.0]))
     for position in (*there, *back, *there, *elsewhere):
         cut, _ = local.at(position)
         np.testing.assert_array_equal(cut.occupied, reference_window(point_map, cut.grid).occupied)
-    assert cast(Reference, local.outer).grid == point_map.lattice.tile((0, 3)).padded(TILE_CELLS)
+    assert cast(Reference, local.outer).grid == point_map.lattice.tile((0, 3)).padded(BESIDE)
 
 
 def test_new_things_are_believed_only_over_ground_that_the_map_measured() -> None:

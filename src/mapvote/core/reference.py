@@ -26,8 +26,10 @@ class LayoutSteps:
 
     band_rows: int = 64
     """Rows of the start of columns in a step: some tenths of a millisecond for a window of three tiles."""
-    cells: int = 2
-    """Cells that the vehicle drives for each step after the first of a scan. A layout has 30 to 100 steps, more where
+    beyond_cells: int = 68
+    """Cells that the vehicle drives beyond its middle tile before it needs the next planes."""
+    cells: int = 1
+    """Cells that the vehicle drives for each step after the first of a scan. A layout has 30 to 60 steps, more where
     more tiles lie around."""
 
 
@@ -106,7 +108,7 @@ class LocalMap:
     """The reference around a moving vehicle: arrays over the tiles around it, made anew only when it has left them.
 
     The next one is made step by step while the vehicle drives through the tile that will be its middle: so many steps
-    per call as the cells that it drove, so that it is there when the vehicle is half a tile farther, at any speed.
+    per call as the cells that it drove, so that it is there before the vehicle needs it, at any speed.
     """
 
     def __init__(
@@ -152,7 +154,8 @@ class LocalMap:
     def _ahead(self, middle: TileIndex, window: Grid) -> Layout:
         if self._next is not None and self._next[0] == middle:
             return self._next[1]
-        around = self.point_map.lattice.tile(middle).padded(max(TILE_CELLS, window.rows))
+        beside = self.steps.beyond_cells + (window.rows + 1) // 2
+        around = self.point_map.lattice.tile(middle).padded(beside)
         return _laid_out(self.point_map, around, self.steps, self.measured)
 
 
