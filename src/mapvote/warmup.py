@@ -36,6 +36,7 @@ from mapvote.formats.drives.point_fields import PointReader, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
 from mapvote.fusion.fuse import update_map
 from mapvote.fusion.gravity import Remains, fall_within
+from mapvote.matching.global_search import GlobalSearch
 from mapvote.matching.localiser import GivenPoses
 from mapvote.matching.ndt import align
 from mapvote.survey.build import build_map
@@ -83,7 +84,7 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
         ("what falls with a demolished object", _let_fall),
-        ("a drive and a map looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
+        ("a map searched, a drive looked at, what a long one needs", lambda: _go_far(_drive(old, True), built[0])),
     ]
     with seldom_collecting():
         for step, work in steps:
@@ -155,8 +156,10 @@ def _let_fall() -> None:
     fall_within((0, 0), Remains(**planes, base=np.zeros((TILE_CELLS, TILE_CELLS), np.int32)))
 
 
-def _go_far(drive: Drive) -> None:
-    """Compile the checks of drive and map; points without times; more voxels than a table takes."""
+def _go_far(drive: Drive, point_map: PointMap) -> None:
+    """Compile the search for a vehicle that is lost; the checks of drive and map; points without times; more voxels
+    than a table takes."""
+    GlobalSearch(point_map, Settings().ndt, drive.sensor.range_sigma_m).find(drive.read_scan(0))
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     for columns in _FIELDS_OF_TABLES:

@@ -14,7 +14,6 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LAYOUT_STEPS, LocalMap, above_ground_points, reference_window
 from mapvote.core.types import F64, Reference
 
-
 WINDOW_M = 20.0
 BESIDE = LAYOUT_STEPS.beyond_cells + int(np.ceil(0.5 * WINDOW_M / CELL_SIZE))
 """Cells around a vehicle's middle tile: half a window, and the way for which the planes do without the next ones."""
