@@ -34,8 +34,8 @@ COUNT_PLANES = 7
 class TilePacking:
     """Numbers of the packing of tiles that the vehicle has left."""
 
-    memory_bytes: int = 16 << 20
-    """Bytes held before a file is opened: a drive of one or two kilometres writes nothing to disk."""
+    memory_bytes: int = 8 << 20
+    """Bytes held before a file is opened: a drive of a kilometre writes nothing to disk."""
     zstd_level: int = 1
     """Level of compression: tiles are packed while driving, and read once or twice."""
     far_cells: int = 64
