@@ -1,5 +1,5 @@
 """docs/operations.md followed literally, from its first command to its last, as an operator would who knows nothing
-else: the wheel in a fresh environment, a real server, both databases.
+else: the wheel in a fresh environment, a real server, both databases. On PostgreSQL the commands run in this process.
 
 Commands of others (pip, systemctl, the databases' tools) are not run here.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from command_line import type_in
 from fresh_wheel import installed, packed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.core.types import CellState
@@ -65,32 +66,36 @@ def vote(url: str, vehicle: str) -> None:
     store.close()
 
 
-def test_every_command_of_the_page_works_as_printed(mapvote: str, store: tuple[str, str], tmp_path: Path) -> None:
+def test_every_command_of_the_page_works_as_printed(
+    mapvote: str, store: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     name, url = store
     write_map(two_walls(), tmp_path / "my_map")
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"MAPVOTE_STORE": url}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.setenv("MAPVOTE_STORE", url)
 
-    def typed(line: str) -> list[str]:
-        words = shlex.split(line, comments=True)
+    def words_of(line: str) -> list[str]:
         stands_for = {"STORE": name, "fleet.db": name, "VERSION": "1", "BACKUP": name, "VEHICLE": "car_1"}
-        return [mapvote, *(stands_for.get(word, word) for word in words[1:])]
+        return [stands_for.get(word, word) for word in shlex.split(line, comments=True)[1:]]
+
+    def typed(line: str) -> str:
+        if name == "-":
+            return type_in(shlex.join(["mapvote", *words_of(line)]))
+        done = subprocess.run([mapvote, *words_of(line)], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        return done.stdout
 
     first, *rest = commands()
     assert " serve " in first
-    serve = [*typed(first), "--port", "0"]
-    with subprocess.Popen(serve, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) as server:
+    serve = [mapvote, *words_of(first), "--port", "0"]
+    with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         assert server.stdout.readline().startswith("key of the operator, shown this once: ")
         assert server.stdout.readline().startswith("serving http://127.0.0.1:")
         for vehicle in ("car_1", "car_2"):
             vote(url, vehicle)
-        said = []
-        for line in rest:
-            done = subprocess.run(
-                typed(line), cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-            )
-            assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
-            said.append(done.stdout)
+        said = [typed(line) for line in rest]
         server.terminate()
         assert server.wait(30) in (0, -15)
     assert any("6 deleted in tiles 0,0" in text for text in said), said

@@ -131,12 +131,13 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
     cols, rows = cells.max(axis=0) - low + 1
     if rows * cols > numbers.most_cells:
         raise MapvoteError(f"a cloud of {cols} m by {rows} m is too large to search without a prior; cut it first")
-    drawn = np.zeros((rows, cols))
+    drawn = np.zeros((rows, cols), np.float32)  # scores to seven digits: half of the time of float64
     drawn[cells[:, 1] - low[1], cells[:, 0] - low[0]] = weight
     reach = int(np.ceil(np.hypot(tall[:, 0], tall[:, 1]).max() / cell_m)) + 1
     shape = [scipy.fft.next_fast_len(side + 2 * reach, real=True) for side in drawn.shape]
     spectrum = scipy.fft.rfft2(drawn, shape)
     energy = scipy.fft.rfft2(drawn**2, shape)
+    image, mask = np.zeros((2, *shape), np.float32)
     # The best places of each heading.
     ranked: list[tuple[float, float, float, float]] = []
     for yaw in np.arange(numbers.yaws) * (2.0 * np.pi / numbers.yaws):
@@ -144,13 +145,14 @@ def _correlate(cells: I64, weight: F64, tall: F64, numbers: CoarseSearch) -> lis
         s = np.sin(yaw)
         col = np.floor((c * tall[:, 0] - s * tall[:, 1]) / cell_m).astype(np.int64)
         row = np.floor((s * tall[:, 0] + c * tall[:, 1]) / cell_m).astype(np.int64)
-        image = np.zeros(shape)
-        mask = np.zeros(shape)
+        image.fill(0.0)
+        mask.fill(0.0)
         np.maximum.at(image, (row, col), tall[:, 2])
         mask[row, col] = 1.0
-        met = scipy.fft.irfft2(spectrum * np.conj(scipy.fft.rfft2(image, shape)), shape)
-        under = scipy.fft.irfft2(energy * np.conj(scipy.fft.rfft2(mask, shape)), shape)
-        score = met / np.sqrt(np.maximum(under, 0.05 * (image**2).sum()) * (image**2).sum())
+        own = float((image**2).sum())
+        met = scipy.fft.irfft2(spectrum * scipy.fft.rfft2(image).conj(), shape, overwrite_x=True)
+        under = scipy.fft.irfft2(energy * scipy.fft.rfft2(mask).conj(), shape, overwrite_x=True)
+        score = met / np.sqrt(np.maximum(under, 0.05 * own) * own)
         for k in np.argpartition(score.ravel(), -5)[-5:]:
             r, q = np.unravel_index(k, shape)
             shift = [int(i) - side if i >= side - reach else int(i) for i, side in zip((r, q), shape, strict=True)]
