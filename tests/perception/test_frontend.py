@@ -196,7 +196,7 @@ def test_a_sweep_of_two_lidars_is_one_observation_and_each_one_s_rays_begin_wher
     np.testing.assert_allclose(first.origin_map(seen.scan.origin_map), SENSOR[:3, 3])
     np.testing.assert_allclose(second.origin_map(seen.scan.origin_map), SENSOR[:3, 3] + rear)
     views = []
-    for part, origin in ((slice(0, 4), SENSOR[:3, 3]), (slice(4, 8), SENSOR[:3, 3] + rear)):
+    for part, origin in ((slice(0, 4), SENSOR[:3, 3].copy()), (slice(4, 8), SENSOR[:3, 3] + rear)):
         rows = rows_from(seen.scan.points_map[part], origin)
         views.append(cast_rays(rows, origin, seen.scan.obstacle[part], seen.moving[part], seen.reference))
     expected = views[0].joined(views[1])

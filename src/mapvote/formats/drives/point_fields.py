@@ -19,7 +19,7 @@ from mapvote.core.kernel import kernel
 from mapvote.core.points import Values, point_fields
 from mapvote.core.record import record
 from mapvote.core.sensors import UPRIGHT, Sensor
-from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold
+from mapvote.core.types import F32, I32, U16, MapvoteError, Scan, TimesTold, read_only
 from mapvote.formats.drives.compressed_cloud import decompressed
 from mapvote.formats.drives.point_times import (
     ClockDifference,
@@ -123,7 +123,7 @@ class PointReader:
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
         usable = np.empty(len(points), np.int32)
         copied = np.empty((len(points), 3), np.float32)
-        n, measured, bad = _sort_out(points, self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied)
+        n, measured, bad = _sort_out(read_only(points), self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied)
         if bad > POINT_RULE.most_bad_share * max(measured, 1):
             raise MapvoteError(
                 f"{source}: {bad} of {measured} points are not finite or beyond {POINT_RULE.far_m:.0f} m, more than "
@@ -343,7 +343,7 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
     The sensor faces forward at the stamp: -azimuth / (2 pi rate) if it turns clockwise seen from above.
     """
     out, (x, y) = np.empty(len(points), np.float32), np.empty((2, _AZIMUTHS_AT_ONCE), np.float32)
-    _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz), x, y, out)
+    _spinning_time_s(read_only(points), np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz), x, y, out)
     return out
 
 
