@@ -61,7 +61,7 @@ class TimeJudgement:
     """A value that a larger share of the points has, and ``shared_ratio`` times as many as any other, is no time."""
     shared_ratio: float = 5.0
     """Ratio of the points with the most frequent value to those with the next one, see ``shared``."""
-    sample: int = 4096
+    sample: int = 1024
     """Points whose values and azimuths are read."""
     shortest_turn_s: float = 0.03
     """Shortest revolution of a spinning LiDAR, seconds."""
