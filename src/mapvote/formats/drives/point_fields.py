@@ -123,7 +123,9 @@ class PointReader:
         near_m = sensor.min_range_m - 5.0 * sensor.range_sigma_m
         usable = np.empty(len(points), np.int32)
         copied = np.empty((len(points), 3), np.float32)
-        n, measured, bad = _sort_out(read_only(points), self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied)
+        n, measured, bad = _sort_out(
+            read_only(points), self.zero_is_no_return, near_m, POINT_RULE.far_m, usable, copied
+        )
         if bad > POINT_RULE.most_bad_share * max(measured, 1):
             raise MapvoteError(
                 f"{source}: {bad} of {measured} points are not finite or beyond {POINT_RULE.far_m:.0f} m, more than "
