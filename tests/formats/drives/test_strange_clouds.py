@@ -12,7 +12,7 @@ import pytest
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, MapvoteError
 from mapvote.formats.drives.packets import direction_of
-from mapvote.formats.drives.point_fields import point_cloud_table, scan_from_point_cloud2
+from mapvote.formats.drives.point_fields import PointReader, _sort_out, point_cloud_table, scan_from_point_cloud2
 
 POINTS = np.random.default_rng(4).uniform([3, 3, -1], [30, 20, 4], (200, 3)).astype(np.float32)
 FLOAT = 7
@@ -64,6 +64,15 @@ def test_every_layout_of_fields_gives_the_same_points_and_the_same_direction(kin
     middle_rad, share = direction_of(point_cloud_table("a cloud", SOUND[kind]))
     assert 0.0 < middle_rad < np.pi / 2
     assert share < 0.3
+
+
+def test_a_warmed_up_vehicle_compiles_nothing_for_the_layout_of_its_clouds() -> None:
+    """Points lie apart or side by side, in bytes of a message or in a table that may be written to."""
+    table = np.zeros(len(POINTS), [(axis, "<f4") for axis in "xyz"])
+    for cloud in (*SOUND.values(), message(XYZ, step=12)):
+        table["x"], table["y"], table["z"] = scan_from_point_cloud2(cloud, SENSORS["hdl32e"]).points.T
+        PointReader("table").scan("table", 0, 0, table, SENSORS["hdl32e"])
+    assert len(_sort_out.signatures) <= 2
 
 
 def test_a_field_of_three_numbers_is_no_x_y_z() -> None:
