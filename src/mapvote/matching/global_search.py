@@ -307,8 +307,28 @@ class Found:
     """Difference of its fit from that of the best place elsewhere."""
 
 
+class _Searched:
+    """A map as the search reads it: each part is made when it is first needed."""
+
+    def __init__(self, point_map: PointMap, numbers: GlobalSearchNumbers) -> None:
+        self._map = point_map
+        self._numbers = numbers
+
+    @cached_property
+    def has_ground(self) -> bool:
+        return has_open_ground(self._map)
+
+    @cached_property
+    def points(self) -> F64:
+        return all_points(self._map)
+
+    @cached_property
+    def layout(self) -> CoarseMap:
+        return laid_out(self._map, self._numbers)
+
+
 class GlobalSearch:
-    """The whole map as arrays for the search, made at the first call."""
+    """The search for scans in the whole of a map."""
 
     def __init__(
         self,
@@ -318,30 +338,16 @@ class GlobalSearch:
         numbers: GlobalSearchNumbers = GLOBAL_SEARCH,
         check: PoseCheck = POSE_CHECK,
     ) -> None:
-        self.point_map = point_map
         self.ndt = ndt
         self.numbers = numbers
         self.map_around = map_around(ndt.matcher, point_map)
+        self._searched = _Searched(point_map, numbers)
         self.judge = Judge(range_sigma_m, check)
 
-    def in_map(self, point_map: PointMap) -> GlobalSearch:
-        """The same search in another version of the map, in which ``map_around`` must go on, too."""
-        other = GlobalSearch(point_map, self.ndt, 0.0, self.numbers)
-        other.map_around = self.map_around
-        other.judge = self.judge
-        return other
-
-    @cached_property
-    def _has_ground(self) -> bool:
-        return has_open_ground(self.point_map)
-
-    @cached_property
-    def _points(self) -> F64:
-        return all_points(self.point_map)
-
-    @cached_property
-    def _layout(self) -> CoarseMap:
-        return laid_out(self.point_map, self.numbers)
+    def go_on_in(self, point_map: PointMap) -> None:
+        """The map is another version from here on."""
+        self.map_around.go_on_in(point_map)
+        self._searched = _Searched(point_map, self.numbers)
 
     def __call__(self, scan: Scan, bound: Bound | None = None) -> F64 | None:
         """The pose (4, 4) of the scan, or None if no place holds or another fits as well. ``bound``: no other place is
@@ -350,7 +356,7 @@ class GlobalSearch:
         A map without ground has neither drivable squares nor heights above ground: there every shift and yaw of
         the scan is tried (matching/coarse_search.py), which takes some seconds for each square kilometre.
         """
-        if not self._has_ground:
+        if not self._searched.has_ground:
             return self._without_ground(scan, bound)
         place = self.find(scan, bound)
         if place is None or place.fit < self.judge.check.min_fit or place.lead < self.judge.check.min_lead:
@@ -359,7 +365,7 @@ class GlobalSearch:
 
     def _without_ground(self, scan: Scan, bound: Bound | None) -> F64 | None:
         """The place in a map without ground, by every shift and yaw of the scan."""
-        points = self._points
+        points = self._searched.points
         if bound is not None:
             wide = replace(bound, radius_m=bound.radius_m + self.numbers.reach_m)
             points = points[wide.holds(points[:, 0], points[:, 1])]
@@ -389,7 +395,8 @@ class GlobalSearch:
         # The sensor's height over the ground, and the poses of the best peaks.
         below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
         sensor_m = -float(np.quantile(below, 0.05)) if len(below) else 1.8
-        lay = self._layout if bound is None else _within(self._layout, bound, numbers.cell_m)
+        lay = self._searched.layout
+        lay = lay if bound is None else _within(lay, bound, numbers.cell_m)
         if not len(lay.cols):
             return None
         best = sorted(self._peaks(lay, xy, bits), key=lambda peak: -peak[0])[: numbers.refined]
@@ -414,7 +421,7 @@ class GlobalSearch:
 
     def _pose(self, peak: tuple[float, float, float, float], sensor_m: float) -> F64:
         """(4, 4) on the map's ground at a peak, level with it."""
-        lay, (_, x, y, yaw) = self._layout, peak
+        lay, (_, x, y, yaw) = self._searched.layout, peak
         cell_m = self.numbers.cell_m
         row = int(y)
         col = int(x)

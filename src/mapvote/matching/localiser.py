@@ -184,8 +184,7 @@ class Localiser:
 
     def go_on_in(self, point_map: PointMap) -> None:
         """The map is another version from here on; the track goes on."""
-        self.search = self.search.in_map(point_map)
-        self.map_around.go_on_in(point_map)
+        self.search.go_on_in(point_map)
 
     def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
         """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
