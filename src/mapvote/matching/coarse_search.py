@@ -16,9 +16,8 @@ import scipy
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
+from mapvote.core.types import F64, I64, Bool, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample, voxel_keys
-from mapvote.matching.matcher import likelihood_at
 from mapvote.matching.ndt_map import NdtMap, build_ndt
 from mapvote.matching.prepare import thin_for_levels
 
@@ -209,8 +208,7 @@ def _refined(
     ranked = sorted(((windows.score(T, 0), T) for T in guesses), key=lambda one: -one[0])
     out: list[tuple[float, F64]] = []
     for T in distinct((T for _, T in ranked), numbers.spread_rad, 1.0, numbers)[: numbers.refined]:
-        ndt_map, clouds = windows.around(T)
-        T_refined = ndt_map.refine(clouds, T).T_map_lidar
+        T_refined = windows.refined(T)
         out.append((standing.nearness(T_refined), T_refined))
     return out
 
@@ -257,30 +255,39 @@ class _Windows:
         self._window_m = numbers.window_m
         tall, _ = _weights(local, numbers)
         cells = np.floor(local[:, :2] / numbers.cell_m).astype(np.int64)
-        self._stands = np.isin(cells @ [1 << 32, 1], tall @ [1 << 32, 1])
+        self._standing = thin_for_levels(local[np.isin(cells @ [1 << 32, 1], tall @ [1 << 32, 1])])
+        """b's points above the ground, (3, m) for each level."""
         self._ndt: dict[tuple[int, int], NdtMap] = {}
 
-    def around(self, T: F64, standing: bool = False) -> tuple[NdtMap, list[F32]]:
-        """(NDT of a, b's points in its window for each of its levels): all, or only those above the ground."""
+    def _around(self, T: F64) -> NdtMap:
+        """The NDT of a around b."""
         key = int(np.floor(T[0, 3] / 20.0)), int(np.floor(T[1, 3] / 20.0))
         if key not in self._ndt:
             at = 20.0 * (np.array(key) + 0.5)
             near = self._a[(np.abs(self._a[:, :2] - at) < self._window_m).all(axis=1)]
             self._ndt[key] = build_ndt(near, np.array([*at, float(np.median(near[:, 2])) if len(near) else 0.0]))
-        ndt_map = self._ndt[key]
-        there = transform(T, self._b)
-        inside = (np.abs(there[:, :2] - ndt_map.centre[:2]) < self._window_m - 2.0).all(axis=1)
-        return ndt_map, thin_for_levels(self._b[inside & self._stands if standing else inside])
+        return self._ndt[key]
+
+    def _is_inside(self, there: F64, ndt_map: NdtMap) -> Bool:
+        """(n,) whether points (n, 3) of the frame of a lie in the window."""
+        away_m = np.abs(there[:, :2] - ndt_map.centre[:2])
+        return np.asarray((away_m < self._window_m - 2.0).all(axis=1))
+
+    def refined(self, T: F64) -> F64:
+        """The pose refined by all of b's points in the window."""
+        ndt_map = self._around(T)
+        inside = self._is_inside(transform(T, self._b), ndt_map)
+        return ndt_map.refine(thin_for_levels(self._b[inside]), T).T_map_lidar
 
     def score(self, T: F64, level: int) -> float:
         """Mean likelihood of b's points above the ground at one level; points outside the window have none."""
-        ndt_map, clouds = self.around(T, standing=True)
-        if clouds[level].shape[1] == 0:
+        ndt_map = self._around(T)
+        cloud = self._standing[level]
+        inside = self._is_inside(transform(T, cloud.T), ndt_map)
+        if not inside.any():
             return 0.0
-        inside = (np.abs(transform(T, self._b[self._stands])[:, :2] - ndt_map.centre[:2]) < self._window_m - 2.0).all(
-            axis=1
-        )
-        return float(inside.mean()) * likelihood_at(ndt_map, clouds, T, level % len(ndt_map.levels))
+        likelihood = ndt_map.likelihood(cloud.compress(inside, axis=1), T[None], level)
+        return float(inside.mean()) * float(likelihood[0])
 
 
 def distinct(
