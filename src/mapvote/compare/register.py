@@ -110,9 +110,8 @@ class Patches:
         clouds = thin_for_levels(own_points[stands(own_points)])
         other = T_a_b.copy()
         other[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
-        finest = len(ndt_map.levels) - 1
-        own = likelihood_at(ndt_map, clouds, self.T_a_patch[k], finest)
-        return 1.0 - likelihood_at(ndt_map, clouds, other, finest) / max(own, 1e-9)
+        own = likelihood_at(ndt_map, clouds[-1], self.T_a_patch[k], -1)
+        return 1.0 - likelihood_at(ndt_map, clouds[-1], other, -1) / max(own, 1e-9)
 
     def apart_m(self, T_a_b: F64) -> F64:
         """(m,) how far each compared patch moves from one motion to where it lies on the surfaces of a, metres."""

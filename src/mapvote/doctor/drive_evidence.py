@@ -473,7 +473,7 @@ def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Ro
         registration,
         *(ndt_map.refine(clouds, guess) for guess in likeliest(ndt_map, standing[0], guesses, RUN_RULE.refined, 800)),
     ]
-    return max(tried, key=lambda one: likelihood_at(ndt_map, standing, one.T_map_lidar, len(clouds) - 1))
+    return max(tried, key=lambda one: likelihood_at(ndt_map, standing[-1], one.T_map_lidar, -1))
 
 
 def _guesses(indices: list[int], poses: list[F64], i: int, up: F64) -> list[F64]:

@@ -115,7 +115,7 @@ def _fit(sweep: list[F32], T_first_others: F64, rules: SweepRules) -> float:
     """Mean likelihood of the other LiDARs' points among those of the first."""
     ndt_map = _map_of(sweep[0], rules)
     pairs = zip(sweep[1:], T_first_others, strict=True)
-    return float(np.mean([likelihood_at(ndt_map, thin_for_levels(points), T) for points, T in pairs]))
+    return float(np.mean([likelihood_at(ndt_map, thin_for_levels(points)[0], T) for points, T in pairs]))
 
 
 def _measured(

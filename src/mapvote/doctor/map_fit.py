@@ -232,7 +232,7 @@ def _scale_by_points(e: MapEvidence, places: Sequence[Place]) -> tuple[float, fl
             if not place.fits:  # it may be elsewhere: where the prior has it, in a map so much larger
                 starts.append(e.scaled(place.index, scale))
             poses = [ndt_map.refine(clouds, start).T_map_lidar for start in starts]
-            fits.append(max(likelihood_at(ndt_map, clouds, T, len(clouds) - 1) for T in poses))
+            fits.append(max(likelihood_at(ndt_map, clouds[-1], T, -1) for T in poses))
         best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
         peaks.append(scales[best] + step * peak_of(fits[best - 1], fits[best], fits[best + 1]))
     scale = float(np.median(peaks))

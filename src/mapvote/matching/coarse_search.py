@@ -18,6 +18,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.record import record
 from mapvote.core.types import F64, I64, Bool, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample, voxel_keys
+from mapvote.matching.matcher import likelihood_at
 from mapvote.matching.ndt_map import NdtMap, build_ndt
 from mapvote.matching.prepare import thin_for_levels
 
@@ -286,8 +287,7 @@ class _Windows:
         inside = self._is_inside(transform(T, cloud.T), ndt_map)
         if not inside.any():
             return 0.0
-        likelihood = ndt_map.likelihood(cloud.compress(inside, axis=1), T[None], level)
-        return float(inside.mean()) * float(likelihood[0])
+        return float(inside.mean()) * likelihood_at(ndt_map, cloud.compress(inside, axis=1), T, level)
 
 
 def distinct(

@@ -119,6 +119,6 @@ def best_of(
     return max((around.refine(clouds, guess, prior) for guess in chosen), key=lambda found: found.score)
 
 
-def likelihood_at(around: LocalMatcher, clouds: Sequence[F32], T_map_lidar: F64, level: int = 0) -> float:
-    """Mean likelihood of a scan at one pose, at one level."""
-    return float(around.likelihood(clouds[level], T_map_lidar[None], level)[0])
+def likelihood_at(around: LocalMatcher, cloud: F32, T_map_lidar: F64, level: int = 0) -> float:
+    """Mean likelihood of a cloud (3, n) at one pose (4, 4), at one level."""
+    return float(around.likelihood(cloud, T_map_lidar[None], level)[0])

@@ -15,7 +15,7 @@ import numpy as np
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.record import record
 from mapvote.core.types import F64, Bool
-from mapvote.matching.matcher import CONVERGENCE, LocalMatcher
+from mapvote.matching.matcher import CONVERGENCE, LocalMatcher, likelihood_at
 from mapvote.matching.ndt_voxels import LEVELS
 from mapvote.matching.prepare import in_rows
 
@@ -140,7 +140,7 @@ class Judge:
         return few, standing, expected, known, self._likelihood(around, standing, T) / expected
 
     def _likelihood(self, around: LocalMatcher, standing: F64, T: F64) -> float:
-        return float(around.likelihood(in_rows(standing), T[None], -1)[0])
+        return likelihood_at(around, in_rows(standing), T, -1)
 
     def _others(self, around: LocalMatcher, few: F64, standing: F64, T: F64, quick: bool) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just

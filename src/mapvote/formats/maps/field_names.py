@@ -55,18 +55,18 @@ def plain(name: str) -> str:
 
 def known_fields(names: Sequence[str]) -> dict[str, str]:
     """For x, y, z and each of :func:`kept_fields` that ``names`` hold: which of them holds it."""
-    brought = tuple((name, plain(name), *row.spellings) for name, row in point_fields().items())
-    return dict(_known_fields(tuple(names), brought))
+    brought = {name: (plain(name), *row.spellings) for name, row in point_fields().items()}
+    return dict(_known_fields(tuple(names), tuple({**brought, **_SPELLINGS}.items())))
 
 
 @lru_cache(maxsize=64)
-def _known_fields(names: tuple[str, ...], brought: tuple[tuple[str, ...], ...]) -> dict[str, str]:
-    """:func:`known_fields` with the attributes ``brought`` (name, spellings): asked three times a scan."""
+def _known_fields(names: tuple[str, ...], spelled: tuple[tuple[str, tuple[str, ...]], ...]) -> dict[str, str]:
+    """:func:`known_fields` by how each field is ``spelled``: asked three times a scan."""
     by_spelling: dict[str, str] = {}
     for name in names:
         by_spelling.setdefault(plain(name), name)
     columns: dict[str, str] = {}
-    for ours, spellings in {**{name: rest for name, *rest in brought}, **_SPELLINGS}.items():
+    for ours, spellings in spelled:
         there = [by_spelling[spelling] for spelling in spellings if spelling in by_spelling]
         if ours in names:
             columns[ours] = ours
