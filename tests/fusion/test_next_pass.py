@@ -11,10 +11,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from typer.testing import CliRunner
 
+from command_line import typed
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.cli import app
 from mapvote.codec.ballot import encode, pack_path
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
@@ -73,8 +72,7 @@ def test_a_store_tells_where_to_drive_as_its_server_does(tmp_path: Path) -> None
         asked = client.get("/v1/coverage/passes").json()
     store.close()
     told = tmp_path / "next.geojson"
-    result = CliRunner().invoke(app, ["coverage", str(tmp_path / "store.db"), "--out", str(told)])
-    assert result.exit_code == 0, result.output
+    typed("coverage", tmp_path / "store.db", "--out", told)
     assert json.loads(told.read_text()) == asked
     (feature,) = asked["features"]
     assert feature["properties"] == {"row": 0, "col": 0, "heading_deg": 0, "cells": 4, "built": 0, "gone": 4}

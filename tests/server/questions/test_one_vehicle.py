@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
+from command_line import typed
 from hand_made import Say, make_ballot, make_tile, states_plane, two_walls, wall
-from mapvote.cli import app
 from mapvote.config import FuseSettings
 from mapvote.core.rule import SURFACES
 from mapvote.core.types import CellState
@@ -56,9 +55,9 @@ def test_publish_coverage_and_the_cell_tell_what_lacks_only_the_quorum(store: St
     assert "car_1" not in hidden, "readers see pseudonyms"
     store.close()
     for verb in (["publish"], ["publish", "--dry-run"], ["coverage"]):
-        printed = CliRunner().invoke(app, [*verb, str(tmp_path / "fleet.db")])
-        assert SENTENCE in " ".join(printed.output.split()), printed.output
-        assert "no cell waits" not in printed.output
+        printed = typed(*verb, tmp_path / "fleet.db")
+        assert SENTENCE in " ".join(printed.split()), printed
+        assert "no cell waits" not in printed
 
 
 def test_a_vote_that_is_spent_or_opposed_or_joined_by_a_second_vehicle_does_not_wait(store: Store) -> None:

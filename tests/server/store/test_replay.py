@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
+from command_line import typed
 from hand_made import Cell, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.cli import app
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
@@ -142,9 +141,7 @@ def test_from_the_command_line(store: Store, honest: Store, database_url: str) -
     name = database_url.removeprefix("sqlite:///")
 
     def run(*arguments: str) -> str:
-        done = CliRunner().invoke(app, ["unvote", name, *arguments], catch_exceptions=False)
-        assert done.exit_code == 0
-        return done.output
+        return typed("unvote", name, *arguments)
 
     shown = run("liar", "--replay")
     assert "only shown: --yes publishes it" in shown
