@@ -13,6 +13,7 @@ import { TILE } from "./view.js";
 import { $, address, element, link, notice, state, when } from "./page.js";
 
 let queue = Promise.resolve();
+let starting = null;  // the newest start: an older one's answers may come later
 const asked = new Set();  // hashes on their way
 
 let range = null;  // {from, to, list, clouds}: the two versions that are shown, and what was asked about them
@@ -23,7 +24,7 @@ const view = (state.view = new Stage(api, {
 view.onWanted = (hash) => fetchTile(hash);
 
 async function start() {
-  const known = Promise.all([api.versions(), api.manifest()]);  // before the overview: small, and more is asked by them
+  const known = (starting = Promise.all([api.versions(), api.manifest()]));  // before the overview: small, and more is asked by them
   const deep = view.possible() ? begin() : null;
   const coverage = api.coverage();
   for (const answer of [known, coverage]) answer.catch(() => null);
@@ -31,6 +32,7 @@ async function start() {
   let first;
   try {
     const [{ versions }, manifest] = await known;
+    if (starting !== known) return;
     Object.assign(state, { versions, manifest });
     fillRange();
     first = askRange(Boolean(deep));

@@ -2,44 +2,51 @@
 
 import * as api from "./api.js";
 import { drawable, nameOf, sides } from "./details.js";
-import { $, address, dot, element, notice, state } from "./page.js";
+import { $, address, dot, element, notice, refill, state } from "./page.js";
 
 const SAID = { accepted: "accepted", held: "held", rejected: "rejected" };
 const KEYS = { a: "accepted", h: "held", r: "rejected" };
 const REVIEW = "verdict.";  // a change that was held or rejected, which a publish leaves out
 let desk = null, chosen = null;
+let asking = null;  // the newest question about the desk: an older answer may come later
+let moving = null;  // the verdict that is on its way: the desk moves on after it, unless somebody chose meanwhile
 
 // For reviewers and operators; to anyone else the server does not tell. The pending changes, the largest first.
 export async function showDesk() {
+  const mine = (asking = api.desk());
+  let answer;
   try {
-    desk = await api.desk();
+    answer = await mine;
   } catch (error) {
     if (error.status !== 403) notice(error.message);
     return [];
   }
-  const { pending, reviewed, held, version } = desk;
-  const size = (f) => -f.properties.area_m2;
-  const waiting = [...pending.features].sort((a, b) => size(a) - size(b));
+  const waiting = largestFirst(answer.pending.features);
+  if (asking === mine) show((desk = answer), waiting);
+  return waiting;
+}
+
+const largestFirst = (features) => [...features].sort((a, b) => b.properties.area_m2 - a.properties.area_m2);
+
+function show({ reviewed, held, doubts, version, waits, waiting: stays }, waiting) {
   $("desk").hidden = false;
   $("desk-tally").textContent = waiting.length
     ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
-    : `No change is pending: a publish would leave version ${version} as it is.${desk.waits ? ` ${desk.waits}.` : ""}`;
-  const told = [...held.map((reason) => `The policy would hold it: ${reason}`), ...desk.doubts.map((text) => `Look: ${text}`)];
+    : `No change is pending: a publish would leave version ${version} as it is.${waits ? ` ${waits}.` : ""}`;
+  const told = [...held.map((reason) => `The policy would hold it: ${reason}`), ...doubts.map((text) => `Look: ${text}`)];
   $("desk-held").replaceChildren(...told.map((text) => element("li", {}, [text])));
-  $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
-  const stays = [...(desk.waiting ?? [])].sort((a, b) => size(a) - size(b));
-  $("waiting-tally").textContent = stays.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
-  $("waiting").replaceChildren(...stays.map(left));
+  refill($("pending"), [...waiting, ...reviewed].map(row));
+  $("waiting-tally").textContent = stays?.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
+  refill($("waiting"), largestFirst(stays ?? []).map(left));
   $("publish").disabled = !waiting.length;
   $("publish").textContent = held.length ? "Publish and override" : "Publish";
   const wanted = chosen?.id ?? address.read().pending;
   choose([...waiting, ...reviewed].find((f) => f.id === wanted) ?? null);
-  return waiting;
 }
 
 const row = (f) => {
   const p = f.properties, v = p.verdict;
-  const button = element("button", { onclick: () => choose(f, true) }, [
+  const button = element("button", { onclick: () => go(f) }, [
     dot(p.kind),
     nameOf(p),
     element("span", { className: "number" }, [`${p.area_m2.toFixed(1)} m\u00b2`]),
@@ -53,7 +60,7 @@ const row = (f) => {
 const left = (f) => {
   const { kind, area_m2: area, false_deletion: risk, drive_by: [x, y], waits } = f.properties;
   const look = () => {
-    choose(null);
+    go(null);
     const shown = drawable(f);
     state.view.setPending(shown);
     state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
@@ -68,6 +75,12 @@ const left = (f) => {
     ]),
   ]);
 };
+
+// Somebody's own choice: no verdict that is on its way moves on from it.
+function go(feature) {
+  moving = null;
+  choose(feature, Boolean(feature));
+}
 
 export function choose(feature, visit = false) {
   chosen = feature;
@@ -86,7 +99,7 @@ export function choose(feature, visit = false) {
 // In 3D as a publish would make the map, as long as one of its changes is looked at.
 function inClouds(feature) {
   const would = Boolean(feature && !feature.id.startsWith(REVIEW) && state.view.cloud);
-  $("pending-sides").replaceChildren(...(would ? [sides()] : []));
+  refill($("pending-sides"), would ? [sides()] : []);
   if (!would && !state.pending) return;
   if (would) desk.clouds ??= api.cloudsPending();
   state.pending = would ? desk : null;
@@ -94,12 +107,16 @@ function inClouds(feature) {
 }
 
 async function decide(verdict) {
-  if (!chosen) return;
-  const next = nextAfter(chosen.id);
+  if (!chosen || moving?.id === chosen.id) return;
+  const mine = (moving = { id: chosen.id }), next = nextAfter(chosen.id);
   await told(async () => {
-    await api.review({ change: chosen.id, verdict, comment: $("comment").value, after: chosen.properties.verdict?.seq ?? null });
-    $("comment").value = "";
-    chosen = next ? { id: next } : null;
+    try {
+      await api.review({ change: chosen.id, verdict, comment: $("comment").value, after: chosen.properties.verdict?.seq ?? null });
+      $("comment").value = "";
+      if (moving === mine) chosen = next ? { id: next } : null;
+    } finally {
+      if (moving === mine) moving = null;
+    }
   });
 }
 

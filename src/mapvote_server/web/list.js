@@ -1,7 +1,7 @@
 // The changes between two versions: what is large first, what is small folded away.
 
 import { drawable, nameOf, showChange, visit } from "./details.js";
-import { $, address, dot, element, state } from "./page.js";
+import { $, address, dot, element, refill, state } from "./page.js";
 
 const MOST_IN_A_FILE = 10_000;  // as many as the server sends at once
 const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
@@ -19,12 +19,12 @@ export function showList({ features, numberMatched }, nothing, range) {
       ? [element("span", { className: "hint" }, [` among the largest ${features.length} of ${numberMatched} changes`])]
       : []),
   );
-  $("changes").replaceChildren(...large.map(row));
+  refill($("changes"), large.map(row));
   for (const [size, [id, told]] of Object.entries(FOLDS)) {
     const some = state.features.filter((f) => f.properties.size === size);
     $(id).hidden = !some.length;
     $(id).querySelector("summary").textContent = told(some.length);
-    $(id).querySelector("ol").replaceChildren(...some.map(row));
+    refill($(id).querySelector("ol"), some.map(row));
     $(id).open = unfolded().includes(size);
     $(id).ontoggle = () => unfold(size, $(id).open);
   }

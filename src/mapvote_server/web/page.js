@@ -17,6 +17,16 @@ export const facts = (pairs) => element("dl", {}, pairs.filter(Boolean).flatMap(
 export const number = (n) => (Number.isInteger(n) ? String(n) : n.toFixed(1));
 export const when = (stamp) => (stamp ? stamp.slice(0, 16).replace("T", " ") + " UTC" : "unknown");
 
+// A list made anew while somebody is in it: the focus stays on the row that is about the same thing, else in its place.
+export function refill(list, rows) {
+  const about = (button) => button.dataset.change ?? (button.value || button.textContent);
+  const place = [...list.querySelectorAll("button")].indexOf(document.activeElement);
+  const left = place < 0 ? null : about(document.activeElement);
+  list.replaceChildren(...rows);
+  const buttons = [...list.querySelectorAll("button")];
+  if (place >= 0) (buttons.find((b) => about(b) === left) ?? buttons[place])?.focus();
+}
+
 export function notice(text, empty = false) {
   $("notice").textContent = text;
   $("notice").className = empty ? "empty" : "";

@@ -2,7 +2,7 @@
 
 import * as api from "./api.js";
 import { showCell } from "./details.js";
-import { $, address, element, link, notice, state } from "./page.js";
+import { $, address, element, link, notice, refill, state } from "./page.js";
 
 const MOST = 5;
 
@@ -17,7 +17,7 @@ export async function showVehicles() {
   state.view.tools?.showVehicles(found.map((v) => v.vehicle));
   const against = found.filter((v) => v.verdict === "contradicts");
   const open = found.filter((v) => v.verdict === "undecidable").length;
-  $("vehicles").replaceChildren(...against.map(item));
+  refill($("vehicles"), against.map(item));
   $("vehicles-note").textContent = !found.length
     ? "No ballot has come yet."
     : (against.length ? "" : "No vehicle contradicts the others significantly. ") +

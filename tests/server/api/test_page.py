@@ -33,6 +33,7 @@ PIXELS = """(wanted => { const c = document.querySelector('#cloud'), p = documen
     for (let i = 0; i < d.length; i += 4) n += (d[i] << 16 | d[i + 1] << 8 | d[i + 2]) === rgb;
     return n; })"""
 """A function: how many pixels of the cloud have one colour."""
+A_MOMENT = "new Promise((go) => setTimeout(go, 200))"
 AXE = Path(__file__).parents[2] / "vendor" / "axe.min.js"
 
 
@@ -84,6 +85,20 @@ def enter(browser: Chromium, chosen: str) -> None:
     """Go to a control by its JavaScript expression, as Tab would, and press Enter there."""
     browser.run(f"{chosen}.focus()")
     press(browser, "Enter")
+
+
+def hold_next_answer(browser: Chromium, path: str, ask: str = "") -> None:
+    """Keep the next answer to a path from the page until ``release()``; ``held`` is true once it is there."""
+    browser.run(f"""(() => {{ const real = window.fetch; window.held = false;
+        const free = new Promise((go) => (window.release = go));
+        window.fetch = async (...asked) => {{
+          if (!new URL(asked[0], location).pathname.endsWith({path!r})) return real(...asked);
+          window.fetch = real;
+          const answer = await real(...asked);
+          window.held = true;
+          await free;
+          return answer; }};
+        {ask}; }})()""")
 
 
 @contextmanager
@@ -205,6 +220,49 @@ def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, sto
         browser.wait("document.querySelector('#desk-said').innerText")
         assert "operator" in browser.text("#desk-said")
         browser.wait("document.querySelector('#pending').innerText.includes('accepted by operator')")
+
+
+@pytest.mark.slow
+def test_what_is_chosen_while_a_verdict_is_on_its_way_stays_chosen(
+    browser: Chromium, store: Path, tmp_path: Path
+) -> None:
+    with page_of(browser, store, tmp_path):
+        enter(browser, "document.querySelector('#pending button')")
+        hold_next_answer(browser, "v1/desk/reviews")
+        press(browser, "r")
+        browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")  # by the event
+        enter(browser, "document.querySelector('#pending button')")
+        asked = "performance.getEntriesByType('resource').filter(e => e.name.endsWith('v1/desk')).length"
+        before = browser.run(asked)
+        browser.run("release()")
+        browser.wait(f"{asked} > {before}")  # the desk was looked at once more
+        browser.run(A_MOMENT)
+        assert browser.run("document.querySelector('#pending button').ariaCurrent") == "true"
+        assert not browser.run("document.querySelector('#verdict-form').hidden")
+
+
+@pytest.mark.slow
+def test_the_focus_stays_on_a_row_that_is_made_anew(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with page_of(browser, store, tmp_path):
+        enter(browser, "document.querySelector('#pending button')")
+        browser.run("document.querySelector('#pending button').before = true")
+        press(browser, "h")
+        browser.wait("document.querySelector('#pending').innerText.includes('held by operator')")
+        assert not browser.run("document.querySelector('#pending button').before")
+        assert browser.run("document.activeElement === document.querySelector('#pending button')")
+
+
+@pytest.mark.slow
+def test_an_older_answer_that_comes_later_is_not_shown(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with page_of(browser, store, tmp_path):
+        enter(browser, "document.querySelector('#pending button')")
+        hold_next_answer(browser, "v1/desk", "document.querySelector('#dry-run').click()")
+        browser.wait("window.held")  # it says that nobody has judged
+        press(browser, "r")
+        browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")
+        browser.run("release()")
+        browser.run(A_MOMENT)
+        assert "rejected by operator" in browser.text("#pending")
 
 
 @pytest.mark.slow
