@@ -98,7 +98,7 @@ def test_rays_are_gathered_by_azimuth_and_only_those_that_reach_where_their_fan_
 def test_passed_cells_are_those_that_the_rule_gives_for_each_cell_and_ray(seed: int) -> None:
     points, base = scene(seed, 1500)
     passed = np.zeros(base.size, np.uint64)
-    mark_passed([gather_rays(follow_rays(rows_from(points, ORIGIN), CLEARANCE_M))], ORIGIN, CORNER, base, passed)
+    mark_passed(gather_rays(follow_rays(rows_from(points, ORIGIN), CLEARANCE_M)), ORIGIN, CORNER, base, passed)
     wanted = plain_passed(plain_rays(points), base)
     np.testing.assert_array_equal(passed.reshape(base.shape), wanted)
     assert (wanted >> np.uint64(40)).any(), "the upper halves of the words are looked at too"
@@ -110,7 +110,7 @@ def test_a_ray_proves_from_a_cells_length_on_to_an_edge_but_not_behind_it_and_ma
         reach, x, y, slope, stop = (np.array([v], np.float32) for v in (reach_m, 1.0, 0.0, 0.0, stop_m))
         words = np.zeros(100, np.uint64)
         rays = gather_rays(Rays(reach, x, y, slope, stop, np.full(1, fan, np.int32)))
-        mark_passed([rays], np.array([x0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 100), np.int32), words)
+        mark_passed(rays, np.array([x0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 100), np.int32), words)
         assert set(words[words != 0].tolist()) <= {0b100}
         return int((words != 0).sum())
 

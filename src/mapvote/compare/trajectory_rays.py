@@ -88,7 +88,7 @@ def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float,
     first = (reach <= image[row, col]) & (reach <= nearest[row, col] + CLEARANCE_M)
     words = np.zeros(window.shape, dtype=np.uint64)
     rays = follow_rays(rows_from(away[first] + origin, origin), CLEARANCE_M)
-    mark_passed([gather_rays(rays)], origin, (window.x0, window.y0), base, words.ravel())
+    mark_passed(gather_rays(rays), origin, (window.x0, window.y0), base, words.ravel())
     return words
 
 

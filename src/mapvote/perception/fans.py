@@ -8,7 +8,6 @@ The work for each ray is inlined: a call would pass five arrays, member by membe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel, one_bit
 from mapvote.core.record import record
-from mapvote.core.types import F32, F64, I32, U32, U64
+from mapvote.core.types import F32, F64, I32, I64, U32, U64
 
 
 @record(votes=True)
@@ -114,38 +113,47 @@ _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 """A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
 
 
-def gather_rays(rays: Rays) -> Fans:
-    """Sort rays into fans. A ray that ends in the sensor's own cell proves nothing."""
-    room = len(rays.reach) + FANS
+def gather_rays(rays: Rays, more: Rays | None = None) -> Fans:
+    """Sort ``rays`` and ``more`` into fans. A ray that ends in the sensor's own cell proves nothing."""
+    every = rays, more or Rays._make(values[:0] for values in rays)
+    n = sum(len(part.reach) for part in every)
     first = np.zeros(FANS, np.int32)
     last = np.empty(FANS, np.int32)
-    slope = np.empty(room, np.float32)
-    stop = np.empty(room, np.float32)
+    slope, stop = np.empty((2, n + FANS), np.float32)
     end = np.zeros(FANS, np.float32)
     fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
-    _gather(rays, fans, np.empty(len(rays.reach), np.int32))
+    _gather(every, fans, np.empty(n, np.int32), np.empty(2, np.int64))
     return fans
 
 
 @kernel
-def _gather(rays: Rays, fans: Fans, kept: I32) -> None:
-    """``kept`` (n,): scratch, first whether each ray marks anything, in a loop that vectorises, then which do: a third.
-    Told in one loop, LLVM made branches of it, which nothing could predict."""
-    n = np.uint64(len(rays.reach))
+def _gather(every: tuple[Rays, Rays], fans: Fans, kept: I32, counts: I64) -> None:
+    """``kept`` (n,), of all rays: scratch, first whether each marks anything, in a loop that vectorises, then which do:
+    a third. Told in one loop, LLVM made branches of it, which nothing could predict. ``counts`` (2,): scratch, how many
+    rays are kept of each part."""
     own = np.float32(CELL_SIZE)
     first, last, slope, stop, end, direction = fans
-    for i in range(n):
-        kept[i] = np.int32((rays.reach[i] >= own) & (rays.stop[i] > _TOO_SHORT[np.uint64(rays.fan[i])]))
-    count = np.uint64(0)
-    for i in range(n):
-        fan = np.uint64(rays.fan[i])
-        if rays.reach[i] >= own:
-            direction[fan, 0] += rays.x[i]
-            direction[fan, 1] += rays.y[i]
-        keep = kept[i]
-        first[fan] += keep
-        kept[count] = i  # a ray that is not kept is overwritten
-        count += np.uint64(keep)
+    # Which rays are kept, how many each fan has of them, and where all of its rays go.
+    begin = np.uint64(0)
+    for part in range(2):
+        rays = every[part]
+        here = kept[begin:]
+        n = np.uint64(len(rays.reach))
+        for i in range(n):
+            here[i] = np.int32((rays.reach[i] >= own) & (rays.stop[i] > _TOO_SHORT[np.uint64(rays.fan[i])]))
+        count = np.uint64(0)
+        for i in range(n):
+            fan = np.uint64(rays.fan[i])
+            if rays.reach[i] >= own:
+                direction[fan, 0] += rays.x[i]
+                direction[fan, 1] += rays.y[i]
+            keep = here[i]
+            first[fan] += keep
+            here[count] = i  # a ray that is not kept is overwritten
+            count += np.uint64(keep)
+        counts[part] = count
+        begin += n
+    # Room for each fan.
     room = 0
     for f in range(FANS):
         room, first[f], last[f] = room + first[f] + 1, room, room
@@ -153,14 +161,20 @@ def _gather(rays: Rays, fans: Fans, kept: I32) -> None:
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    for j in range(count):
-        ray = np.uint64(kept[j])
-        fan = np.uint64(rays.fan[ray])
-        k = np.uint64(last[fan])
-        slope[k] = rays.slope[ray]
-        stop[k] = rays.stop[ray]
-        last[fan] += 1
-        end[fan] = max(end[fan], rays.stop[ray])
+    # Its rays, each behind the last one.
+    begin = np.uint64(0)
+    for part in range(2):
+        rays = every[part]
+        here = kept[begin:]
+        for j in range(np.uint64(counts[part])):
+            ray = np.uint64(here[j])
+            fan = np.uint64(rays.fan[ray])
+            k = np.uint64(last[fan])
+            slope[k] = rays.slope[ray]
+            stop[k] = rays.stop[ray]
+            last[fan] += 1
+            end[fan] = max(end[fan], rays.stop[ray])
+        begin += np.uint64(len(rays.reach))
 
 
 class Way(NamedTuple):
@@ -322,11 +336,9 @@ def _enter(crossed: Crossed, n: np.int64, passed: U64) -> None:
         crossed.low[j] = crossed.high[j] = 0
 
 
-def mark_passed(every: Iterable[Fans], origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
+def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
     """Take each fan from where it marks to the end of its rays, and enter what they pass into ``passed`` (flat)."""
-    room = _room_for(sum(base.shape) + 1)
-    for fans in every:
-        _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, room)
+    _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, _room_for(sum(base.shape) + 1))
 
 
 @kernel

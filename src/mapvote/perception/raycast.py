@@ -157,10 +157,9 @@ def cast_rays(
     sight = np.zeros(requested, dtype=np.uint8)
     base = np.ascontiguousarray(reference.base)
     rays = follow_rays(rows, CLEARANCE_M)
-    fans = gather_rays(rays)
-    every = [fans] if sky is None else [fans, gather_rays(sky(rays))]
+    fans = gather_rays(rays) if sky is None else gather_rays(rays, sky(rays))
     passed = np.zeros(grid.shape, dtype=np.uint64)  # now, so that the cache still holds it
-    mark_passed(every, origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
         still = obstacle & ~moving
         enter_hits(rows[2], float(origin_map[2]), cell, still, base.ravel(), counts.ravel(), hit.ravel())
