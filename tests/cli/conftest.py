@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 from collections.abc import Callable
@@ -55,8 +56,22 @@ LANELETS = "".join(
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Everything that the documents name. Tests link what they need from here and change nothing."""
-    folder = tmp_path_factory.mktemp("made")
+    """Everything that the documents name. Tests link what they need from here and change nothing.
+
+    The first process of the tests that asks makes it, and all others take it from there."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "made"
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            partial = tmp_path_factory.mktemp("partial")
+            make_all(partial)
+            partial.rename(folder)
+    return folder
+
+
+def make_all(folder: Path) -> None:
+    """What the documents name, into an empty folder."""
     home = Path.cwd()
     os.chdir(folder)
     try:
@@ -83,7 +98,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Path("key").write_text("mv_" + "0" * 40)
     finally:
         os.chdir(home)
-    return folder
 
 
 @pytest.fixture
