@@ -9,7 +9,7 @@ const KEYS = { a: "accepted", h: "held", r: "rejected" };
 const REVIEW = "verdict.";  // a change that was held or rejected, which a publish leaves out
 let desk = null, chosen = null;
 let asking = null;  // the newest question about the desk: an older answer may come later
-let moving = null;  // the verdict that is on its way: the desk moves on after it, unless somebody chose meanwhile
+let moving = null;  // the change whose verdict is on its way: the desk moves on after it, unless somebody chose meanwhile
 
 // For reviewers and operators; to anyone else the server does not tell. The pending changes, the largest first.
 export async function showDesk() {
@@ -106,14 +106,26 @@ function inClouds(feature) {
   state.showClouds?.();
 }
 
-async function decide(verdict) {
-  if (!chosen || moving?.id === chosen.id) return;
-  const mine = (moving = { id: chosen.id }), next = nextAfter(chosen.id);
+function decide(verdict) {
+  const next = chosen && nextAfter(chosen.id);
+  return judge(async ({ id: change, properties }) => {
+    await api.review({ change, verdict, comment: $("comment").value, after: properties.verdict?.seq ?? null });
+    $("comment").value = "";
+    return next ? { id: next } : null;
+  });
+}
+
+const undo = () => judge(async (f) => (await api.takeBack(f.properties.verdict.seq), null));
+
+// Judges the change that is chosen, and moves on to what the judgement returns. A key pressed twice judges once, and
+// nothing is judged before it is shown: until then only its id is known.
+async function judge(judgement) {
+  if (!chosen?.properties || moving?.id === chosen.id) return;
+  const mine = (moving = chosen);
   await told(async () => {
     try {
-      await api.review({ change: chosen.id, verdict, comment: $("comment").value, after: chosen.properties.verdict?.seq ?? null });
-      $("comment").value = "";
-      if (moving === mine) chosen = next ? { id: next } : null;
+      const next = await judgement(mine);
+      if (moving === mine) chosen = next;
     } finally {
       if (moving === mine) moving = null;
     }
@@ -138,7 +150,7 @@ async function told(action, done = "") {
 
 $("verdict-form").onsubmit = (event) => event.preventDefault();
 for (const [key, verdict] of Object.entries(KEYS)) $(verdict).onclick = () => decide(verdict);
-$("undo").onclick = () => told(() => api.takeBack(chosen.properties.verdict.seq));
+$("undo").onclick = undo;
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input, select, textarea")) return;
   if ($("desk").hidden || !chosen) return;

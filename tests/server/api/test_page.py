@@ -242,6 +242,23 @@ def test_what_is_chosen_while_a_verdict_is_on_its_way_stays_chosen(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("key", ["r", "u"])
+def test_a_key_pressed_twice_judges_once(browser: Chromium, store: Path, tmp_path: Path, key: str) -> None:
+    with page_of(browser, store, tmp_path):
+        for pressed in "r", "u":
+            browser.wait("document.querySelectorAll('#pending button').length")
+            enter(browser, "document.querySelector('#pending button')")
+            for _ in range(1 + (pressed == key)):
+                press(browser, pressed)
+            rejected = (
+                f"document.querySelector('#pending').innerText.includes('rejected') === {json.dumps(pressed == 'r')}"
+            )
+            browser.wait(rejected)
+            browser.run(A_MOMENT)
+            assert browser.text("#desk-said") == ""
+
+
+@pytest.mark.slow
 def test_the_focus_stays_on_a_row_that_is_made_anew(browser: Chromium, store: Path, tmp_path: Path) -> None:
     with page_of(browser, store, tmp_path):
         enter(browser, "document.querySelector('#pending button')")
