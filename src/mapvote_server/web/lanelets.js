@@ -2,7 +2,7 @@
 // page. The server compares it and keeps nothing.
 
 import * as api from "./api.js";
-import { $, element, link, number, state } from "./page.js";
+import { $, element, link, number, refill, state } from "./page.js";
 
 const MOST = 50;  // in the list; the map shows all
 let file = null;
@@ -21,7 +21,7 @@ export async function showLanelets() {
   }
   if (!current()) return;
   $("lanelets-text").textContent = text + (features.length > MOST ? `; the first ${MOST} are listed` : "");
-  $("lanelets-near").replaceChildren(...features.slice(0, MOST).map(item));
+  refill($("lanelets-near"), features.slice(0, MOST).map(item));
   state.view.setPaths("lanelets", features.flatMap((f) => lines(f.geometry)).map((line) => ({ colour: "lanelet", line })));
 }
 
