@@ -21,27 +21,27 @@ export async function showDesk() {
     if (error.status !== 403) notice(error.message);
     return [];
   }
-  const waiting = largestFirst(answer.pending.features);
-  if (asking === mine) show((desk = answer), waiting);
-  return waiting;
+  const pending = largestFirst(answer.pending.features);
+  if (asking === mine) show((desk = answer), pending);
+  return pending;
 }
 
 const largestFirst = (features) => [...features].sort((a, b) => b.properties.area_m2 - a.properties.area_m2);
 
-function show({ reviewed, held, doubts, version, waits, waiting: stays }, waiting) {
+function show({ reviewed, held, doubts, version, waits, waiting }, pending) {
   $("desk").hidden = false;
-  $("desk-tally").textContent = waiting.length
-    ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
+  $("desk-tally").textContent = pending.length
+    ? `A publish would make ${pending.length} change${pending.length > 1 ? "s" : ""} to version ${version}.`
     : `No change is pending: a publish would leave version ${version} as it is.${waits ? ` ${waits}.` : ""}`;
   const told = [...held.map((reason) => `The policy would hold it: ${reason}`), ...doubts.map((text) => `Look: ${text}`)];
   $("desk-held").replaceChildren(...told.map((text) => element("li", {}, [text])));
-  refill($("pending"), [...waiting, ...reviewed].map(row));
-  $("waiting-tally").textContent = stays?.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
-  refill($("waiting"), largestFirst(stays ?? []).map(left));
-  $("publish").disabled = !waiting.length;
+  refill($("pending"), [...pending, ...reviewed].map(row));
+  $("waiting-tally").textContent = waiting.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
+  refill($("waiting"), largestFirst(waiting).map(left));
+  $("publish").disabled = !pending.length;
   $("publish").textContent = held.length ? "Publish and override" : "Publish";
   const wanted = chosen?.id ?? address.read().pending;
-  choose([...waiting, ...reviewed].find((f) => f.id === wanted) ?? null);
+  choose([...pending, ...reviewed].find((f) => f.id === wanted) ?? null);
 }
 
 const row = (f) => {

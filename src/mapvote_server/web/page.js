@@ -20,11 +20,12 @@ export const when = (stamp) => (stamp ? stamp.slice(0, 16).replace("T", " ") + "
 // A list made anew while somebody is in it: the focus stays on the row that is about the same thing, else in its place.
 export function refill(list, rows) {
   const about = (button) => button.dataset.change ?? (button.value || button.textContent);
-  const place = [...list.querySelectorAll("button")].indexOf(document.activeElement);
-  const left = place < 0 ? null : about(document.activeElement);
+  const focused = document.activeElement;
+  const place = [...list.querySelectorAll("button")].indexOf(focused);
   list.replaceChildren(...rows);
+  if (place < 0) return;
   const buttons = [...list.querySelectorAll("button")];
-  if (place >= 0) (buttons.find((b) => about(b) === left) ?? buttons[place])?.focus();
+  (buttons.find((b) => about(b) === about(focused)) ?? buttons[place])?.focus();
 }
 
 export function notice(text, empty = false) {

@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 import pytest
@@ -139,10 +140,7 @@ def test_from_the_command_line(store: Store, honest: Store, database_url: str) -
     a_year(store, liar=True)
     newest, before = store.current(), content(store)
     name = database_url.removeprefix("sqlite:///")
-
-    def run(*arguments: str) -> str:
-        return typed("unvote", name, *arguments)
-
+    run = partial(typed, "unvote", name)
     shown = run("liar", "--replay")
     assert "only shown: --yes publishes it" in shown
     assert (store.current(), content(store)) == (newest, before)
