@@ -43,6 +43,20 @@ def marks_from(fan: int) -> float:
     return 0.0 if metres <= CELL_SIZE else metres
 
 
+def kept(rays: Rays, fan: int) -> np.ndarray:
+    """(n,) the rays of a fan that may come to a cell which it marks: a cell is 1.42 sides across."""
+    comes = rays.stop > np.float32(marks_from(fan) - 1.5 * CELL_SIZE)
+    return np.logical_and.reduce([comes, rays.fan == fan, rays.reach >= CELL_SIZE])
+
+
+def mean_direction(rays: Rays, fan: int) -> np.ndarray:
+    """(2,) of the rays that are kept; the fan's middle without any."""
+    mine = kept(rays, fan)
+    azimuth = (fan + 0.5) * 2.0 * np.pi / FANS
+    together = np.array([rays.x[mine].sum(dtype=np.float64), rays.y[mine].sum(dtype=np.float64)])
+    return together / np.linalg.norm(together) if mine.any() else np.array([np.cos(azimuth), np.sin(azimuth)])
+
+
 def crossed(x: float, y: float, dx: float, dy: float, start: float, end: float) -> list[tuple[int, int, float, float]]:
     """(row, col, where entered, where left) of the cells from the one in which ``start`` lies to the one of ``end``."""
     steps = np.arange(-2 * SIDE, 2 * SIDE)
@@ -68,8 +82,7 @@ def plain_passed(rays: Rays, base: np.ndarray) -> np.ndarray:
         mine = np.flatnonzero((rays.fan == fan) & (rays.reach >= CELL_SIZE))
         if not len(mine) or rays.stop[mine].max() <= marks_from(fan):
             continue
-        direction = np.array([rays.x[mine].sum(dtype=np.float64), rays.y[mine].sum(dtype=np.float64)])
-        dx, dy = direction / np.linalg.norm(direction)
+        dx, dy = mean_direction(rays, fan)
         for r, c, enter, leave in crossed(x, y, dx, dy, marks_from(fan), float(rays.stop[mine].max())):
             for k in mine[rays.stop[mine] > np.float32(enter)]:
                 ends = np.float32(enter), min(np.float32(leave), rays.stop[k])
@@ -90,8 +103,7 @@ def test_rays_are_gathered_by_azimuth_and_only_those_that_reach_where_their_fan_
         mine = (plain.fan == fan) & (plain.reach >= CELL_SIZE)
         stops = fans.stop[fans.first[fan] : fans.last[fan]]
         assert set(plain.stop[mine & (plain.stop > marks_from(fan))]) <= set(stops) <= set(plain.stop[mine])
-        together = np.array([plain.x[mine].sum(), plain.y[mine].sum()])
-        np.testing.assert_allclose(fans.direction[fan], together / max(np.linalg.norm(together), 1e-9), atol=1e-6)
+        np.testing.assert_allclose(fans.direction[fan], mean_direction(plain, fan), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(2))

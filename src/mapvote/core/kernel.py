@@ -27,6 +27,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.registry import cpu_target
@@ -183,3 +184,22 @@ def one_bit(context: Any, place: Any) -> Any:
         return builder.select(within, builder.shl(at.type(1), at), at.type(0))
 
     return numba.uint32(numba.int32), built
+
+
+@intrinsic
+def whole_along(context: Any, slope: Any, way: Any, start: Any) -> Any:
+    """int32 nearest to ``start`` + ``slope`` ``way`` (float32, up to 4e6 either way), counted from that of 0, 0, 0.
+
+    An addition leaves the whole number in the last bits of the sum. Floor and conversion take three times as long in a
+    loop that vectorises.
+    """
+
+    def built(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        slope, way, start = values
+        kind = ir.FunctionType(start.type, [start.type] * 3)
+        fused = builder.module.declare_intrinsic("llvm.fmuladd", [start.type], kind)  # one rounding or two
+        place = builder.call(fused, [slope, way, start])
+        shifted = builder.fadd(place, place.type(1.5 * 2**23))
+        return builder.bitcast(shifted, context.get_value_type(numba.int32))
+
+    return numba.int32(numba.float32, numba.float32, numba.float32), built

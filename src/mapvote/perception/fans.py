@@ -15,7 +15,7 @@ import numpy as np
 
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.kernel import inlined, kernel, one_bit
+from mapvote.core.kernel import inlined, kernel, one_bit, whole_along
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64, U32, U64
 
@@ -65,13 +65,13 @@ class Fans(NamedTuple):
     last: I32
     """... the one after its last."""
     slope: F32
-    """Voxels of height per metre of horizontal way, of every ray; between two fans one is left free."""
+    """Voxels of height per metre of horizontal way, of every ray; one place behind each fan is left free."""
     stop: F32
     """Horizontal metres to the end of what the ray proves."""
     end: F32
     """(FANS,) the largest of them in each fan; 0 without rays."""
     direction: F64
-    """(FANS, 2) mean direction of all rays, of length 1; 0 without any."""
+    """(FANS, 2) mean direction of these rays, of length 1; without any, the middle of the fan."""
 
 
 def follow_rays(rows: F32, clearance: float) -> Rays:
@@ -133,7 +133,7 @@ def _gather(every: tuple[Rays, Rays], fans: Fans, kept: I32, counts: I64) -> Non
     rays are kept of each part."""
     own = np.float32(CELL_SIZE)
     first, last, slope, stop, end, direction = fans
-    # Which rays are kept, how many each fan has of them, and where all of its rays go.
+    # Which rays are kept.
     begin = np.uint64(0)
     for part in range(2):
         rays = every[part]
@@ -143,25 +143,24 @@ def _gather(every: tuple[Rays, Rays], fans: Fans, kept: I32, counts: I64) -> Non
             here[i] = np.int32((rays.reach[i] >= own) & (rays.stop[i] > _TOO_SHORT[np.uint64(rays.fan[i])]))
         count = np.uint64(0)
         for i in range(n):
-            fan = np.uint64(rays.fan[i])
-            if rays.reach[i] >= own:
-                direction[fan, 0] += rays.x[i]
-                direction[fan, 1] += rays.y[i]
             keep = here[i]
-            first[fan] += keep
             here[count] = i  # a ray that is not kept is overwritten
             count += np.uint64(keep)
         counts[part] = count
         begin += n
+    # How many each fan has of them.
+    begin = np.uint64(0)
+    for part in range(2):
+        rays = every[part]
+        here = kept[begin:]
+        for j in range(np.uint64(counts[part])):
+            first[np.uint64(rays.fan[np.uint64(here[j])])] += 1
+        begin += np.uint64(len(rays.reach))
     # Room for each fan.
     room = 0
     for f in range(FANS):
         room, first[f], last[f] = room + first[f] + 1, room, room
-        norm = np.sqrt(direction[f, 0] ** 2 + direction[f, 1] ** 2)
-        if norm > 0.0:
-            direction[f, 0] /= norm
-            direction[f, 1] /= norm
-    # Its rays, each behind the last one.
+    # Its rays, each behind the last one, and where they go together.
     begin = np.uint64(0)
     for part in range(2):
         rays = every[part]
@@ -174,7 +173,16 @@ def _gather(every: tuple[Rays, Rays], fans: Fans, kept: I32, counts: I64) -> Non
             stop[k] = rays.stop[ray]
             last[fan] += 1
             end[fan] = max(end[fan], rays.stop[ray])
+            direction[fan, 0] += rays.x[ray]
+            direction[fan, 1] += rays.y[ray]
         begin += np.uint64(len(rays.reach))
+    for f in range(FANS):
+        if first[f] == last[f]:
+            direction[f, 0] = np.cos((f + 0.5) * (2.0 * np.pi / FANS))
+            direction[f, 1] = np.sin((f + 0.5) * (2.0 * np.pi / FANS))
+        norm = np.sqrt(direction[f, 0] ** 2 + direction[f, 1] ** 2)
+        direction[f, 0] /= norm
+        direction[f, 1] /= norm
 
 
 class Way(NamedTuple):
@@ -293,35 +301,47 @@ def _cross_cells(
 
 @inlined
 def _pass(
-    slope: np.float32, stop: np.float32, height: np.float32, up: int, n: np.int64, crossed: Crossed, words: U32
-) -> None:
-    """Enter the voxels of the first ``n`` cells that one ray passes: in each cell those between its heights on entering
-    and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above the
-    columns. Cells behind ``stop`` are masked."""
+    slopes: tuple[np.float32, np.float32], stops: tuple[np.float32, np.float32], height: np.float32, up: int,
+    n: np.int64, crossed: Crossed, words: U32,
+) -> None:  # fmt: skip
+    """Enter the voxels of the first ``n`` cells that two rays pass: in each cell those between a ray's heights on
+    entering and on leaving. ``height``: of the sensor over its layer, in voxels. ``words`` begin ``up`` voxels above
+    the columns. Cells behind a ray's stop are masked. Two rays share what is read, and the end of a loop, which no
+    processor foresees."""
     t = crossed.entered
     bottom = crossed.bottom
     one = np.uint64(1)  # unsigned: an index that cannot be negative vectorises
     lanes = np.uint64((n + _LANES - 1) // _LANES * _LANES)
+    middle = np.float32(height - np.float32(0.5))  # the voxel is the whole number nearest to this
+    zero = np.float32(0.0)
+    floor = np.int32(up + whole_along(zero, zero, zero))
     gentle = np.float32(0.999 / (np.sqrt(2.0) * CELL_SIZE))  # 35 deg: up to here a ray passes two voxels at most
-    if abs(slope) <= gentle:
+    if max(abs(slopes[0]), abs(slopes[1])) <= gentle:
         for j in range(np.uint64(0), lanes):
-            lowest = np.int32(bottom[j] + up)
-            enter = np.int32(np.int32(np.floor(height + slope * t[j])) - lowest)
-            leave = np.int32(np.int32(np.floor(height + slope * min(t[j + one], stop))) - lowest)
-            words[j] |= one_bit(enter) | one_bit(leave) if t[j] < stop else np.uint32(0)
+            lowest = np.int32(bottom[j] + floor)
+            enter_a = np.int32(whole_along(slopes[0], t[j], middle) - lowest)
+            enter_b = np.int32(whole_along(slopes[1], t[j], middle) - lowest)
+            leave_a = np.int32(whole_along(slopes[0], min(t[j + one], stops[0]), middle) - lowest)
+            leave_b = np.int32(whole_along(slopes[1], min(t[j + one], stops[1]), middle) - lowest)
+            bits_a = one_bit(enter_a) | one_bit(leave_a) if t[j] < stops[0] else np.uint32(0)
+            bits_b = one_bit(enter_b) | one_bit(leave_b) if t[j] < stops[1] else np.uint32(0)
+            words[j] |= bits_a | bits_b
         return
-    none = np.int32(0)
+    least = np.int32(0)
     most = np.int32(_HALF_COLUMN - 1)
-    for j in range(np.uint64(0), lanes):
-        enter = np.int32(np.floor(height + slope * t[j]))
-        leave = np.int32(np.floor(height + slope * min(t[j + one], stop)))
-        from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + up))
-        to = np.int32(max(enter, leave) - np.int32(bottom[j] + up))
-        here = (t[j] < stop) & (to >= none) & (from_ <= most)
-        first = np.uint32(min(max(from_, none), most))
-        last = np.uint32(min(max(to, none), most))
-        bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
-        words[j] |= np.uint32(bits) if here else np.uint32(0)
+    for which in range(2):
+        slope = slopes[which]
+        stop = stops[which]
+        for j in range(np.uint64(0), lanes):
+            enter = whole_along(slope, t[j], middle)
+            leave = whole_along(slope, min(t[j + one], stop), middle)
+            from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + floor))
+            to = np.int32(max(enter, leave) - np.int32(bottom[j] + floor))
+            here = (t[j] < stop) & (to >= least) & (from_ <= most)
+            first = np.uint32(min(max(from_, least), most))
+            last = np.uint32(min(max(to, least), most))
+            bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
+            words[j] |= np.uint32(bits) if here else np.uint32(0)
 
 
 @inlined
@@ -355,19 +375,22 @@ def _mark_passed(
             continue
         dx, dy = fans.direction[f]
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        way = set_out(x, y, dx, dy, _MARKS_FROM[f])
-        n = _cross_cells(way, ahead, fans.end[f], base, shape, layer, crossed)
+        n = _cross_cells(set_out(x, y, dx, dy, _MARKS_FROM[f]), ahead, fans.end[f], base, shape, layer, crossed)
         lowest = crossed.bottom[0]
         for j in range(1, n):
             lowest = min(lowest, crossed.bottom[j])
         cells_a_metre = np.float32((abs(dx) + abs(dy)) / CELL_SIZE)
-        for k in range(fans.first[f], fans.last[f]):
-            slope = fans.slope[k]
-            stop = fans.stop[k]
+        # Rays by two: the place that is free behind the last one is a ray of length 0.
+        fans.slope[fans.last[f]] = fans.stop[fans.last[f]] = np.float32(0.0)
+        for k in range(fans.first[f], fans.last[f], 2):
+            slopes = fans.slope[k], fans.slope[k + 1]
+            stops = fans.stop[k], fans.stop[k + 1]
             # A ray that ends before the fan marks has a cell or none.
-            reached = min(n, np.int64(max(stop - crossed.entered[0], np.float32(0.0)) * cells_a_metre) + 3)
-            halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF_COLUMN else 1
+            way = max(max(stops[0], stops[1]) - crossed.entered[0], np.float32(0.0))
+            reached = min(n, np.int64(way * cells_a_metre) + 3)
+            top = max(max(slopes[0], np.float32(0.0)) * stops[0], max(slopes[1], np.float32(0.0)) * stops[1])
+            halves = 2 if height + top >= lowest + _HALF_COLUMN else 1
             for half in range(halves):
                 words = crossed.low if half == 0 else crossed.high
-                _pass(slope, stop, height, half * _HALF_COLUMN, reached, crossed, words)
+                _pass(slopes, stops, height, half * _HALF_COLUMN, reached, crossed, words)
         _enter(crossed, n, passed)
