@@ -76,6 +76,7 @@ class Room(NamedTuple):
     moved: I64
     """(BLOCK,) and below (7, BLOCK) and (BLOCK,): who is paired, with whom, with how many."""
     partner: I32
+    whose: I32
     counts: I64
     centre: F32
     """(3, BLOCK) the centres of their voxels, from ``origin``."""
@@ -100,7 +101,8 @@ def room_for(n: int) -> Room:
     return Room(
         np.empty(blocks * 63 * BLOCK, np.float32), np.empty(points, np.float32), np.empty(points, np.float32),
         np.empty(blocks * BLOCK, np.int32), np.empty(blocks, np.int64), np.zeros(3), np.empty(BLOCK, np.int32),
-        np.empty(BLOCK, np.int64), np.empty((7, BLOCK), np.int32), np.empty(BLOCK, np.int64),
+        np.empty(BLOCK, np.int64), np.empty((7, BLOCK), np.int32), np.empty(7 * BLOCK, np.int32),
+        np.empty(BLOCK, np.int64),
         np.empty((3, BLOCK), np.float32), np.empty(10 * BLOCK, np.float32), np.empty(50),
         np.empty((3, 3), np.float32), np.empty(3, np.float32), np.empty(3, np.int32),
         np.empty((7, 6, 6)), np.empty((3, 6, 1)), np.empty((3, 3, 3)),
@@ -191,7 +193,11 @@ def arrange(points: F32, T: F64, window: Window, room: Room) -> None:
         missing = room.home[BLOCK * block : BLOCK * (block + 1)]
         _place(block, T, window, room, missing)
         for i in range(min(BLOCK, n - BLOCK * block)):
-            missing[i] = 7 - _find_partners(window, np.int64(missing[i]), 0, room.partner)
+            home = np.int64(missing[i])
+            missing[i] = 0
+            for j in range(7):
+                missing[i] += not _voxel_beside(window, home, j)[1]
+        for i in range(min(BLOCK, n - BLOCK * block)):
             first_with[missing[i] + 1] += 1
     for most in range(1, 8):
         first_with[most] += first_with[most - 1]
@@ -398,36 +404,47 @@ def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64
     """Into ``out`` (m,) the mean likelihood, in [0, 1], of the n points at each of the poses T (m, 4, 4), all near the
     one for which they were arranged: what :func:`linearise` says, for a single look without pairs.
 
-    Without a branch: which voxels have points cannot be guessed, and a wrong guess costs as much as the rest.
+    Without a branch: which voxels have points cannot be guessed, and a wrong guess costs as much as the rest. Two or
+    three of the seven have some: they are listed first.
     """
     side = np.float32(window.size)
     each = np.float32(1.0 / window.size)
     home = room.here
+    row = room.partner.reshape(-1)
+    whose = room.whose
+    nearest = room.pull
     for pose in range(len(T)):
         total = np.float32(0.0)
         for block in range(-(-n // BLOCK)):
             _place(block, T[pose], window, room, home)
             first = np.uint64(3 * BLOCK * block)
-            for i in range(np.uint64(min(BLOCK, n - BLOCK * block))):
-                x = room.placed[first + i]
-                y = room.placed[first + i + np.uint64(BLOCK)]
-                z = room.placed[first + i + np.uint64(2 * BLOCK)]
-                x -= (np.floor(x * each) + np.float32(0.5)) * side
-                y -= (np.floor(y * each) + np.float32(0.5)) * side
-                z -= (np.floor(z * each) + np.float32(0.5)) * side
-                nearest = np.float32(1e9)
+            here = np.uint64(min(BLOCK, n - BLOCK * block))
+            partners = np.uint64(0)
+            for i in range(here):
+                nearest[i] = np.float32(1e9)
                 for j in range(np.uint64(0), np.uint64(7)):
                     k, there = _voxel_beside(window, np.int64(home[i]), j)
-                    ux = x - side * np.float32(SEVEN[j, 0]) - cells[k, 0]
-                    uy = y - side * np.float32(SEVEN[j, 1]) - cells[k, 1]
-                    uz = z - side * np.float32(SEVEN[j, 2]) - cells[k, 2]
-                    # e = u C u, C the precision: the squared Mahalanobis distance.
-                    vx = cells[k, 3] * ux + np.float32(2.0) * (cells[k, 4] * uy + cells[k, 5] * uz)
-                    vy = cells[k, 6] * uy + np.float32(2.0) * cells[k, 7] * uz
-                    e = vx * ux + vy * uy + cells[k, 8] * uz * uz
-                    there = there & (cells[k, 3] + cells[k, 6] + cells[k, 8] > np.float32(0.0))
-                    nearest = min(nearest, e if there else np.float32(1e9))
-                total += _likelihood(nearest)
+                    row[partners] = np.int32(k * np.uint64(8) + j)
+                    whose[partners] = i
+                    partners += np.uint64(there)
+            for w in range(partners):
+                k = np.uint64(row[w] >> 3)
+                way = np.uint64(row[w] & 7)
+                point = np.uint64(whose[w])
+                x = room.placed[first + point]
+                y = room.placed[first + point + np.uint64(BLOCK)]
+                z = room.placed[first + point + np.uint64(2 * BLOCK)]
+                ux = x - (np.floor(x * each) + np.float32(0.5) + np.float32(SEVEN[way, 0])) * side - cells[k, 0]
+                uy = y - (np.floor(y * each) + np.float32(0.5) + np.float32(SEVEN[way, 1])) * side - cells[k, 1]
+                uz = z - (np.floor(z * each) + np.float32(0.5) + np.float32(SEVEN[way, 2])) * side - cells[k, 2]
+                # e = u C u, C the precision: the squared Mahalanobis distance.
+                vx = cells[k, 3] * ux + np.float32(2.0) * (cells[k, 4] * uy + cells[k, 5] * uz)
+                vy = cells[k, 6] * uy + np.float32(2.0) * cells[k, 7] * uz
+                e = vx * ux + vy * uy + cells[k, 8] * uz * uz
+                there = cells[k, 3] + cells[k, 6] + cells[k, 8] > np.float32(0.0)
+                nearest[point] = min(nearest[point], e if there else np.float32(1e9))
+            for i in range(here):
+                total += _likelihood(nearest[i])
         out[pose] = total / max(1, n)
 
 
