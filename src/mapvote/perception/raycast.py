@@ -198,20 +198,11 @@ def _highest(rays: Rays, lean: F64, slopes: F32, top: F32, count: I32) -> None:
     for i in range(np.uint64(0), np.uint64(len(slopes))):
         lifted = np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
         slopes[i] = rays.slope[i] * np.float32(CELL_SIZE) + lifted
-    begun = 0
-    here = np.uint64(0)
-    highest = top[here]
-    for k in range(len(slopes)):
-        sector = np.uint64(rays.fan[np.uint64(k)]) // wide
-        if sector != here:
-            top[here] = highest
-            count[here] += k - begun
-            begun = k
-            here = sector
-            highest = top[here]
-        highest = max(highest, slopes[np.uint64(k)])
-    top[here] = highest
-    count[here] += len(slopes) - begun
+    for k in range(np.uint64(0), np.uint64(len(slopes))):
+        sector = np.uint64(rays.fan[k]) // wide
+        count[sector] += 1
+        if slopes[k] > top[sector]:
+            top[sector] = slopes[k]
 
 
 @kernel

@@ -135,23 +135,29 @@ def _beyond(
     points: F32, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
     corner: tuple[int, int], found: I64,
 ) -> int:  # fmt: skip
-    """Into the first of ``found`` (n,) which of the points (3, n) from ``origin`` outside the local grid (``cell`` -1)
-    are obstacles, within reach, and in voxels that the map does not hold; returns how many. The map is the planes
-    (rows, cols) whose first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
+    """Into the first of ``found`` (n + 1,) which of the points (3, n) from ``origin`` outside the local grid, whose
+    ``cell`` is -1, are obstacles, within reach, and in voxels that the map does not hold; returns how many. The map is
+    the planes (rows, cols) whose first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
     rows, cols = occupied.shape
-    n, (x0, y0), (row0, col0) = 0, lattice, corner
-    for i in range(np.uint64(0), np.uint64(len(cell))):
-        if cell[i] >= 0 or points[0, i] ** 2 + points[1, i] ** 2 >= np.float32(REACH_M**2):
+    (x0, y0), (row0, col0) = lattice, corner
+    outside = np.uint64(0)
+    for i in range(np.uint64(0), np.uint64(len(cell))):  # as in _select
+        found[outside] = i
+        outside += np.uint64(cell[i] < 0)
+    n = 0
+    for w in range(outside):
+        p = np.uint64(found[w])
+        if points[0, p] ** 2 + points[1, p] ** 2 >= np.float32(REACH_M**2):
             continue
-        c = int(np.floor((np.float64(points[0, i]) + origin[0] - x0) / CELL_SIZE)) - col0
-        r = int(np.floor((np.float64(points[1, i]) + origin[1] - y0) / CELL_SIZE)) - row0
+        c = int(np.floor((np.float64(points[0, p]) + origin[0] - x0) / CELL_SIZE)) - col0
+        r = int(np.floor((np.float64(points[1, p]) + origin[1] - y0) / CELL_SIZE)) - row0
         if not (0 <= r < rows and 0 <= c < cols):
             continue
-        z = np.float64(points[2, i]) + origin[2]
+        z = np.float64(points[2, p]) + origin[2]
         if height_above(z, ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
             continue
         if not (occupied[r, c] >> np.uint64(column_bit(z, base[r, c]))) & np.uint64(1):
-            found[n] = i
+            found[n] = p
             n += 1
     return n
 
@@ -205,7 +211,7 @@ class NewPoints:
         outer = scan.outer
         lattice = (grid.lattice.x0, grid.lattice.y0)
         corner = (grid.row0, grid.col0)
-        found = np.empty(len(scan.cell), np.int64)
+        found = np.empty(len(scan.cell) + 1, np.int64)
         n = _beyond(
             scan.rows, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
             found,
