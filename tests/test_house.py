@@ -20,7 +20,7 @@ SOURCES = sorted(SRC.rglob("*.py"))
 COSTS = ROOT / "docs/measurements/kernels.md"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
-KERNELS = {"kernel", "fast_math", "allocating", "inlined"}
+KERNELS = {"kernel", "fast_math", "allocating", "disjoint", "inlined"}
 """Decorators of mapvote.core.kernel."""
 MOST_KERNELS = 155
 """All of them, those inlined in others too: each costs a tenth of a second of `mapvote warmup`, or more."""

@@ -45,8 +45,8 @@ def marks_from(fan: int) -> float:
 
 def kept(rays: Rays, fan: int) -> np.ndarray:
     """(n,) the rays of a fan that may come to a cell which it marks: a cell is 1.42 sides across."""
-    comes = rays.stop > np.float32(marks_from(fan) - 1.5 * CELL_SIZE)
-    return np.logical_and.reduce([comes, rays.fan == fan, rays.reach >= CELL_SIZE])
+    far_enough = rays.stop > np.float32(marks_from(fan) - 1.5 * CELL_SIZE)
+    return np.asarray(far_enough & (rays.fan == fan) & (rays.reach >= CELL_SIZE))
 
 
 def mean_direction(rays: Rays, fan: int) -> np.ndarray:

@@ -30,6 +30,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.compiler import Compiler
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
@@ -143,13 +144,22 @@ def _compiled_into(function: FunctionType, seen: set[FunctionType]) -> Iterator[
             yield from _compiled_into(called, seen)
 
 
-def _kept(**options: bool) -> Callable[[Any], Any]:
+class _Apart(Compiler):  # type: ignore[misc]
+    """numba's compiler, told that no argument overlaps another."""
+
+    def __init__(self, *function_and_types: Any) -> None:
+        super().__init__(*function_and_types)
+        self.state.flags.noalias = True
+
+
+def _kept(**options: object) -> Callable[[Any], Any]:
     """A decorator that compiles with these options and keeps the compiled form on disk."""
     compiled = numba.njit(**_OPTIONS, **options)
 
     def declare(function: FunctionType) -> Any:
         dispatcher = compiled(function)
-        dispatcher._cache = _Cache(function, options.get("_nrt", True))  # as enable_caching() does with numba's own
+        allocates = options.get("_nrt", True) is True
+        dispatcher._cache = _Cache(function, allocates)  # as enable_caching() does with numba's own
         return dispatcher
 
     return declare
@@ -169,6 +179,11 @@ allocating = _kept()
 """A kernel that allocates arrays."""
 inlined = numba.njit(inline="always", error_model="numpy")
 """A part of kernels, typed and compiled inside each of them."""
+
+
+def disjoint(function: Callable[..., Any]) -> Any:
+    """A kernel of which no array overlaps another, so that loops which read anywhere and write vectorise."""
+    return _kept(_nrt=False, pipeline_class=_Apart)(function)
 
 
 @intrinsic
@@ -203,3 +218,17 @@ def whole_along(context: Any, slope: Any, way: Any, start: Any) -> Any:
         return builder.bitcast(shifted, context.get_value_type(numba.int32))
 
     return numba.int32(numba.float32, numba.float32, numba.float32), built
+
+
+@intrinsic
+def two_at(context: Any, values: Any, place: Any) -> Any:
+    """int32 of two neighbours in ``values`` (uint16), the one at ``place`` (int64) in the lower half: processors gather
+    no 16 bits, and 32 take no longer."""
+
+    def built(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, given[0])
+        first = builder.gep(array.data, [given[1]])
+        both = builder.bitcast(first, context.get_value_type(numba.int32).as_pointer())
+        return builder.load(both, align=2)
+
+    return numba.int32(values, numba.int64), built

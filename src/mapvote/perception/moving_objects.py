@@ -34,7 +34,7 @@ import numpy as np
 from mapvote.config import MovingSettings
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.kernel import inlined, kernel
+from mapvote.core.kernel import disjoint, inlined, kernel, two_at
 from mapvote.core.record import record
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, I64, U16, Bool
@@ -188,14 +188,18 @@ def _ask(n: int, image: U16, rule: tuple[np.int32, np.int32], sought: Sought) ->
     """Add what one scan saw at each of the first ``n`` samples; returns how many still wait. ``rule``: steps behind a
     sample that a ray must end to have seen through it, and ``enough``, see :func:`look`.
 
-    Most samples read only _LEAST_PIXELS to each side: the first loop is short, so that it requests many pixels at once
-    and waits less for memory. The last one has no branch, so that it vectorises."""
+    Most samples read only _LEAST_PIXELS to each side: the first loop gathers those of eight samples at once. The last
+    one has no branch, so that it vectorises."""
     steps, pixel, around, here, below, above, observed, waits = sought
+    low = np.int32(0xFFFF)
+    high = np.int32(16)
     for w in range(np.uint64(0), np.uint64(n)):
-        p = np.uint64(max(pixel[w], np.int32(_LEAST_PIXELS)))
-        here[w] = image[p]
-        below[w] = min(image[p - np.uint64(1)], image[p - np.uint64(2)])
-        above[w] = min(image[p + np.uint64(1)], image[p + np.uint64(2)])
+        at = np.int64(max(pixel[w], np.int32(_LEAST_PIXELS)))
+        under = two_at(image, at - 2)
+        over = two_at(image, at + 1)
+        here[w] = two_at(image, at) & low
+        below[w] = min(np.int32(under & low), np.int32(under >> high & low))
+        above[w] = min(np.int32(over & low), np.int32(over >> high & low))
     for w in range(np.uint64(0), np.uint64(n)):
         p = np.uint64(pixel[w])
         if (around[w] > _LEAST_PIXELS) & (p > 0):
@@ -227,7 +231,7 @@ def _ask(n: int, image: U16, rule: tuple[np.int32, np.int32], sought: Sought) ->
     return waiting
 
 
-@kernel
+@disjoint
 def look(
     samples: Samples, n: int, images: U16, slots: I64, sensors: F32, pixels: Pixels, rule: tuple[float, float, int],
     seen: I32, sought: Sought,
