@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -146,9 +146,7 @@ class Grid:
 
     def padded(self, cells: int) -> Grid:
         """The window grown by ``cells`` on each side."""
-        return replace(
-            self, row0=self.row0 - cells, col0=self.col0 - cells, rows=self.rows + 2 * cells, cols=self.cols + 2 * cells
-        )
+        return Grid(self.lattice, self.row0 - cells, self.col0 - cells, self.rows + 2 * cells, self.cols + 2 * cells)
 
     def tiles(self) -> Iterator[TileIndex]:
         """Indices of the tiles that this window touches, row by row."""

@@ -11,8 +11,6 @@ from __future__ import annotations
 import time
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from math import ceil
@@ -134,11 +132,25 @@ class DriveReport:
         self.lost = [i for i in self.lost if i < n]
         return later
 
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        start = time.thread_time()
-        yield
-        self.stage_s.setdefault(stage, []).append(time.thread_time() - start)
+    def timed(self, stage: str) -> _Timed:
+        """Enter what it encloses as the time of one scan in this stage."""
+        return _Timed(self.stage_s.setdefault(stage, []))
+
+
+class _Timed:
+    """The CPU time of what it encloses. A class: a generator would take three times as long, ten times a scan."""
+
+    __slots__ = ("_seconds", "_start")
+
+    def __init__(self, seconds: list[float]) -> None:
+        self._seconds = seconds
+
+    def __enter__(self) -> None:
+        self._start = time.thread_time()
+
+    def __exit__(self, *raised: object) -> None:
+        if raised[0] is None:
+            self._seconds.append(time.thread_time() - self._start)
 
 
 @dataclass(frozen=True, slots=True)
