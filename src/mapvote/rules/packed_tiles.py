@@ -249,12 +249,10 @@ def add_four(cell: U64, first: int, a: np.uint64, b: np.uint64, c: np.uint64, d:
     either = fours ^ carry
     cell[first + 2] = plane ^ either
     carry = fours & carry | plane & either
-    k = first + 3
-    while carry and k < first + COUNT_PLANES:
+    for k in range(first + 3, first + COUNT_PLANES):  # all, for where the carry ends cannot be predicted
         plane = cell[k]
         cell[k] = plane ^ carry
         carry &= plane
-        k += 1
     return carry
 
 
