@@ -540,19 +540,21 @@ def voxels(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float) ->
 
 @inlined
 def _flood(cells: I32, n: int, state: I32, seeds: I32, side: int, plane: I32, label: I32, stack: I32) -> None:
-    """Label of each of n cells by 8-connected component of those whose ``state`` is 1, from 0; negative for others,
-    and where no cell of a component is among the ``seeds``.
+    """Label of each of n cells by 8-connected component of those whose ``state`` is 1, from 0; -1 for others, and where
+    no cell of a component is among the ``seeds``.
 
-    ``cells`` (n,) are distinct indices row * side + col with 0 < row, col < side - 1; ``plane`` (side * side,) the
-    place of each cell in them, -1 elsewhere. ``stack`` (n,): scratch.
+    ``cells`` (n,) are distinct indices row * side + col with 0 < row, col < side - 1; ``plane`` (side * side,): scratch
+    that holds -1 beside them: the place in them of each cell that waits. ``stack`` (n,): scratch.
     """
-    open_, shut = -1, -2
+    none = np.int32(-1)
     for k in range(np.uint64(0), np.uint64(n)):
-        label[k] = open_ if state[k] == 1 else shut
+        label[k] = none
+        plane[np.uint64(cells[k])] = np.int32(k) if state[k] == 1 else none
     count = 0
     for seed in range(np.uint64(0), np.uint64(n)):
-        if seeds[seed] == 0 or label[seed] != open_:
+        if seeds[seed] == 0 or plane[np.uint64(cells[seed])] < 0:
             continue
+        plane[np.uint64(cells[seed])] = none
         label[seed] = count
         stack[0] = seed
         top = np.uint64(1)
@@ -563,7 +565,8 @@ def _flood(cells: I32, n: int, state: I32, seeds: I32, side: int, plane: I32, la
                 at = corner + dr * np.uint64(side)
                 for dc in range(np.uint64(0), np.uint64(3)):
                     k = plane[at + dc]
-                    if k >= 0 and label[np.uint64(k)] == open_:
+                    if k >= 0:
+                        plane[at + dc] = none
                         label[np.uint64(k)] = count
                         stack[top] = k
                         top += np.uint64(1)
