@@ -16,6 +16,7 @@ from pathlib import Path
 import numba
 import pytest
 
+from mapvote.core import kernel
 from mapvote.core.kernel import choose_kernel_cache
 
 RECORDS = """
@@ -119,6 +120,17 @@ def test_a_constant_that_a_kernel_takes_from_another_file_changes(
     source.write_text(source.read_text().replace(old, new))
     assert started_anew()[:2] == (expected, 1)
     assert started_anew()[:2] == (expected, 0)
+
+
+def test_how_kernels_are_compiled_changes(package: Path) -> None:
+    """numba does not ask with which options it compiled what it keeps."""
+    options = package / "options.py"
+    options.write_text(Path(kernel.__file__).read_text())
+    (package / "loops.py").write_text(LOOPS.replace("mapvote.core.kernel", "cached_sample.options"))
+    assert started_anew()[:2] == (32, 1)
+    options.write_text(options.read_text().replace('"nogil": True', '"nogil": False'))
+    assert started_anew()[:2] == (32, 1)
+    assert started_anew()[:2] == (32, 0)
 
 
 def test_an_entry_that_names_a_type_that_is_gone_is_replaced(package: Path) -> None:

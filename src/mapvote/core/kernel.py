@@ -6,8 +6,8 @@ get the arrays that they fill: an allocation takes 50 ms to compile, and without
 (numba's run time, NRT) is left out: a seventh of all that is compiled.
 
 Compiled kernels are kept on disk. numba compiles a kernel again if its own file has changed. The cache below also does
-so if a kernel or a constant of another file has changed, and if an entry cannot be read: it names a type that was
-renamed since, or a power failure cut it off.
+so if this file, or a kernel or a constant of another one has changed, and if an entry cannot be read: it names a type
+that was renamed since, or a power failure cut it off.
 
 numba keeps them beside the program, else in the user's cache, and else refuses to import them at all. A container with
 a read-only image and a user without a home has neither: there they stay in the temporary folder.
@@ -113,7 +113,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def __init__(self, function: FunctionType, allocates: bool) -> None:
         super().__init__(function)
         self._allocates = allocates
-        stamp = self._impl.locator.get_source_stamp()
+        options = Path(__file__).stat()  # this file says how kernels are compiled
+        stamp = self._impl.locator.get_source_stamp(), options.st_mtime_ns, options.st_size
         self._cache_file = _Index(function, self.cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
