@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse, log
-from mapvote.core.kernel import kernel
+from mapvote.core.kernel import disjoint, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I64, Scan, read_only
 from mapvote.core.voxels import packed_key, slot_of, thin
@@ -76,7 +76,7 @@ class Thinned:
         return self._chosen[k]
 
 
-@kernel
+@disjoint
 def _deskew(points: F32, time_s: F32, motion: F32, turn: F32, rows: F32) -> None:
     """:func:`deskew_into` of ``points`` (3 n,): of a width that the compiler knows, so that the loop vectorises.
     ``motion``: rows of the offset, the velocity and the angular velocity."""

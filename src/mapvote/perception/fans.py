@@ -15,7 +15,7 @@ import numpy as np
 
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.kernel import inlined, kernel, one_bit, whole_along
+from mapvote.core.kernel import disjoint, inlined, kernel, one_bit, whole_along
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64, U32, U64
 
@@ -361,7 +361,7 @@ def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32,
     _mark_passed(fans, origin, corner, base.reshape(-1), base.shape, passed, _room_for(sum(base.shape) + 1))
 
 
-@kernel
+@disjoint
 def _mark_passed(
     fans: Fans, origin: F64, corner: tuple[float, float], base: I32, shape: tuple[int, int], passed: U64,
     crossed: Crossed,

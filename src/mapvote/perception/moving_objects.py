@@ -499,7 +499,7 @@ def _weigh(
         brief[i] = (observed[i] >= BELOW + ABOVE) & (free >= min_free) & (free >= free_share * total)
 
 
-@kernel
+@disjoint
 def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, chosen: I32, keys: I64) -> np.int64:
     """How many points ``rows`` (3, n) from ``origin`` are obstacles within ``reach``: which, and the keys of their
     voxels, into the first of ``chosen`` (n,) and ``keys`` (n,)."""
@@ -515,15 +515,18 @@ def _choose(rows: F32, obstacle: Bool, origin: F64, reach: float, cell: float, c
     for i in range(np.uint64(0), np.uint64(len(obstacle))):  # what is not chosen is written over: no branch to predict
         chosen[count] = i
         count += np.uint64(obstacle[i])
-    within = np.uint64(0)
     for k in range(np.uint64(0), count):
         p = np.uint64(chosen[k])
         x = east[p]
         y = north[p]
         z = (np.float64(up[p]) + z0) * per_m
-        chosen[within] = p
-        keys[within] = voxel_key((np.float64(x) + x0) * per_m, (np.float64(y) + y0) * per_m, z, 1.0)
-        within += np.uint64(x * x + y * y <= reach2)
+        key = voxel_key((np.float64(x) + x0) * per_m, (np.float64(y) + y0) * per_m, z, 1.0)
+        keys[k] = key if x * x + y * y <= reach2 else np.int64(0)
+    within = np.uint64(0)
+    for k in range(np.uint64(0), count):
+        chosen[within] = chosen[k]
+        keys[within] = keys[k]
+        within += np.uint64(keys[k] != 0)
     return np.int64(within)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M, height_above
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.kernel import kernel
+from mapvote.core.kernel import disjoint
 from mapvote.core.types import F32, F64, I32, Bool, Reference, Scan
 from mapvote.matching.prepare import deskew_into
 
@@ -100,7 +100,7 @@ def find_obstacles(points_map: F64, reference: Reference) -> tuple[Bool, I32]:
     return obstacle, cell
 
 
-@kernel
+@disjoint
 def _find_cells(
     rows: F32, origin: F64, corner: tuple[float, float, int, int, int, int], ground_z: F32, base: I32, cell: I32,
     obstacle: Bool,
