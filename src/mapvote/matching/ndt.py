@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapvote.core.kernel import fast_math, inlined, kernel
+from mapvote.core.kernel import disjoint, fast_math, inlined, kernel
 from mapvote.core.record import record
 from mapvote.core.types import F32, F64, I32, I64, Bool
 from mapvote.matching.ndt_voxels import SEVEN, Voxels, Window, holds, voxel_of
@@ -399,7 +399,7 @@ def linearise(n: int, room: Room, H: F64, M: F64, g: F64) -> tuple[float, float]
     return sums[48] / max(1, n), sums[49] / max(1, n)
 
 
-@kernel
+@disjoint
 def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64) -> None:
     """Into ``out`` (m,) the mean likelihood, in [0, 1], of the n points at each of the poses T (m, 4, 4), all near the
     one for which they were arranged: what :func:`linearise` says, for a single look without pairs.
@@ -412,6 +412,7 @@ def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64
     home = room.here
     row = room.partner.reshape(-1)
     whose = room.whose
+    distance = room.of
     nearest = room.pull
     for pose in range(len(T)):
         total = np.float32(0.0)
@@ -442,7 +443,10 @@ def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64
                 vy = cells[k, 6] * uy + np.float32(2.0) * cells[k, 7] * uz
                 e = vx * ux + vy * uy + cells[k, 8] * uz * uz
                 there = cells[k, 3] + cells[k, 6] + cells[k, 8] > np.float32(0.0)
-                nearest[point] = min(nearest[point], e if there else np.float32(1e9))
+                distance[w] = e if there else np.float32(1e9)
+            for w in range(partners):
+                point = np.uint64(whose[w])
+                nearest[point] = min(nearest[point], distance[w])
             for i in range(here):
                 total += _likelihood(nearest[i])
         out[pose] = total / max(1, n)
