@@ -103,8 +103,10 @@ def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64,
     from_corner = x - grid.x0, y - grid.y0, z
     chosen = np.empty(len(cell) + 1, np.int32)
     outer = scan.outer if here is scan.reference else here  # whole: a copy of the window would take longer
-    corner = grid.row0 - outer.grid.row0, grid.col0 - outer.grid.col0
-    mapped = np.ascontiguousarray(here.base).reshape(-1), np.ascontiguousarray(outer.occupied), corner
+    wide = outer.grid.cols
+    corner = (grid.row0 - outer.grid.row0) * wide + grid.col0 - outer.grid.col0
+    occupied = np.ascontiguousarray(outer.occupied).reshape(-1)
+    mapped = np.ascontiguousarray(here.base).reshape(-1), occupied, corner, wide
     marked = np.ascontiguousarray(seen.view.passed).reshape(-1), near.reshape(-1), hit.reshape(-1), apart.reshape(-1)
     spans = np.empty((len(near), 2), np.int32)
     reach = rule.hit_reach_m / CELL_SIZE
@@ -117,19 +119,17 @@ def near_hits(seen: Observation, rule: SurfaceRule = SURFACE_RULE) -> tuple[U64,
 @kernel
 def _mark_near(
     points: F32, cell: I32, obstacle: Bool, moving: Bool, origin: tuple[float, float, float], reach: float,
-    shape: tuple[int, int], mapped: tuple[I32, U64, tuple[int, int]], marked: tuple[U64, U64, U64, U64], spans: I32,
+    shape: tuple[int, int], mapped: tuple[I32, U64, int, int], marked: tuple[U64, U64, U64, U64], spans: I32,
     chosen: I32,
 ) -> None:  # fmt: skip
     """:func:`near_hits` of the points (3, n) from ``origin``, which is given from the corner of planes of this
-    ``shape``, all flat: ``marked`` passed, near, hit, apart; ``mapped`` base, and the words of a wider plane with the
-    row and column of it at which these begin. ``reach``: cells, below a half, so that a return reaches two cells or one
+    ``shape``, all flat: ``marked`` passed, near, hit, apart; ``mapped`` base, the words of a wider plane, the cell of
+    it at which these begin, and its columns. ``reach``: cells, below a half, so that a return reaches two cells or one
     along each axis. Four are always entered, be they one: no branch to predict. A voxel near a return is hit if it is
     the map's. ``chosen`` (n + 1,): scratch."""
-    base, occupied, (row0, col0) = mapped
+    base, occupied, corner, wide = mapped
     passed, near, hit, apart = marked
     rows, cols = shape
-    wide = np.uint64(occupied.shape[1])
-    held = occupied.reshape(-1)[np.uint64(row0) * wide + np.uint64(col0) :]
     east = points[0]
     north = points[1]
     up = points[2]
@@ -164,20 +164,20 @@ def _mark_near(
         near[b] |= of_b
         near[c] |= of_c
         near[d] |= of_d
-        lower = held[np.uint64(first) * wide :]
-        upper = held[np.uint64(last) * wide :]
-        explained = of_a & lower[np.uint64(left)] | of_b & lower[np.uint64(right)]
-        if not explained | of_c & upper[np.uint64(left)] | of_d & upper[np.uint64(right)]:
+        lower = corner + first * wide
+        upper = corner + last * wide
+        explained = of_a & occupied[np.uint64(lower + left)] | of_b & occupied[np.uint64(lower + right)]
+        if not explained | of_c & occupied[np.uint64(upper + left)] | of_d & occupied[np.uint64(upper + right)]:
             at = np.uint64(cell[p])
             layer = np.int64(np.floor((np.float64(up[p]) + z0) / CELL_SIZE))  # as all say in which voxel a point lies
             apart[at] |= _layers(layer, layer, base[at])
     for r in range(rows):
         begin = np.uint64(r * cols)
-        of_map = held[np.uint64(r) * wide :]
+        of_map = np.uint64(corner + r * wide)
         west = np.int32(cols)
         east = np.int32(0)
         for i in range(np.uint64(0), np.uint64(cols)):
-            struck = near[begin + i] & of_map[i] | apart[begin + i]
+            struck = near[begin + i] & occupied[of_map + i] | apart[begin + i]
             hit[begin + i] = struck
             empty = struck | passed[begin + i] == 0
             west = min(west, np.int32(cols) if empty else np.int32(i))
