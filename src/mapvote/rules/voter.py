@@ -182,8 +182,9 @@ class NewPoints:
         self._shelf = Shelf()
         self._runs = defaultdict[TileIndex, list[Slot]](list)
         """The runs of each tile: points in the order in which they were offered, one point per voxel."""
-        self._waiting: list[F64] = []
-        """The points since the last run, ..."""
+        self._waiting = np.empty((2 * numbers.sorted_together, 3 + len(self.names)))
+        """Room for the points since the last run, ... An array for each scan would lie between the scans' own, and keep
+        the heap from giving back what they leave."""
         self._count = 0
         """... how many there are, ..."""
         self._seen = np.zeros(1 << (4 * numbers.sorted_together).bit_length(), np.int64)
@@ -238,18 +239,18 @@ class NewPoints:
         n = len(points_map)
         rows = {name: point_field(name) for name in self.names}
         sent = [row.in_ballot(scanned[name]) if name in scanned else row.unknown(n) for name, row in rows.items()]
-        self._waiting.append(np.column_stack([points_map, *sent]) if sent else points_map)
+        for column, values in zip(self._waiting[self._count : self._count + n].T, [*points_map.T, *sent], strict=True):
+            column[:] = values
         self._count += n
         if self._count > self._numbers.sorted_together:
             for tile, points in self._of_tiles(self._last()).items():
                 self._runs[tile].append(self._shelf.put(points.tobytes()))
-            self._waiting = []
             self._count = 0
             self._seen.fill(0)
 
     def _last(self) -> F64:
         """The points since the last run."""
-        return np.concatenate([self._none(), *self._waiting])
+        return self._waiting[: self._count]
 
     def _none(self) -> F64:
         return np.zeros((0, 3 + len(self.names)))
