@@ -43,8 +43,8 @@ class TilePacking:
     bands: int = 16
     """Bands of rows of a tile, one of which is packed for each scan: a tile at once would take as long as several
     scans."""
-    tiles_between_trims: int = 4
-    """Tiles that are left between two calls of :func:`give_back_free_pages`, some 300 m: the scans after a call ask for
+    tiles_between_trims: int = 3
+    """Tiles that are left between two calls of :func:`give_back_free_pages`, some 200 m: the scans after a call ask for
     3,000 pages again, 10 ms in all."""
 
 
