@@ -246,11 +246,14 @@ def demo(
         for line in lines:
             print(line)
         return
-    from mapvote_lab.evaluation.demo import CASE, commands, drives_sentence
-    from mapvote_lab.evaluation.demo import demo as run
+    from mapvote_lab.processes import processes
 
-    with stages() as report:
-        evaluation, story = run(out, full=full, keep=keep, progress=report, show=show)
+    with processes(2, loading="mapvote_lab.simulation") as helpers:  # while this one loads all the rest
+        from mapvote_lab.evaluation.demo import CASE, commands, drives_sentence
+        from mapvote_lab.evaluation.demo import demo as run
+
+        with stages() as report:
+            evaluation, story = run(out, helpers, full=full, keep=keep, progress=report, show=show)
     console.print("\n[bold]What changed[/]")
     for area, deleted, added in story.areas:
         console.print(f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added")

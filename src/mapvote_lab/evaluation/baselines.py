@@ -39,7 +39,7 @@ from mapvote_lab.evaluation.scene import (
     sources_digest,
 )
 from mapvote_lab.evaluation.scores import Cost, map_obstacles
-from mapvote_lab.simulation.processes import mapping
+from mapvote_lab.processes import mapping
 
 LAYERS = 64
 """Voxels of a column, as in the map's column words: 19.2 m above the road."""

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +35,16 @@ from mapvote.shapes.cutout import Cutout, fragment
 from mapvote.survey.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes, compiled_mark, leave_mark
 from mapvote_lab.evaluation import figures, real_bench
-from mapvote_lab.evaluation.cases import Progress, choose_cases, untold
+from mapvote_lab.evaluation.cases import Case, Progress, choose_cases, untold
 from mapvote_lab.evaluation.evaluate import Evaluation, PublishedRound, evaluate, vote_by_http
 from mapvote_lab.evaluation.gallery import ChangedArea, areas_of, gallery
 from mapvote_lab.evaluation.real_report import draw_things
 from mapvote_lab.evaluation.real_street import RealRun, Street, lay_street
-from mapvote_lab.evaluation.scene import Scene
+from mapvote_lab.evaluation.scene import Pass, Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.evaluation.truths import read_moving
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.processes import processes
 from mapvote_server.questions.changes import changes_between, cutouts_between
 from mapvote_server.store.store import Store, url_of
 
@@ -425,6 +426,7 @@ def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tupl
 
 def demo(
     out: Path,
+    helpers: Executor,
     *,
     full: bool = False,
     keep: bool = False,
@@ -435,9 +437,9 @@ def demo(
 
     ``show(path)`` is called with the first picture, as soon as two drives are simulated. ``keep``: the drives, the
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
-    was interrupted is continued by the next one. Two processes compile the kernels while this one simulates, or
-    simulate where a run before has compiled them. Two of the three vehicles drive in them. MapvoteError if
-    ``out`` cannot be written.
+    was interrupted is continued by the next one. Two processes, ``helpers``, compile the kernels while this one
+    simulates, or simulate where a run before has compiled them. Two of the three vehicles drive in them, and they save
+    the pictures. MapvoteError if ``out`` cannot be written.
     """
     settings = Settings()
     work = out / "work"
@@ -450,19 +452,13 @@ def demo(
         if show:
             show(pictures[0][0])
 
-    with processes(2) as helpers:
-        compiling = _compile_in(helpers)
-        scene.simulate(progress, None if compiling else helpers.map, begun)
-        _wait_for(compiling, progress)
-        evaluation = evaluate(scene, cases, progress=progress, helpers=helpers)
-    give_back_free_pages()
-    progress("server and pictures", 0, 1)
-    write_map(evaluation.first_map, out / "map_before")
-    ballots = [drive.ballots[CASE] for drive in evaluation.drives]
-    with ThreadPoolExecutor(1) as waiting:
-        serving = waiting.submit(vote_by_http, ballots, out / "map_before", work / "server")
-        pictures += gallery(evaluation, CASE, out / "pictures")
-        done = serving.result()
+    compiling = _compile_in(helpers)
+    scene.simulate(progress, None if compiling else helpers.map, begun)
+    _wait_for(compiling, progress)
+    for _ in range(2):
+        helpers.submit(import_module, "mapvote.plots")  # while this process maps
+    evaluation, drawn, done = _voted(scene, cases, helpers, progress, out)
+    pictures += drawn
     if not follows(evaluation.first_map, done.updated, evaluation.outcomes[CASE].updated):
         raise MapvoteError("the server's map is not the one that the offline rule makes; please report this bug")
     for name, point_map in (("map_before", evaluation.first_map), ("map_after", done.updated)):
@@ -480,6 +476,25 @@ def demo(
         shutil.rmtree(work)
     progress("server and pictures", 1, 1)
     return evaluation, story
+
+
+def _voted(
+    scene: Scene, cases: Sequence[Case], helpers: Executor, progress: Progress, out: Path
+) -> tuple[Evaluation, list[Picture], PublishedRound]:
+    """The evaluation, its pictures, and the round of a server that takes the ballots while this process scores them."""
+    serving: list[Future[PublishedRound]] = []
+    with ThreadPoolExecutor(1) as waiting:
+
+        def send(drives: Sequence[Pass]) -> None:
+            ballots = [drive.ballots[CASE] for drive in drives]
+            serving.append(waiting.submit(vote_by_http, ballots, scene.work / "map", out / "work" / "server"))
+
+        evaluation = evaluate(scene, cases, progress=progress, helpers=helpers, voted=send)
+        give_back_free_pages()
+        progress("server and pictures", 0, 1)
+        write_map(evaluation.first_map, out / "map_before")
+        pictures = gallery(evaluation, CASE, out / "pictures", helpers=helpers)
+        return evaluation, pictures, serving[0].result()
 
 
 def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:

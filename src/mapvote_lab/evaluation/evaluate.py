@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -198,8 +198,10 @@ def evaluate(
     progress: Progress = untold,
     readings: str | None = None,
     helpers: Executor | None = None,
+    voted: Callable[[Sequence[Pass]], object] | None = None,
 ) -> Evaluation:
     """Run what the cache lacks, decide and score every case. Two processes where there are two cores, or ``helpers``.
+    ``voted(passes)`` is called before they are scored.
 
     ``readings``: the open sentence of the paper (a setting of ``[paper]``) whose other readings are scored too; "all":
     every sentence; None: no other reading.
@@ -209,7 +211,9 @@ def evaluate(
     prepared = time.perf_counter()
     workers = min(2, os.cpu_count() or 1)
     drives = passes(scene, cases, workers, progress, readings is not None, helpers)
-    voted = time.perf_counter()
+    if voted:
+        voted(drives)
+    all_voted = time.perf_counter()
     truth = scene.truth
     first_map = scene.point_map
     jury = Jury(first_map, truth)
@@ -231,17 +235,15 @@ def evaluate(
         coverage=entries[best].coverage,
         settings=scene.settings.model_dump(mode="json"),
         map_shift=map_shift(scene),
-        localisation={
-            d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives
-        },
+        localisation=_errors(scene, drives, T_map_world),
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
         ceilings=jury.ceilings(),
         cases=entries,
         readings={} if readings is None else _readings(scene, cases, jury, readings, progress),
         timings=Timings(
             prepare_s=prepared - started,
-            vote_s=voted - prepared,
-            score_s=scored - voted,
+            vote_s=all_voted - prepared,
+            score_s=scored - all_voted,
             yardsticks_s=time.perf_counter() - scored,
             methods=costs,
             stages_ms={drive.vehicle: drive.stage_ms for drive in drives},
@@ -249,6 +251,11 @@ def evaluate(
         ),
     )
     return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, best)
+
+
+def _errors(scene: Scene, drives: Sequence[Pass], T_map_world: F64) -> dict[str, PoseErrors]:
+    """By vehicle."""
+    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}
 
 
 def _readings(

@@ -46,9 +46,9 @@ from mapvote.survey.build import build_map
 from mapvote.vehicle import write_ballot
 from mapvote_lab.evaluation.cases import Case, CountedBy, KeptDrive, Progress, counting_rule, untold
 from mapvote_lab.evaluation.truths import Truth, read_truth
+from mapvote_lab.processes import Run, processes
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.drives import Begun
-from mapvote_lab.simulation.processes import Run, processes
 from mapvote_lab.simulation.scenario import load_scenario
 
 _MAP_FROM = ("core", "codec", "formats", "matching", "perception", "rules", "survey")

@@ -18,11 +18,11 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import NAMED, Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool, MapvoteError
 from mapvote.formats.drives.scan_folder import DriveWriter, write_poses
+from mapvote_lab.processes import Run, mapping
 from mapvote_lab.simulation.actors import Traffic, make_traffic
 from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
 from mapvote_lab.simulation.lidar import Caster, SlicedCaster, Sweep, measure, sweep
 from mapvote_lab.simulation.patterns import MOVING_SLICES, pattern_of, turning
-from mapvote_lab.simulation.processes import Run, mapping
 from mapvote_lab.simulation.routes import Route, make_routes
 from mapvote_lab.simulation.scenario import Scenario, load_scenario
 from mapvote_lab.simulation.truth import (

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.processes import processes
 
 TASKS = """
 import pathlib, signal, sys, time
-from mapvote_lab.simulation.processes import processes
+from mapvote_lab.processes import processes
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -106,3 +106,13 @@ def test_an_error_in_one_task_ends_the_others_and_is_raised() -> None:
 def _nap(seconds: float) -> float:
     time.sleep(max(seconds, 0.0))
     return 1 / (1 + seconds)
+
+
+def is_loaded(module: str) -> bool:
+    return module in sys.modules
+
+
+@pytest.mark.parametrize("loading", ["", "wave"])
+def test_a_process_loads_what_it_is_told_before_its_first_task(loading: str) -> None:
+    with processes(1, loading) as pool:
+        assert pool.submit(is_loaded, "wave").result() == bool(loading)

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, nullcontext, suppress
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+def processes(workers: int, loading: str = "") -> Iterator[ProcessPoolExecutor]:
     """``workers`` spawned processes. On an error or Ctrl-C what waits is dropped, what runs is ended, and waited for.
+    ``loading``: a module that they import at once, while this process does something else.
 
     A terminal sends Ctrl-C to every process; here only the first one hears it. The others are told to end, so that
     they leave their own files whole, and none prints a traceback.
@@ -31,6 +33,8 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
         signal.pthread_sigmask(signal.SIG_SETMASK, heard)
         try:
             wait(started)
+            for _ in range(workers if loading else 0):
+                pool.submit(import_module, loading)
             yield pool
         except BaseException:
             if all(start.done() for start in started):  # a process that does not listen yet would be killed by it
