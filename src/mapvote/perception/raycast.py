@@ -192,15 +192,15 @@ SKY_RULE = SkyRule()
 @kernel
 def _highest(rays: Rays, lean: F64, slopes: F32, top: F32, count: I32) -> None:
     """Enter into ``top`` (SKY_SECTORS,), which holds -inf, the steepest slope of a return in each sector, from the
-    sensor's own plane, and into ``count`` (SKY_SECTORS,), which holds 0, how many came. ``slopes`` (n,): scratch, of
-    all returns, in a loop that vectorises."""
+    sensor's own plane, and into ``count`` (2, SKY_SECTORS), which holds 0, how many came, in turns: a sum waits for the
+    one before it. ``slopes`` (n,): scratch, of all returns, in a loop that vectorises."""
     wide = np.uint64(FANS // SKY_SECTORS)
     for i in range(np.uint64(0), np.uint64(len(slopes))):
         lifted = np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
         slopes[i] = rays.slope[i] * np.float32(CELL_SIZE) + lifted
     for k in range(np.uint64(0), np.uint64(len(slopes))):
         sector = np.uint64(rays.fan[k]) // wide
-        count[sector] += 1
+        count[k & np.uint64(1), sector] += 1
         if slopes[k] > top[sector]:
             top[sector] = slopes[k]
 
@@ -272,8 +272,9 @@ class Sky:
             return Rays(none, none, none, none, none, no_fan)
         lean = up_map[:2] / z
         top = np.full(SKY_SECTORS, -np.inf, np.float32)
-        count = np.zeros(SKY_SECTORS, np.int32)
-        _highest(rays, lean, np.empty(len(rays.reach), np.float32), top, count)
+        counts = np.zeros((2, SKY_SECTORS), np.int32)
+        _highest(rays, lean, np.empty(len(rays.reach), np.float32), top, counts)
+        count = counts[0] + counts[1]
         edge = self._edge_seen(top, forward_map)
         # Rays of the beams above the highest returns of their sector and its neighbours, and below the edge.
         slopes = self._slopes[z > 0.0]
