@@ -145,7 +145,7 @@ def _compiled_into(function: FunctionType, seen: set[FunctionType]) -> Iterator[
             yield from _compiled_into(called, seen)
 
 
-class _Apart(Compiler):  # type: ignore[misc]
+class _Disjoint(Compiler):  # type: ignore[misc]
     """numba's compiler, told that no argument overlaps another."""
 
     def __init__(self, *function_and_types: Any) -> None:
@@ -184,7 +184,7 @@ inlined = numba.njit(inline="always", error_model="numpy")
 
 def disjoint(function: Callable[..., Any]) -> Any:
     """A kernel of which no array overlaps another, so that loops which read anywhere and write vectorise."""
-    return _kept(_nrt=False, pipeline_class=_Apart)(function)
+    return _kept(_nrt=False, pipeline_class=_Disjoint)(function)
 
 
 @intrinsic

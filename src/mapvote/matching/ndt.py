@@ -76,8 +76,9 @@ class Room(NamedTuple):
     moved: I64
     """(BLOCK,) and below (7, BLOCK) and (BLOCK,): who is paired, with whom, with how many."""
     partner: I32
-    whose: I32
     counts: I64
+    whose: I32
+    """(7 BLOCK,) the point of each partner: of :func:`likelihoods`."""
     centre: F32
     """(3, BLOCK) the centres of their voxels, from ``origin``."""
     pull: F32
@@ -101,8 +102,8 @@ def room_for(n: int) -> Room:
     return Room(
         np.empty(blocks * 63 * BLOCK, np.float32), np.empty(points, np.float32), np.empty(points, np.float32),
         np.empty(blocks * BLOCK, np.int32), np.empty(blocks, np.int64), np.zeros(3), np.empty(BLOCK, np.int32),
-        np.empty(BLOCK, np.int64), np.empty((7, BLOCK), np.int32), np.empty(7 * BLOCK, np.int32),
-        np.empty(BLOCK, np.int64),
+        np.empty(BLOCK, np.int64), np.empty((7, BLOCK), np.int32), np.empty(BLOCK, np.int64),
+        np.empty(7 * BLOCK, np.int32),
         np.empty((3, BLOCK), np.float32), np.empty(10 * BLOCK, np.float32), np.empty(50),
         np.empty((3, 3), np.float32), np.empty(3, np.float32), np.empty(3, np.int32),
         np.empty((7, 6, 6)), np.empty((3, 6, 1)), np.empty((3, 3, 3)),
@@ -405,7 +406,7 @@ def likelihoods(n: int, T: F64, window: Window, cells: F32, room: Room, out: F64
     one for which they were arranged: what :func:`linearise` says, for a single look without pairs.
 
     Without a branch: which voxels have points cannot be guessed, and a wrong guess costs as much as the rest. Two or
-    three of the seven have some: they are listed first.
+    three of the seven have some: they are listed first, and then asked by a loop that vectorises.
     """
     side = np.float32(window.size)
     each = np.float32(1.0 / window.size)
