@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import to_rgb
 
+from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE
@@ -45,8 +46,6 @@ from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScor
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.evaluation.truths import read_moving
 from mapvote_lab.processes import processes
-from mapvote_server.questions.changes import changes_between, cutouts_between
-from mapvote_server.store.store import Store, url_of
 
 CASE = "surfaces"
 
@@ -439,7 +438,7 @@ def demo(
     server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
     was interrupted is continued by the next one. Two processes, ``helpers``, compile the kernels while this one
     simulates, or simulate where a run before has compiled them. Two of the three vehicles drive in them, and they save
-    the pictures. MapvoteError if ``out`` cannot be written.
+    the pictures; then they are told to end. MapvoteError if ``out`` cannot be written.
     """
     settings = Settings()
     work = out / "work"
@@ -457,8 +456,9 @@ def demo(
     _wait_for(compiling, progress)
     for _ in range(2):
         helpers.submit(import_module, "mapvote.plots")  # while this process maps
-    evaluation, drawn, done = _voted(scene, cases, helpers, progress, out)
+    evaluation, drawn, done, areas = _voted(scene, cases, helpers, progress, out)
     pictures += drawn
+    helpers.shutdown(wait=False)  # they end, .4 s, while this process writes
     if not follows(evaluation.first_map, done.updated, evaluation.outcomes[CASE].updated):
         raise MapvoteError("the server's map is not the one that the offline rule makes; please report this bug")
     for name, point_map in (("map_before", evaluation.first_map), ("map_after", done.updated)):
@@ -467,7 +467,6 @@ def demo(
     write_whole(out / "tables.txt", as_text(evaluation.result))
     write_whole(out / "results.json", to_json(evaluation.result))
     write_map(done.updated, out / "map_after")
-    areas = changed_areas(work / "server" / "store.db", done.version)
     story = tell(
         evaluation, done, drives_bytes=sum(f.stat().st_size for f in work.rglob("*") if f.is_file()), kept=keep
     )
@@ -480,21 +479,27 @@ def demo(
 
 def _voted(
     scene: Scene, cases: Sequence[Case], helpers: Executor, progress: Progress, out: Path
-) -> tuple[Evaluation, list[Picture], PublishedRound]:
-    """The evaluation, its pictures, and the round of a server that takes the ballots while this process scores them."""
-    serving: list[Future[PublishedRound]] = []
+) -> tuple[Evaluation, list[Picture], PublishedRound, list[Cutout]]:
+    """The evaluation, its pictures, and the round of a server that takes the ballots while this process scores them,
+    with what it changed."""
+    serving: list[Future[tuple[PublishedRound, list[Cutout]]]] = []
     with ThreadPoolExecutor(1) as waiting:
 
         def send(drives: Sequence[Pass]) -> None:
             ballots = [drive.ballots[CASE] for drive in drives]
-            serving.append(waiting.submit(vote_by_http, ballots, scene.work / "map", out / "work" / "server"))
+            serving.append(waiting.submit(_served, ballots, scene.work / "map", out / "work" / "server"))
 
         evaluation = evaluate(scene, cases, progress=progress, helpers=helpers, voted=send)
         give_back_free_pages()
         progress("server and pictures", 0, 1)
         write_map(evaluation.first_map, out / "map_before")
         pictures = gallery(evaluation, CASE, out / "pictures", helpers=helpers)
-        return evaluation, pictures, serving[0].result()
+        return evaluation, pictures, *serving[0].result()
+
+
+def _served(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> tuple[PublishedRound, list[Cutout]]:
+    done = vote_by_http(ballots, first_map, folder)
+    return done, changed_areas(folder / "store.db", done.version)
 
 
 def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:
@@ -509,6 +514,9 @@ def follows(first: PointMap, served: PointMap, offline: PointMap) -> bool:
 
 def changed_areas(store: Path, version: int) -> list[Cutout]:
     """Changes of the server's round, cut out of the map."""
+    from mapvote_server.questions.changes import changes_between, cutouts_between  # SQLAlchemy: while others draw
+    from mapvote_server.store.store import Store, url_of
+
     opened = Store.open(url_of(str(store)))
     try:
         return cutouts_between(opened, 1, version, changes_between(opened, 1, version)) if version > 1 else []
