@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mapvote_lab.processes import processes
+from mapvote_lab.processes import load_in, processes
 
 TASKS = """
 import pathlib, signal, sys, time
@@ -114,5 +114,7 @@ def is_loaded(module: str) -> bool:
 
 @pytest.mark.parametrize("loading", ["", "wave"])
 def test_a_process_loads_what_it_is_told_before_its_first_task(loading: str) -> None:
-    with processes(1, loading) as pool:
+    with processes(1) as pool:
+        if loading:
+            load_in(pool, 1, loading)
         assert pool.submit(is_loaded, "wave").result() == bool(loading)

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def processes(workers: int, loading: str = "") -> Iterator[ProcessPoolExecutor]:
+def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """``workers`` spawned processes. On an error or Ctrl-C what waits is dropped, what runs is ended, and waited for.
-    ``loading``: a module that they import at once, while this process does something else.
 
     A terminal sends Ctrl-C to every process; here only the first one hears it. The others are told to end, so that
     they leave their own files whole, and none prints a traceback.
@@ -33,8 +32,6 @@ def processes(workers: int, loading: str = "") -> Iterator[ProcessPoolExecutor]:
         signal.pthread_sigmask(signal.SIG_SETMASK, heard)
         try:
             wait(started)
-            for _ in range(workers if loading else 0):
-                pool.submit(import_module, loading)
             yield pool
         except BaseException:
             if all(start.done() for start in started):  # a process that does not listen yet would be killed by it
@@ -43,6 +40,12 @@ def processes(workers: int, loading: str = "") -> Iterator[ProcessPoolExecutor]:
                         os.kill(process.pid or 0, signal.SIGUSR1)
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+def load_in(helpers: Executor, workers: int, module: str) -> None:
+    """Let ``workers`` idle processes import a module, while this one does something else."""
+    for _ in range(workers):
+        helpers.submit(import_module, module)
 
 
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]

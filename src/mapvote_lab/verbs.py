@@ -246,9 +246,10 @@ def demo(
         for line in lines:
             print(line)
         return
-    from mapvote_lab.processes import processes
+    from mapvote_lab.processes import load_in, processes
 
-    with processes(2, loading="mapvote_lab.simulation") as helpers:  # while this one loads all the rest
+    with processes(2) as helpers:
+        load_in(helpers, 2, "mapvote_lab.simulation")  # while this process loads all the rest
         from mapvote_lab.evaluation.demo import CASE, commands, drives_sentence
         from mapvote_lab.evaluation.demo import demo as run
 

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +44,7 @@ from mapvote_lab.evaluation.scene import Pass, Scene
 from mapvote_lab.evaluation.scores import PAPER_F1, EvaluationResult, ObjectScores, same_rows, to_json
 from mapvote_lab.evaluation.tables import ReportSection, as_text, case_name, page, tables
 from mapvote_lab.evaluation.truths import read_moving
-from mapvote_lab.processes import processes
+from mapvote_lab.processes import load_in, processes
 
 CASE = "surfaces"
 
@@ -454,8 +453,7 @@ def demo(
     compiling = _compile_in(helpers)
     scene.simulate(progress, None if compiling else helpers.map, begun)
     _wait_for(compiling, progress)
-    for _ in range(2):
-        helpers.submit(import_module, "mapvote.plots")  # while this process maps
+    load_in(helpers, 2, "mapvote.plots")  # while this process maps
     evaluation, drawn, done, areas = _voted(scene, cases, helpers, progress, out)
     pictures += drawn
     helpers.shutdown(wait=False)  # they end, .4 s, while this process writes
