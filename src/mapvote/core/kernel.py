@@ -21,6 +21,7 @@ import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -109,12 +110,18 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
             raise OSError(f"{name}: {error}") from error  # which numba takes as absent
 
 
+@cache
+def _stamp_of_this_file() -> tuple[int, int]:
+    """It says how kernels are compiled."""
+    own = Path(__file__).stat()
+    return own.st_mtime_ns, own.st_size
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     def __init__(self, function: FunctionType, allocates: bool) -> None:
         super().__init__(function)
         self._allocates = allocates
-        options = Path(__file__).stat()  # this file says how kernels are compiled
-        stamp = self._impl.locator.get_source_stamp(), options.st_mtime_ns, options.st_size
+        stamp = self._impl.locator.get_source_stamp(), _stamp_of_this_file()
         self._cache_file = _Index(function, self.cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
