@@ -24,8 +24,8 @@ def deaf(_):
     return sum(range(25_000_000))  # seconds in one call: nothing is heard meanwhile
 
 def long(_):
-    pathlib.Path("ready").touch()
     try:
+        pathlib.Path("ready").touch()
         time.sleep(60)
     finally:
         pathlib.Path("whole").touch()
